@@ -1,0 +1,62 @@
+"""Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.
+
+    session_folder = liex_lab.run_session("recording.mcap", plan=liex_lab.Plan.load("mouse"))
+    poses = liex_lab.Session.open(session_folder).poses
+
+Importing the package does nothing and costs little: each public name brings its own module along when it is asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Camera": "liex_lab.camera",
+    "LiexError": "liex_lab.errors",
+    "Plan": "liex_lab.plan",
+    "PoseEstimator": "liex_lab.estimation.estimator",
+    "SE3": "liex_lab.geometry",
+    "Session": "liex_lab.sessions",
+    "Skeleton": "liex_lab.body",
+    "open_recording": "liex_lab.recordings",
+    "run_session": "liex_lab.api",
+}
+
+__all__ = [
+    "SE3",
+    "Camera",
+    "LiexError",
+    "Plan",
+    "PoseEstimator",
+    "Session",
+    "Skeleton",
+    "__version__",
+    "open_recording",
+    "run_session",
+]
+
+if TYPE_CHECKING:
+    from liex_lab.api import run_session
+    from liex_lab.body import Skeleton
+    from liex_lab.camera import Camera
+    from liex_lab.errors import LiexError
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.geometry import SE3
+    from liex_lab.plan import Plan
+    from liex_lab.recordings import open_recording
+    from liex_lab.sessions import Session
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'liex_lab' has no attribute '{name}'")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,47 @@
+"""Where jobs and views meet: what `liex run` and `liex demo` do, for Python as for the command line.
+
+`pipelines` and `dashboards` do not know each other; this module hands the views to the job that writes a session.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.recording import Recording
+
+DEMO = "mouse_walk.mcap"
+
+
+def run_session(
+    recording: str | Path | Recording,
+    plan: Plan | None = None,
+    out: str | Path = ".",
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Path:
+    """Measure every frame of a recording and write the session folder `out/<recording's name>.liex`; returns it.
+
+    recording: a path, or a recording that is open already; plan: None takes the mouse's. Raises a LiexError that says
+    what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
+    """
+    from liex_lab.dashboards.blueprint import replay_blueprint
+    from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.session import measure_session
+
+    plan = plan or Plan.load("mouse")
+    return measure_session(
+        recording, plan, out, overwrite=overwrite, blueprint=replay_blueprint, report=write_report, progress=progress
+    )
+
+
+def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
+    """The bundled sample recording as a session; an earlier session of the demo is replaced."""
+    from liex_lab.catalog import find_sample
+
+    return run_session(find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress)

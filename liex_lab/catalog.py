@@ -1,0 +1,80 @@
+"""What comes with the package: the bundled models with their cards, and the data sets with their samples."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from liex_lab.errors import LiexError, ModelError
+
+_HERE = Path(__file__).resolve().parent
+MODELS = _HERE / "models"
+
+
+def datasets_folder() -> Path:
+    """The folder `datasets`: inside the package once installed, beside it in a clone.
+
+    importlib.resources does not find a folder without code in an editable install, so the two places are tried.
+    """
+    for folder in (_HERE / "datasets", _HERE.parent / "datasets"):
+        if folder.is_dir():
+            return folder
+    raise LiexError(f"the folder datasets should be in {_HERE} or beside it, but is in neither; install liex_lab again")
+
+
+def find_sample(name: str) -> Path:
+    """The bundled sample recording `name`: a file or a folder of `datasets`."""
+    folder = datasets_folder()
+    if name and (folder / name).exists():
+        return folder / name
+    known = sorted(p.name for p in folder.iterdir() if p.suffix not in {".toml", ".md"} and not p.name.startswith("."))
+    raise LiexError(f"there is no bundled sample '{name}'; there are: {', '.join(known) or 'none'}")
+
+
+def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
+    """The cards of the bundled models by name, in alphabetical order; the hashes are not checked here."""
+    return {path.stem: _read_card(path.with_suffix(".json")) for path in sorted(folder.glob("*.npz"))}
+
+
+def find_model(model: str | Path, folder: Path = MODELS) -> Path:
+    """The model file of a bundled name ('mouse') or of a path, once its SHA-256 agrees with its card.
+
+    The card is the .json of the same name beside the .npz. A bundled model has one; a model of the user's own may.
+    """
+    bundled = folder / f"{model}.npz"
+    path = bundled if bundled.is_file() else Path(model)
+    if not path.is_file():
+        known = [p.stem for p in sorted(folder.glob("*.npz"))]
+        near = difflib.get_close_matches(str(model), known, 1)
+        hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
+        raise ModelError(f"there is no model '{model}'; {hint}, or give the path of an .npz made by `liex train`")
+    card_path = path.with_suffix(".json")
+    if path == bundled or card_path.is_file():
+        stated, found = _read_card(card_path)["sha256"], sha256(path)
+        if stated != found:
+            raise ModelError(
+                f"the model {path} is damaged or was changed: its card states SHA-256 {stated[:12]}..., the file has "
+                f"{found[:12]}...; install liex_lab again or make the model again with `liex train`"
+            )
+    return path
+
+
+def sha256(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise ModelError(f"the model {path.stem} needs its card {path}, which is missing; install liex_lab again")
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ModelError(f"the model card {path} should be JSON, but: {error}; install liex_lab again") from None
+    if not isinstance(card, dict) or not isinstance(card.get("sha256"), str):
+        raise ModelError(f"the model card {path} should state the model's sha256; make it again with `liex train`")
+    return card

@@ -1,0 +1,279 @@
+"""`liex`: a table of verbs. Each brings its job along when it is asked for, so that `liex --help` stays quick."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+import liex_lab
+from liex_lab.errors import LiexError
+from liex_lab.progress import progress_bar
+
+FAULT = 70  # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
+_USERS_TO_MEND = {errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.ENAMETOOLONG, errno.ENOTDIR}
+
+app = typer.Typer(
+    name="liex",
+    help="Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
+app.add_typer(evaluate, name="evaluate")
+
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
+SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
+PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
+OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
+AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse or hand.")]
+VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"liex_lab {liex_lab.__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+) -> None:
+    """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
+
+
+@app.command()
+def demo(out: OutFolder = Path()) -> None:
+    """Run the bundled sample recording, to see what comes out."""
+    from liex_lab.api import run_demo
+
+    with progress_bar() as progress:
+        session = run_demo(out, progress=progress)
+    _tell_session(session)
+
+
+@app.command()
+def run(
+    recording: RecordingPath,
+    plan: PlanName = "mouse",
+    out: OutFolder = Path(),
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
+) -> None:
+    """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])  # first: a wrong plan is told at once
+    from liex_lab.api import run_session
+
+    with progress_bar() as progress:
+        session = run_session(recording, chosen, out, overwrite=overwrite, progress=progress)
+    _tell_session(session)
+
+
+@app.command()
+def doctor(
+    recording: RecordingPath,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
+    topic: Annotated[str | None, typer.Option("--topic", help="The MCAP topic, where several hold depth.")] = None,
+) -> None:
+    """Say what is in a recording and what is wrong with it. Needs no model."""
+    from liex_lab.pipelines.doctor import examine, print_report
+
+    with progress_bar() as progress:
+        findings = examine(recording, fps=fps, topic=topic, progress=progress)
+    if as_json:
+        typer.echo(_json(findings))
+    else:
+        print_report(findings)
+
+
+@app.command()
+def train(
+    animal: Annotated[str, typer.Argument(metavar="ANIMAL", help="fish, mouse or hand.")],
+    variant: VariantName = "default",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz.")] = None,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")] = 0,
+) -> None:
+    """Make an animal's model from rendered pictures; the same again, byte for byte, whenever it is run."""
+    from liex_lab.pipelines.train import train_model
+
+    with progress_bar() as progress:
+        model = train_model(animal, variant, out or Path(f"{animal}.npz"), workers=workers, progress=progress)
+    typer.echo(f"model: {model}")
+
+
+@evaluate.command("pose")
+def evaluate_pose(
+    animal: AnimalName = "mouse",
+    split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
+    variant: VariantName = "default",
+    n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
+    spine_mm: Annotated[
+        float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors on a fixed split of rendered test frames."""
+    from liex_lab.pipelines.evaluate import evaluate_pose as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, split, variant, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@evaluate.command("speed")
+def evaluate_speed(animal: AnimalName = "mouse", json_file: JsonFile = None) -> None:
+    """Frames per second on one and two cores, stage by stage, and the ratio to the paper's variant."""
+    from liex_lab.pipelines.evaluate import evaluate_speed as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@evaluate.command("sizes")
+def evaluate_sizes(
+    animal: AnimalName = "mouse",
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="Only this many frames for each size.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors of animals between 45 and 100 mm long, their size estimated and not given."""
+    from liex_lab.pipelines.evaluate import evaluate_sizes as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, n_frames=n_frames, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@evaluate.command("reference")
+def evaluate_reference(
+    session: SessionPath,
+    reference: Annotated[
+        Path, typer.Option("--reference", metavar="CSV", help="The reference's table, one row a frame.")
+    ],
+    json_file: JsonFile = None,
+) -> None:
+    """Compare a session with what another program measured in the same recording."""
+    from liex_lab.pipelines.evaluate import evaluate_reference as measure
+
+    _tell_numbers(measure(session, reference), json_file)
+
+
+@app.command()
+def show(
+    session: SessionPath,
+    web: Annotated[bool, typer.Option("--web", help="Show it in the browser instead of a window.")] = False,
+) -> None:
+    """Open a session's replay in Rerun."""
+    from liex_lab.sessions import Session
+
+    replay = Session.open(session).path / "session.rrd"
+    if not web and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise LiexError(
+            f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
+        )
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
+    command = [sys.executable, "-m", "rerun", str(replay), *(["--web-viewer"] if web else [])]
+    raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
+
+
+@app.command()
+def info(
+    plan: Annotated[str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")] = None,
+) -> None:
+    """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of your own."""
+    from liex_lab.plan import Plan, known_plans
+
+    if plan is not None:
+        typer.echo(Plan.load(plan).to_toml(), nl=False)
+        return
+    from liex_lab.catalog import bundled_models
+    from liex_lab.sessions.provenance import versions
+
+    facts: dict[str, Any] = versions()
+    facts["plans"] = ", ".join(known_plans())
+    models = bundled_models()
+    facts["models"] = ", ".join(models) or "none"
+    facts |= {f"model {name}: {key}": value for name, card in models.items() for key, value in card.items()}
+    _tell_numbers(facts, None)
+
+
+def main() -> None:
+    """The command line. What the user can put right is one sentence and exit code 1; a fault of ours shows itself."""
+    try:
+        app()
+    except LiexError as error:
+        _fail(str(error))
+    except OSError as error:
+        if error.errno not in _USERS_TO_MEND:
+            _fault()
+        where = f" {error.filename}" if error.filename else ""
+        _fail(f"the system refused{where}: {error.strerror}; make room, correct the permissions or name another place")
+    except Exception:
+        _fault()
+
+
+def _fail(sentence: str, code: int = 1) -> NoReturn:
+    typer.secho(f"liex: {sentence}", fg=typer.colors.RED, err=True)
+    sys.exit(code)
+
+
+def _fault() -> NoReturn:
+    traceback.print_exc()
+    _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
+
+
+def _tell_session(session: Path) -> None:
+    typer.echo(f"session: {session}")
+    report = session / "report.html"
+    if report.is_file():
+        typer.echo(f"report:  {report}")
+    typer.echo(f"replay:  liex show {session}")
+
+
+def _tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
+    """The numbers as a table on the screen, and as JSON where a file was named."""
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(_json(result) + "\n", encoding="utf-8")
+    table = Table(show_header=False)
+    for name, value in result.items():
+        shown = f"{value:.4g}" if isinstance(value, float) else _json(value) if isinstance(value, dict) else str(value)
+        table.add_row(name, Text(shown))
+    Console().print(table)
+
+
+def _json(result: Any) -> str:
+    return json.dumps(_plain(result), indent=2, allow_nan=False, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: NumPy's numbers as Python's, and null for what is not a finite number."""
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(value, list):
+        return _plain(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,27 @@
+"""The errors a user can put right. Each message is one sentence: what was expected, what came, what to do."""
+
+from __future__ import annotations
+
+
+class LiexError(Exception):
+    """Something the user can put right; the command line prints its message alone, without a traceback."""
+
+
+class RecordingError(LiexError):
+    """A recording that cannot be opened or read."""
+
+
+class PlanError(LiexError):
+    """A plan, or a value in it, that cannot be used."""
+
+
+class ModelError(LiexError):
+    """A model that is missing, damaged or made for another animal."""
+
+
+class SessionError(LiexError):
+    """A session folder that is missing, unfinished or not ours."""
+
+
+class EstimationError(LiexError):
+    """A recording in which the animal cannot be measured."""

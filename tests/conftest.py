@@ -1,0 +1,52 @@
+"""What all tests share: seeded hypothesis, the reference data, and no skipping in continuous integration."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+REFERENCE_DATA = REPOSITORY.parent / "shared" / "data"
+ABSENT = "reference data absent"  # the one reason for which a test may skip in CI
+
+settings.register_profile("suite", derandomize=True, deadline=None, max_examples=50, database=None)
+settings.load_profile("suite")
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> Path:
+    """The folder of real recordings beside the repository; the test skips where it is not there."""
+    if not REFERENCE_DATA.is_dir():
+        pytest.skip(ABSENT)
+    return REFERENCE_DATA
+
+
+def excuse(report: pytest.TestReport | pytest.CollectReport) -> str:
+    """Why a test was skipped."""
+    return str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
+
+
+def refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """In CI a skip is a failure: a missing tool is for .ci/run to install, not for a test to look away from."""
+    expected = hasattr(report, "wasxfail") or ABSENT in excuse(report)
+    if os.environ.get("CI") and report.skipped and not expected:
+        report.outcome = "failed"
+        report.longrepr = f"a test may not skip in CI unless '{ABSENT}', but: {excuse(report)}"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    refuse_skip(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    report = yield
+    refuse_skip(report)
+    return report
