@@ -1,0 +1,266 @@
+"""Kernels that lay a closed triangle mesh around the joints of one pose; drivers that do it for a batch.
+
+Every part of a mesh is a *tube*: a pole, some rings, a pole. A body is one tube of ellipses along the spine, an ear or
+a foot an ellipsoid (a tube as well), a tail a thin tube, a capsule a straight tube around one bone. Lengths in mm, in
+the frame in which the joints are given; the tail needs that frame's z up and its floor at z = 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+BODY_SEGMENTS = 16
+BLOB_RINGS, BLOB_SEGMENTS = 4, 8
+TAIL_RINGS, TAIL_SEGMENTS = 12, 6
+CAPSULE_RINGS, CAPSULE_SEGMENTS = 6, 10
+
+
+def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
+    """Triangles (F, 3) of a closed tube: vertex 0 is the first pole, then ring after ring, the last the other pole."""
+    faces = []
+    for k in range(n_segments):
+        after = (k + 1) % n_segments
+        faces.append((0, 1 + after, 1 + k))
+        for r in range(n_rings - 1):
+            low, high = 1 + r * n_segments, 1 + (r + 1) * n_segments
+            faces += [(low + k, low + after, high + after), (low + k, high + after, high + k)]
+        last = 1 + (n_rings - 1) * n_segments
+        faces.append((last + k, last + after, last + n_segments))
+    return np.array(faces, np.int32)
+
+
+def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
+    """Triangles (F, 3) of several tubes (n_rings, n_segments) whose vertices follow one another."""
+    faces, start = [], 0
+    for n_rings, n_segments in tubes:
+        faces.append(tube_faces(n_rings, n_segments) + np.int32(start))
+        start += n_rings * n_segments + 2
+    return np.concatenate(faces)
+
+
+@njit(cache=True)
+def spine_frame(joints, rotations, arc, station, out):
+    """Centre, forward, left and up of the mid-axis at `station` (share of the spine's length) into `out` (4, 3).
+
+    Between the joints (J, 3) runs a Catmull-Rom curve, outside it goes straight on. Up blends the joints' z axes
+    (rotations (J, 3, 3)). `arc` (J,) mm: length of the chain up to each joint.
+    """
+    n_joints = joints.shape[0]
+    total = arc[n_joints - 1]
+    along = station * total
+    k = 0
+    while k < n_joints - 2 and along > arc[k + 1]:
+        k += 1
+    length = arc[k + 1] - arc[k]
+    s = min(max((along - arc[k]) / length, 0.0), 1.0)
+    beyond = min(along, 0.0) + max(along - total, 0.0)
+    before_length = arc[k] - arc[k - 1] if k > 0 else 1.0
+    after_length = arc[k + 2] - arc[k + 1] if k < n_joints - 2 else 1.0
+    s2, s3 = s * s, s * s * s
+    for axis in range(3):
+        here, there = joints[k, axis], joints[k + 1, axis]
+        bone = (there - here) / length
+        start = bone
+        if k > 0:
+            before = (here - joints[k - 1, axis]) / before_length
+            start = (before * length + bone * before_length) / (length + before_length)
+        stop = bone
+        if k < n_joints - 2:
+            after = (joints[k + 2, axis] - there) / after_length
+            stop = (after * length + bone * after_length) / (length + after_length)
+        forward = (6 * s2 - 6 * s) * (here - there) / length + (3 * s2 - 4 * s + 1) * start + (3 * s2 - 2 * s) * stop
+        centre = (2 * s3 - 3 * s2 + 1) * here + (s3 - 2 * s2 + s) * length * start
+        centre += (3 * s2 - 2 * s3) * there + (s3 - s2) * length * stop
+        out[0, axis] = centre + beyond * forward
+        out[1, axis] = forward
+        out[3, axis] = (1 - s) * rotations[k, axis, 2] + s * rotations[k + 1, axis, 2]
+    _normalise(out, 1)
+    _cross(out, 3, 1, 2)
+    _normalise(out, 2)
+    _cross(out, 1, 2, 3)
+
+
+@njit(cache=True)
+def _normalise(rows, k):
+    """Row k of `rows` (., 3) to unit length."""
+    length = math.sqrt(rows[k, 0] ** 2 + rows[k, 1] ** 2 + rows[k, 2] ** 2)
+    for axis in range(3):
+        rows[k, axis] /= length
+
+
+@njit(cache=True)
+def _cross(rows, a, b, out):
+    """Row `out` becomes the cross product of rows a and b of `rows` (., 3)."""
+    x = rows[a, 1] * rows[b, 2] - rows[a, 2] * rows[b, 1]
+    y = rows[a, 2] * rows[b, 0] - rows[a, 0] * rows[b, 2]
+    z = rows[a, 0] * rows[b, 1] - rows[a, 1] * rows[b, 0]
+    rows[out, 0], rows[out, 1], rows[out, 2] = x, y, z
+
+
+@njit(cache=True)
+def chain_arc(joints, arc):
+    """Fill `arc` (J,) mm with the chain's length up to each of the joints (J, 3)."""
+    arc[0] = 0.0
+    for j in range(1, joints.shape[0]):
+        square = 0.0
+        for axis in range(3):
+            square += (joints[j, axis] - joints[j - 1, axis]) ** 2
+        arc[j] = arc[j - 1] + math.sqrt(square)
+
+
+@njit(cache=True)
+def _body(joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, start):
+    """The trunk: a superellipse across the mid-axis at every station; the first and last stations are the poles."""
+    n, at = len(stations), start
+    for r in range(n):
+        spine_frame(joints, rotations, arc, stations[r], frame)
+        if r == 0 or r == n - 1:
+            for axis in range(3):
+                out[at, axis] = frame[0, axis]
+            at += 1
+            continue
+        wide, high = girth * half_width[r], girth * half_height[r]
+        for k in range(BODY_SEGMENTS):
+            phi = 2.0 * math.pi * k / BODY_SEGMENTS
+            c, s = math.cos(phi), math.sin(phi)
+            if power != 2.0:
+                c = math.copysign(abs(c) ** (2.0 / power), c)
+                s = math.copysign(abs(s) ** (2.0 / power), s)
+            for axis in range(3):
+                out[at, axis] = frame[0, axis] + wide * c * frame[2, axis] + high * s * frame[3, axis]
+            at += 1
+    return at
+
+
+@njit(cache=True)
+def ellipsoid(frame, radii, out, start):
+    """An ellipsoid about frame (4, 3) = centre, forward, left, up with radii (3,) mm into `out` from row `start`."""
+    at = start
+    for r in range(BLOB_RINGS + 2):
+        theta = math.pi * r / (BLOB_RINGS + 1)
+        along, across = -math.cos(theta) * radii[0], math.sin(theta)
+        for k in range(1 if r == 0 or r == BLOB_RINGS + 1 else BLOB_SEGMENTS):
+            phi = 2.0 * math.pi * k / BLOB_SEGMENTS
+            left, up = across * math.cos(phi) * radii[1], across * math.sin(phi) * radii[2]
+            for axis in range(3):
+                out[at, axis] = frame[0, axis] + along * frame[1, axis] + left * frame[2, axis] + up * frame[3, axis]
+            at += 1
+    return at
+
+
+@njit(cache=True)
+def _blob(joints, rotations, arc, girth, blob, frame, out, start):
+    """One ear or foot: `blob` = station, left, up of its centre, its three radii, mm at scale 1; radius 0 hides it."""
+    spine_frame(joints, rotations, arc, blob[0], frame)
+    for axis in range(3):
+        frame[0, axis] += girth * (blob[1] * frame[2, axis] + blob[2] * frame[3, axis])
+    return ellipsoid(frame, girth * blob[3:6], out, start)
+
+
+@njit(cache=True)
+def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
+    """A tube that leaves the rump at station `first`, sinks to the floor z = 0 and turns by `bends` rad at its rings.
+
+    tail: length, radius at the rump, radius at the tip, mm at scale 1; length 0 hides it inside the body.
+    """
+    spine_frame(joints, rotations, arc, first, frame)
+    x, y, z = frame[0, 0], frame[0, 1], frame[0, 2]
+    if girth * tail[0] <= 0.0:
+        for k in range(TAIL_RINGS * TAIL_SEGMENTS + 2):
+            out[start + k, 0], out[start + k, 1], out[start + k, 2] = x, y, z
+        return start + TAIL_RINGS * TAIL_SEGMENTS + 2
+    heading = math.atan2(-frame[1, 1], -frame[1, 0])
+    if math.hypot(frame[1, 0], frame[1, 1]) < 0.35:  # an upright rump: the tail leaves away from the belly
+        heading = math.atan2(frame[3, 1], frame[3, 0])
+    step = girth * tail[0] / TAIL_RINGS
+    at = start
+    out[at, 0], out[at, 1], out[at, 2] = x, y, z
+    at += 1
+    for r in range(TAIL_RINGS):
+        share = (r + 1.0) / TAIL_RINGS
+        radius = girth * (tail[1] + share * (tail[2] - tail[1]))
+        heading += bends[r]
+        fall = min(max((z - radius) * 0.45, -0.6 * step), 0.8 * step)
+        run = math.sqrt(step * step - fall * fall)
+        x, y, z = x + run * math.cos(heading), y + run * math.sin(heading), z - fall
+        for k in range(TAIL_SEGMENTS):
+            phi = 2.0 * math.pi * k / TAIL_SEGMENTS
+            side = radius * math.cos(phi)
+            out[at, 0] = x - side * math.sin(heading)
+            out[at, 1] = y + side * math.cos(heading)
+            out[at, 2] = z + radius * math.sin(phi)
+            at += 1
+    out[at, 0], out[at, 1], out[at, 2] = x, y, z
+    return at + 1
+
+
+@njit(cache=True)
+def skin_tube(joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out):
+    """Vertices (V, 3) mm of one animal with a tubular body: trunk, blobs, tail. Shapes as in `BodyShape`."""
+    arc, frame = np.empty(joints.shape[0]), np.empty((4, 3))
+    chain_arc(joints, arc)
+    at = _body(joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, 0)
+    for b in range(blobs.shape[0]):
+        at = _blob(joints, rotations, arc, girth, blobs[b], frame, out, at)
+    _tail(joints, rotations, arc, girth, stations[0], tail, bends, frame, out, at)
+
+
+@njit(cache=True)
+def skin_tubes(joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out):
+    """`skin_tube` for a batch (n, ...), one after the other; stations (R,) are shared."""
+    for i in range(len(joints)):
+        skin_tube(joints[i], rotations[i], girth[i], stations, half_width[i], half_height[i], power[i], blobs[i],
+                  tail[i], bends[i], out[i])  # fmt: skip
+
+
+@njit(cache=True, parallel=True)
+def skin_tubes_parallel(joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out):
+    """`skin_tube` for a batch (n, ...) on all threads; stations (R,) are shared."""
+    for i in prange(len(joints)):
+        skin_tube(joints[i], rotations[i], girth[i], stations, half_width[i], half_height[i], power[i], blobs[i],
+                  tail[i], bends[i], out[i])  # fmt: skip
+
+
+@njit(cache=True)
+def skin_capsules(joints, girth, parents, radii, out):
+    """Vertices of one capsule a bone, round at both ends: joints (n, J, 3), girth (n,), radii (J,) mm -> (n, V, 3)."""
+    frame = np.empty((4, 3))
+    for i in range(len(joints)):
+        at = 0
+        for j in range(1, len(parents)):
+            at = _capsule(joints[i, parents[j]], joints[i, j], girth[i] * radii[parents[j]], girth[i] * radii[j],
+                          frame, out[i], at)  # fmt: skip
+
+
+@njit(cache=True)
+def _capsule(first, last, first_radius, last_radius, frame, out, start):
+    """A tube around one bone: half its rings round off each end."""
+    length = 0.0
+    for axis in range(3):
+        frame[1, axis] = last[axis] - first[axis]
+        length += frame[1, axis] ** 2
+        frame[3, axis] = 0.0
+    length = math.sqrt(length)
+    _normalise(frame, 1)
+    frame[3, 2 if abs(frame[1, 2]) < 0.9 else 0] = 1.0
+    _cross(frame, 3, 1, 2)
+    _normalise(frame, 2)
+    _cross(frame, 1, 2, 3)
+    half = CAPSULE_RINGS // 2
+    at = start
+    for r in range(CAPSULE_RINGS + 2):
+        near = r <= half
+        radius = first_radius if near else last_radius
+        theta = 0.5 * math.pi * (r if near else CAPSULE_RINGS + 1 - r) / half
+        along = -radius * math.cos(theta) if near else length + radius * math.cos(theta)
+        for k in range(1 if r == 0 or r == CAPSULE_RINGS + 1 else CAPSULE_SEGMENTS):
+            phi = 2.0 * math.pi * k / CAPSULE_SEGMENTS
+            left, up = radius * math.sin(theta) * math.cos(phi), radius * math.sin(theta) * math.sin(phi)
+            for axis in range(3):
+                out[at, axis] = first[axis] + along * frame[1, axis] + left * frame[2, axis] + up * frame[3, axis]
+            at += 1
+    return at

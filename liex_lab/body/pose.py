@@ -1,0 +1,59 @@
+"""A pose: a point on the manifold of SE(3) chains, one or a batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from liex_lab.body.kinematics import chain_from_joints, forward_kinematics
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import SE3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Skeleton coordinates, one pose or a batch (...).
+
+    root: T_frame_root, the base joint in the frame in which the pose lives; angles (..., J, 3) rad, rotation vectors
+    of each joint relative to its parent, zero at the base and on axes that are not free; scale (...) of all bones.
+    """
+
+    root: SE3
+    angles: Array
+    scale: Array
+
+    @staticmethod
+    def home(skeleton: Skeleton, *batch: int) -> Pose:
+        """The straight pose at the origin, pointing along x, or a batch of it."""
+        return Pose(SE3.identity(*batch), np.zeros((*batch, skeleton.n_joints, 3)), np.ones(batch))
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int) -> Pose:
+        """Some poses out of a batch."""
+        return Pose(SE3(self.root.rotation[index], self.root.translation[index]), self.angles[index], self.scale[index])
+
+    def frames(self, skeleton: Skeleton) -> SE3:
+        """T_frame_joint of every joint, a batch (..., J)."""
+        rotation, position = forward_kinematics(skeleton, self.root, self.angles, self.scale)
+        return SE3(rotation, position)
+
+    def joints(self, skeleton: Skeleton) -> Array:
+        """Joint positions (..., J, 3) mm in the pose's frame."""
+        return forward_kinematics(skeleton, self.root, self.angles, self.scale)[1]
+
+    def moved(self, T_new_old: SE3) -> Pose:
+        """The same posture in another frame."""
+        return Pose(T_new_old @ self.root, self.angles, self.scale)
+
+    @staticmethod
+    def from_joints(skeleton: Skeleton, joints: ArrayLike, up: ArrayLike) -> Pose:
+        """The pose (...) whose bones point along given joint positions (..., J, 3) mm of one chain.
+
+        Each joint turns by the smallest rotation that aims its bone; the base's roll is chosen so that its z axis lies
+        as near to `up` (3,) as its bone allows. Bones keep their proportions; the scale comes from the total length.
+        """
+        root, angles, scale = chain_from_joints(skeleton, np.asarray(joints, float), np.asarray(up, float))
+        return Pose(root, angles, scale)

@@ -1,0 +1,169 @@
+"""A skeleton: a kinematic tree of joints and bones of fixed proportions, described by a TOML file."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.geometry import so3
+
+Array = NDArray[np.float64]
+
+AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the joint's own frame
+PRESETS = Path(__file__).parent / "presets"
+_JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
+_ROOT_DOF = 6
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Joints of an animal in its home pose: straight, seen from above, base joint at the origin.
+
+    Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a joint away from
+    its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame into the joint's at home; `axes`
+    (J, 3) says which of roll, pitch and yaw the joint can do; `limits` (J, 3, 2) rad. The base joint, 0, has all six
+    degrees of freedom. Parents precede their children.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    parents: NDArray[np.int64]
+    offsets: Array
+    rest: Array
+    axes: NDArray[np.bool_]
+    limits: Array
+    surface: dict[str, Any]
+
+    @staticmethod
+    def load(animal: str | Path) -> Skeleton:
+        """The skeleton of a preset ('fish', 'mouse', 'hand') or of a TOML file that a user wrote."""
+        path = PRESETS / f"{animal}.toml"
+        if not path.is_file():
+            path = Path(animal)
+        if not path.is_file():
+            known = sorted(p.stem for p in PRESETS.glob("*.toml"))
+            near = difflib.get_close_matches(str(animal), known, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}, or give a .toml file"
+            raise LiexError(f"there is no skeleton '{animal}': {hint}")
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise LiexError(f"the skeleton {path} is not a TOML file: {error}") from None
+        return Skeleton.from_table(table, str(path))
+
+    @staticmethod
+    def from_table(table: dict[str, Any], origin: str) -> Skeleton:
+        """A skeleton from the content of its TOML; `origin` names the file in errors."""
+        joints = table.get("joints")
+        if not isinstance(table.get("name"), str) or not isinstance(joints, list) or not joints:
+            raise LiexError(f"{origin}: a skeleton needs a name and at least one [[joints]] table")
+        rows = [_Joint.parse(joint, k, origin) for k, joint in enumerate(joints)]
+        names = [row.name for row in rows]
+        parents = []
+        for k, row in enumerate(rows):
+            if k == 0 and row.parent:
+                raise LiexError(f"{origin}: the first joint is the base and has no parent, got '{row.parent}'")
+            if k > 0 and row.parent not in names[:k]:
+                raise LiexError(f"{origin}: the parent '{row.parent}' of '{row.name}' must be a joint listed before it")
+            parents.append(names.index(row.parent) if k else -1)
+        if len(set(names)) != len(names):
+            raise LiexError(f"{origin}: two joints have the same name; every joint needs its own")
+        axes = np.array([row.axes for row in rows], bool)
+        axes[0] = True
+        return Skeleton(
+            name=table["name"],
+            names=tuple(names),
+            parents=np.array(parents, np.int64),
+            offsets=np.array([row.offset for row in rows], float),
+            rest=so3.exp(np.radians([row.rest for row in rows])),
+            axes=axes,
+            limits=np.radians([row.limits for row in rows]),
+            surface=table.get("surface", {}),
+        )
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints, end-effectors included."""
+        return len(self.names)
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom: six for the base and one for each free axis of the other joints."""
+        return _ROOT_DOF + int(self.axes[1:].sum())
+
+    @cached_property
+    def edges(self) -> list[tuple[int, int]]:
+        """The bones as (parent, child) pairs."""
+        return [(int(p), j) for j, p in enumerate(self.parents) if p >= 0]
+
+    @cached_property
+    def length(self) -> float:
+        """Length of the longest chain from the base at home, mm: the spine of a mouse, the body of a fish."""
+        reach = np.zeros(self.n_joints)
+        for parent, child in self.edges:
+            reach[child] = reach[parent] + np.linalg.norm(self.offsets[child])
+        return float(reach.max())
+
+    @cached_property
+    def next_joint(self) -> NDArray[np.int64]:
+        """(J,) the first child of each joint, the one its bone points at; -1 at an end-effector."""
+        first = np.full(self.n_joints, -1, np.int64)
+        for parent, child in reversed(self.edges):
+            first[parent] = child
+        return first
+
+    @cached_property
+    def solved(self) -> list[int]:
+        """The joints that move and so need a regressor, base first."""
+        return [0] + [j for j in range(1, self.n_joints) if self.axes[j].any()]
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """One [[joints]] table, checked."""
+
+    name: str
+    parent: str
+    offset: list[float]
+    rest: list[float]
+    axes: list[bool]
+    limits: list[list[float]]
+
+    @staticmethod
+    def parse(table: dict[str, Any], index: int, origin: str) -> _Joint:
+        name = table.get("name")
+        if not isinstance(name, str):
+            raise LiexError(f"{origin}: joint {index} has no name")
+        where = f"{origin}: joint '{name}'"
+        for key in table:
+            if key not in _JOINT_KEYS:
+                raise LiexError(f"{where} has an unknown key '{key}'; known are {', '.join(sorted(_JOINT_KEYS))}")
+        axes = table.get("axes", [])
+        if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
+            raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
+        limits_deg = table.get("limits_deg", {})
+        limits = [limits_deg.get(axis, [-180.0, 180.0] if axis in axes else [0.0, 0.0]) for axis in AXES]
+        if any(len(pair) != 2 or not pair[0] <= pair[1] for pair in limits):
+            raise LiexError(f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}")
+        return _Joint(
+            name,
+            table.get("parent", ""),
+            _triple(table.get("offset_mm", [0.0, 0.0, 0.0]), f"{where}: offset_mm"),
+            _triple(table.get("rest_deg", [0.0, 0.0, 0.0]), f"{where}: rest_deg"),
+            [axis in axes for axis in AXES],
+            limits,
+        )
+
+
+def _triple(value: Any, where: str) -> list[float]:
+    if not isinstance(value, list) or len(value) != 3 or not all(isinstance(x, int | float) for x in value):
+        raise LiexError(f"{where} is a list of three numbers, got {value}")
+    return [float(x) for x in value]

@@ -1,0 +1,158 @@
+"""The surface around a skeleton, as a triangle mesh, and its picture in a depth camera.
+
+A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a tube along one chain
+of joints (the mouse), `radii_mm` a capsule around every bone (anything else).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body import _render, _skin
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.camera import Camera
+from liex_lab.errors import LiexError
+from liex_lab.geometry import SE3
+
+Array = NDArray[np.float64]
+Window = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh of fixed topology that follows a skeleton: `faces` (F, 3) index the vertices (V, 3) of every pose.
+
+    shape: the default animal of a tubular body; radii (J,) mm at scale 1 of a capsule body. The other one is None.
+    """
+
+    skeleton: Skeleton
+    faces: NDArray[np.int32]
+    stations: Array
+    shape: BodyShape | None
+    radii: Array | None
+
+    @staticmethod
+    def of(skeleton: Skeleton) -> Surface:
+        """The surface that the skeleton's TOML describes."""
+        table = skeleton.surface
+        if "stations" in table:
+            shape = BodyShape.default(skeleton)
+            stations = np.array(table["stations"], float)
+            parts = [(len(stations) - 2, _skin.BODY_SEGMENTS)]
+            parts += [(_skin.BLOB_RINGS, _skin.BLOB_SEGMENTS)] * len(shape.blobs)
+            parts += [(_skin.TAIL_RINGS, _skin.TAIL_SEGMENTS)]
+            return Surface(skeleton, _skin.joined_faces(parts), stations, shape, None)
+        radii = np.array(table.get("radii_mm", []), float)
+        if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each of its "
+                f"{skeleton.n_joints} joints, or stations with half_width_mm and half_height_mm"
+            )
+        parts = [(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * (skeleton.n_joints - 1)
+        return Surface(skeleton, _skin.joined_faces(parts), np.zeros(0), None, radii)
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of one pose's mesh."""
+        return int(self.faces.max()) + 1
+
+    @property
+    def n_trunk_vertices(self) -> int:
+        """The leading vertices that belong to the trunk, without ears, feet and tail."""
+        return (len(self.stations) - 2) * _skin.BODY_SEGMENTS + 2 if self.shape is not None else self.n_vertices
+
+    @property
+    def n_trunk_faces(self) -> int:
+        """The leading faces that belong to the trunk."""
+        return 2 * (len(self.stations) - 2) * _skin.BODY_SEGMENTS if self.shape is not None else len(self.faces)
+
+    def vertices(
+        self,
+        pose: Pose,
+        shape: BodyShape | None = None,
+        girth: Array | float | None = None,
+        bends: Array | None = None,
+        parallel: bool = True,
+    ) -> Array:
+        """Mesh vertices (..., V, 3) mm of poses (...), in the poses' frame.
+
+        shape: the animal; None is the default animal without ears, feet and tail. girth (...) multiplies all lengths
+        across the body; None takes the pose's scale. bends (n, TAIL_RINGS) rad: how the tail lies. A tail needs poses
+        in the arena frame: it sinks to z = 0.
+        """
+        frames = pose.frames(self.skeleton)
+        batch = frames.translation.shape[:-2]
+        joints = np.ascontiguousarray(frames.translation).reshape(-1, self.skeleton.n_joints, 3)
+        n = len(joints)
+        size = np.broadcast_to(pose.scale if girth is None else girth, batch).astype(float).reshape(n)
+        out = np.empty((n, self.n_vertices, 3))
+        if self.shape is None:
+            _skin.skin_capsules(joints, size, self.skeleton.parents, self.radii, out)
+            return out.reshape(*batch, -1, 3)
+        body = (self.shape.bare() if shape is None else shape).broadcast(n)
+        turns = np.zeros((n, _skin.TAIL_RINGS)) if bends is None else np.asarray(bends, float)
+        rotations = np.ascontiguousarray(frames.rotation).reshape(n, self.skeleton.n_joints, 3, 3)
+        skin = _skin.skin_tubes_parallel if parallel and n > 16 else _skin.skin_tubes
+        skin(joints, rotations, size, self.stations, body.half_width, body.half_height, body.power, body.blobs,
+             body.tail, turns, out)  # fmt: skip
+        return out.reshape(*batch, -1, 3)
+
+    def render(
+        self,
+        pose: Pose,
+        camera: Camera,
+        window: Window | None = None,
+        shape: BodyShape | None = None,
+        T_camera_pose: SE3 | None = None,
+        **skinning: Array | float | None,
+    ) -> NDArray[np.float32]:
+        """Depth (H, W) mm of one pose alone, 0 where it is not; see `vertices` and `render_mesh`."""
+        mesh = self.vertices(pose, shape, **skinning)  # type: ignore[arg-type]
+        return render_mesh(mesh, self.faces, camera, window, T_camera_pose)
+
+
+def render_mesh(
+    vertices: Array,
+    faces: NDArray[np.int32],
+    camera: Camera,
+    window: Window | None = None,
+    T_camera_mesh: SE3 | None = None,
+) -> NDArray[np.float32]:
+    """Depth (H, W) mm of one closed mesh; 0 where it is not.
+
+    vertices (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there; window: (u0, v0, width, height)
+    of the picture, None the whole of it.
+    """
+    T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
+    u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
+    inverse, depth = np.zeros((height, width)), np.empty((height, width), np.float32)
+    _render.draw(np.ascontiguousarray(vertices), faces, T.rotation, T.translation, camera.fx, camera.fy, camera.cx,
+                 camera.cy, float(u0), float(v0), inverse)  # fmt: skip
+    _render.to_depth(inverse, depth)
+    return depth
+
+
+def render_meshes(
+    vertices: Array,
+    faces: NDArray[np.int32],
+    T_camera_mesh: SE3,
+    intrinsics: Array,
+    origin: Array,
+    size: tuple[int, int],
+    parallel: bool = True,
+) -> NDArray[np.float32]:
+    """Depth (n, H, W) mm of meshes (n, V, 3), each seen by its own camera in its own window.
+
+    T_camera_mesh (n); intrinsics (n, 4): fx, fy, cx, cy; origin (n, 2): the picture's pixel at the window's top left;
+    size: (width, height) of the windows.
+    """
+    depth = np.empty((len(vertices), size[1], size[0]), np.float32)
+    drive = _render.draw_batch_parallel if parallel else _render.draw_batch
+    drive(vertices, faces, T_camera_mesh.rotation, T_camera_mesh.translation, np.asarray(intrinsics, float),
+          np.asarray(origin, float), depth)  # fmt: skip
+    return depth

@@ -1,0 +1,34 @@
+"""Left-invariant Brownian motion on SE(3) (Lie-X Eq. 6 and 7)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from liex_lab.geometry.se3 import SE3
+
+
+def brownian_steps(
+    rng: np.random.Generator, covariance: ArrayLike, n_steps: int, *batch: int
+) -> NDArray[np.float64]:
+    """Tangent steps z_k ~ N(0, covariance) (*batch, n_steps, 6) for a covariance (6, 6) in rad and mm."""
+    return rng.multivariate_normal(np.zeros(6), np.asarray(covariance, float), size=(*batch, n_steps))
+
+
+def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) -> SE3:
+    """The path g(t) from `start` at the given times (n,), as a batch (n,).
+
+    g((k+1) delta) = g(k delta) exp(sqrt(delta) z_k) (Eq. 6); between the steps
+    g(t) = g(k delta) exp((t - k delta) / sqrt(delta) z_k) (Eq. 7).
+
+    steps: tangent steps z (n_steps, 6); delta: step length in s; times: seconds in [0, n_steps * delta].
+    """
+    z, t = np.asarray(steps, float), np.atleast_1d(np.asarray(times, float))
+    if not delta > 0 or t.min() < 0 or t.max() > len(z) * delta * (1 + 1e-12):
+        raise ValueError(f"times must lie within the path, 0 to {len(z) * delta} s, got {t.min()} to {t.max()} s")
+    nodes = [start]
+    for step in z:
+        nodes.append(nodes[-1] @ SE3.exp(np.sqrt(delta) * step))
+    before = np.minimum((t / delta).astype(int), len(z) - 1)
+    at_node = SE3(np.stack([nodes[k].rotation for k in before]), np.stack([nodes[k].translation for k in before]))
+    return at_node @ SE3.exp(((t - before * delta) / np.sqrt(delta))[:, None] * z[before])

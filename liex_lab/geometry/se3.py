@@ -1,0 +1,101 @@
+"""The group SE(3) of rigid motions: one element or a batch, with the formulas of Lie-X section 3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from liex_lab.geometry import so3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SE3:
+    """Rigid transforms, one or a batch: `T_a_b` carries points of frame b into frame a.
+
+    rotation (..., 3, 3), proper; translation (..., 3) mm. A tangent vector is (wx, wy, wz, vx, vy, vz), as in the
+    paper: radians, then millimetres.
+    """
+
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def identity(*batch: int) -> SE3:
+        """The identity, or a batch of identities of shape `batch`."""
+        return SE3(np.broadcast_to(np.eye(3), (*batch, 3, 3)).copy(), np.zeros((*batch, 3)))
+
+    @staticmethod
+    def from_matrix(matrix: ArrayLike) -> SE3:
+        """From homogeneous matrices (..., 4, 4)."""
+        m = np.asarray(matrix, float)
+        return SE3(m[..., :3, :3].copy(), m[..., :3, 3].copy())
+
+    @staticmethod
+    def exp(twist: ArrayLike) -> SE3:
+        """The group elements of twists (..., 6) (Lie-X Eq. 4 and 5)."""
+        xi = np.asarray(twist, float)
+        omega, nu = xi[..., :3], xi[..., 3:]
+        return SE3(so3.exp(omega), np.einsum("...ij,...j->...i", so3.left_jacobian(omega), nu))
+
+    def log(self) -> Array:
+        """The twists (..., 6) with rotation angle in [0, pi]: the inverse of `exp`."""
+        omega = so3.log(self.rotation)
+        nu = np.einsum("...ij,...j->...i", so3.left_jacobian_inverse(omega), self.translation)
+        return np.concatenate([omega, nu], axis=-1)
+
+    def inverse(self) -> SE3:
+        """`T_b_a` of `T_a_b`."""
+        transposed = np.swapaxes(self.rotation, -1, -2)
+        return SE3(transposed, -np.einsum("...ij,...j->...i", transposed, self.translation))
+
+    def adjoint(self) -> Array:
+        """Matrices (..., 6, 6) that carry a twist of frame b into frame a: `exp(Ad xi) = g exp(xi) g^-1`."""
+        r = self.rotation
+        matrix = np.zeros((*r.shape[:-2], 6, 6))
+        matrix[..., :3, :3] = r
+        matrix[..., 3:, 3:] = r
+        matrix[..., 3:, :3] = so3.hat(self.translation) @ r
+        return matrix
+
+    @property
+    def matrix(self) -> Array:
+        """Homogeneous matrices (..., 4, 4)."""
+        m = np.zeros((*self.rotation.shape[:-2], 4, 4))
+        m[..., :3, :3], m[..., :3, 3], m[..., 3, 3] = self.rotation, self.translation, 1.0
+        return m
+
+    @overload
+    def __matmul__(self, other: SE3) -> SE3: ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> Array: ...
+    def __matmul__(self, other: SE3 | ArrayLike) -> SE3 | Array:
+        if isinstance(other, SE3):
+            return SE3(self.rotation @ other.rotation, self @ other.translation)
+        return np.einsum("...ij,...j->...i", self.rotation, np.asarray(other, float)) + self.translation
+
+    def geodesic(self, other: SE3, s: ArrayLike) -> SE3:
+        """The curve from self (s = 0) to other (s = 1): rotation and translation each go straight (Lie-X section 3).
+
+        The paper's matrix multiplies the translation by A, with which the end point is missed; it is left out here.
+        """
+        step = np.asarray(s, float)[..., None]
+        omega = so3.log(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
+        rotation = self.rotation @ so3.exp(step * omega)
+        return SE3(rotation, self.translation + step * (other.translation - self.translation))
+
+
+def product_of_exponentials(twists: ArrayLike) -> SE3:
+    """All partial products exp(xi_1) ... exp(xi_j) of a chain of twists (..., J, 6), as a batch (..., J)."""
+    links = SE3.exp(twists)
+    rotations, translations = [], []
+    so_far = SE3.identity(*links.translation.shape[:-2])
+    for j in range(links.translation.shape[-2]):
+        so_far = so_far @ SE3(links.rotation[..., j, :, :], links.translation[..., j, :])
+        rotations.append(so_far.rotation)
+        translations.append(so_far.translation)
+    return SE3(np.stack(rotations, axis=-3), np.stack(translations, axis=-2))

@@ -1,0 +1,118 @@
+"""The rotation group SO(3): hat, exp, log, and means. Vectors are (..., 3) radians, rotations (..., 3, 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL_EXP = 1e-8  # th^2 below which exp uses its series
+_SMALL_A = 1e-6  # th^2 below which A and its inverse use their series
+
+
+def hat(omega: ArrayLike) -> Array:
+    """Skew matrices (..., 3, 3) of vectors (..., 3) (Lie-X Eq. 2): `hat(w) @ x == cross(w, x)`."""
+    w = np.asarray(omega, float)
+    matrix = np.zeros((*w.shape[:-1], 3, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -w[..., 2], w[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = w[..., 2], -w[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -w[..., 1], w[..., 0]
+    return matrix
+
+
+def vee(matrix: ArrayLike) -> Array:
+    """Vectors (..., 3) of skew matrices (..., 3, 3): the inverse of `hat`."""
+    m = np.asarray(matrix, float)
+    return np.stack([m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]], axis=-1)
+
+
+def exp(omega: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3) rad, by Rodrigues' formula."""
+    w = np.asarray(omega, float)
+    th2 = np.sum(w * w, axis=-1)[..., None, None]
+    small = th2 < _SMALL_EXP
+    th = np.sqrt(np.where(small, 1.0, th2))
+    a = np.where(small, 1.0 - th2 / 6.0, np.sin(th) / th)
+    # 2 sin^2(th/2) / th^2 keeps all digits where 1 - cos(th) would cancel
+    b = np.where(small, 0.5 - th2 / 24.0, 2.0 * np.sin(th / 2.0) ** 2 / (th * th))
+    w_hat = hat(w)
+    return np.eye(3) + a * w_hat + b * (w_hat @ w_hat)
+
+
+def quaternion(rotation: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) as (w, x, y, z), w >= 0, of rotations (..., 3, 3).
+
+    Shepperd's method: of the four squared components the largest is taken as pivot, so no division is by a small
+    number at any angle, pi included.
+    """
+    r = np.asarray(rotation, float)
+    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
+    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], wx, wy, wz], axis=-1),
+            np.stack([wx, squares[..., 1], xy, xz], axis=-1),
+            np.stack([wy, xy, squares[..., 2], yz], axis=-1),
+            np.stack([wz, xz, yz, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    pivot = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(rows, pivot[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def log(rotation: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) rad, length in [0, pi], of rotations (..., 3, 3): the inverse of `exp`.
+
+    Goes through the quaternion and atan2, which keeps full precision near 0 and near pi, where the arc cosine of the
+    trace loses all of it. At exactly pi the two signs are the same rotation; either may come out.
+    """
+    q = quaternion(rotation)
+    v = q[..., 1:]
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    tiny = length < 1e-9
+    factor = np.where(tiny, 2.0, 2.0 * np.arctan2(length, q[..., :1]) / np.where(tiny, 1.0, length))
+    return factor * v
+
+
+def left_jacobian(omega: ArrayLike) -> Array:
+    """The matrix A (..., 3, 3) of Lie-X Eq. 5: the translation of exp(omega, nu) is `A @ nu`."""
+    w = np.asarray(omega, float)
+    th2 = np.sum(w * w, axis=-1)[..., None, None]
+    small = th2 < _SMALL_A
+    th = np.sqrt(np.where(small, 1.0, th2))
+    b = np.where(small, 0.5 - th2 / 24.0, 2.0 * np.sin(th / 2.0) ** 2 / (th * th))
+    c = np.where(small, 1.0 / 6.0 - th2 / 120.0, (th - np.sin(th)) / th**3)
+    w_hat = hat(w)
+    return np.eye(3) + b * w_hat + c * (w_hat @ w_hat)
+
+
+def left_jacobian_inverse(omega: ArrayLike) -> Array:
+    """The inverse of `left_jacobian` for lengths in [0, pi]; it has a pole at 2 pi, so keep logs principal."""
+    w = np.asarray(omega, float)
+    th2 = np.sum(w * w, axis=-1)[..., None, None]
+    small = th2 < _SMALL_A
+    half = 0.5 * np.sqrt(np.where(small, 1.0, th2))
+    c = np.where(small, 1.0 / 12.0 + th2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / np.where(small, 1, th2))
+    w_hat = hat(w)
+    return np.eye(3) - 0.5 * w_hat + c * (w_hat @ w_hat)
+
+
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """The proper rotation (..., 3, 3) nearest to a matrix (..., 3, 3) in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, float))
+    sign = np.sign(np.linalg.det(u @ vt))
+    u = u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None, :]
+    return u @ vt
+
+
+def mean(rotations: ArrayLike, weights: ArrayLike | None = None) -> Array:
+    """Weighted mean rotation (3, 3) of rotations (n, 3, 3): the chordal mean, unique unless they cancel."""
+    r = np.asarray(rotations, float)
+    w = np.ones(len(r)) if weights is None else np.asarray(weights, float)
+    return nearest_rotation(np.einsum("n,nij->ij", w, r))

@@ -1,0 +1,103 @@
+"""Skeletons: the paper's counts, kinematics against the product of exponentials, and errors that name the mistake."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from liex_lab.body import Pose, Skeleton
+from liex_lab.body.kinematics import aim
+from liex_lab.body.skeleton import PRESETS
+from liex_lab.errors import LiexError
+from liex_lab.geometry import SE3, so3
+from liex_lab.geometry.se3 import product_of_exponentials
+
+
+@pytest.mark.parametrize(("animal", "joints", "dof"), [("fish", 21, 25), ("mouse", 5, 12), ("hand", 23, 26)])
+def test_presets_have_the_papers_joints_and_degrees_of_freedom(animal, joints, dof):
+    skeleton = Skeleton.load(animal)
+    assert (skeleton.n_joints, skeleton.dof) == (joints, dof)
+
+
+def test_the_mouse_has_the_bone_ratios_of_the_published_tracks():
+    skeleton = Skeleton.load("mouse")
+    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
+    np.testing.assert_allclose(bones / bones.sum(), [0.2440, 0.2090, 0.2256, 0.3214], atol=1e-4)
+    assert skeleton.length == pytest.approx(52.834, abs=1e-3)
+
+
+def test_published_mouse_poses_are_poses_of_our_skeleton(reference_data):
+    skeleton = Skeleton.load("mouse")
+    rows = np.loadtxt(reference_data / "liex_tracks" / "mouse_S1_frames_1_40.txt").reshape(-1, 5, 3)
+    joints = rows * np.array([1.0, 1.0, 1.0])  # x right, y up, z towards the camera: already right-handed, z up
+    pose = Pose.from_joints(skeleton, joints, np.array([0.0, 0.0, 1.0]))
+    assert np.abs(pose.joints(skeleton) - joints).max() < 0.02
+    np.testing.assert_allclose(pose.scale, np.round(pose.scale, 2), atol=2e-4)
+
+
+def random_pose(skeleton: Skeleton, rng: np.random.Generator, n: int = 20) -> Pose:
+    angles = rng.normal(0, 0.4, (n, skeleton.n_joints, 3)) * skeleton.axes
+    angles[:, 0] = 0
+    return Pose(SE3.exp(rng.normal(0, 1, (n, 6))), angles, rng.uniform(0.8, 1.3, n))
+
+
+@pytest.mark.parametrize("animal", ["fish", "mouse", "hand"])
+def test_kinematics_is_the_product_of_exponentials(animal):
+    skeleton = Skeleton.load(animal)
+    pose = random_pose(skeleton, np.random.default_rng(0), 1)
+    frames = pose.frames(skeleton)
+    for joint in range(skeleton.n_joints):
+        chain: list[np.ndarray] = []
+        j = joint
+        while j > 0:
+            move = np.concatenate([np.zeros(3), pose.scale[0] * skeleton.offsets[j]])
+            rest = np.concatenate([so3.log(skeleton.rest[j]), np.zeros(3)])
+            turn = np.concatenate([pose.angles[0, j], np.zeros(3)])
+            chain = [move, rest, turn, *chain]
+            j = int(skeleton.parents[j])
+        root = pose.root.log()[0]
+        g = product_of_exponentials(np.array([root, *chain]))
+        np.testing.assert_allclose(g.translation[-1], frames.translation[0, joint], atol=1e-9)
+        np.testing.assert_allclose(g.rotation[-1], frames.rotation[0, joint], atol=1e-9)
+
+
+@pytest.mark.parametrize("animal", ["fish", "mouse"])
+def test_a_chain_is_recovered_from_its_joints(animal):
+    skeleton = Skeleton.load(animal)
+    pose = random_pose(skeleton, np.random.default_rng(1))
+    joints = pose.joints(skeleton)
+    again = Pose.from_joints(skeleton, joints, pose.root.rotation[:, :, 2])
+    np.testing.assert_allclose(again.joints(skeleton), joints, atol=1e-9)
+    np.testing.assert_allclose(again.scale, pose.scale)
+
+
+def test_aiming_turns_one_direction_onto_the_other_even_when_they_are_opposite():
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(2, 50, 3))
+    b[0], b[1] = -a[0], 3 * a[1]
+    turned = np.einsum("nij,nj->ni", so3.exp(aim(a, b)), a / np.linalg.norm(a, axis=1, keepdims=True))
+    np.testing.assert_allclose(turned, b / np.linalg.norm(b, axis=1, keepdims=True), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: t["joints"][2].update(parent="nose"), "listed before"),
+        (lambda t: t["joints"][1].update(axes=["jaw"]), "axes is a list out of"),
+        (lambda t: t["joints"][1].update(lenght=3), "unknown key 'lenght'"),
+        (lambda t: t["joints"][1].update(offset_mm=[1, 2]), "three numbers"),
+        (lambda t: t.pop("joints"), "at least one"),
+    ],
+)
+def test_a_mistake_in_a_skeleton_is_named(change, says):
+    table = tomllib.loads((PRESETS / "mouse.toml").read_text(encoding="utf-8"))
+    change(table)
+    with pytest.raises(LiexError, match=says):
+        Skeleton.from_table(table, "mine.toml")
+
+
+def test_an_unknown_animal_names_the_nearest():
+    with pytest.raises(LiexError, match="did you mean 'mouse'"):
+        Skeleton.load("mose")

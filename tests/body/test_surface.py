@@ -1,0 +1,148 @@
+"""The surface around a skeleton: closed, the right size, moving with the body; and the families of shapes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from liex_lab.body import Pose, Skeleton
+from liex_lab.body.shape import FAMILIES, BodyShape, draw_shapes, draw_tail_bends
+from liex_lab.body.surface import Surface
+from liex_lab.errors import LiexError
+from liex_lab.geometry import SE3
+
+MOUSE = Skeleton.load("mouse")
+STATIONS = np.array(MOUSE.surface["stations"])
+
+
+def on_floor(n: int, scale: float = 1.23, height_mm: float = 20.0) -> Pose:
+    pose = Pose.home(MOUSE, n)
+    pose.root.translation[:, 2] = height_mm
+    return Pose(pose.root, pose.angles, np.full(n, scale))
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.sum(np.cross(a, b) * c) / 6.0)
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_every_edge_joins_two_triangles_that_run_opposite_ways(animal: str) -> None:
+    surface = Surface.of(Skeleton.load(animal))
+    edges = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in surface.faces for k in range(3))
+    assert set(edges.values()) == {1}
+    assert all((b, a) in edges for a, b in edges)
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_triangles_face_outward(animal: str) -> None:
+    skeleton = Skeleton.load(animal)
+    surface = Surface.of(skeleton)
+    assert volume(surface.vertices(Pose.home(skeleton)), surface.faces) > 0
+
+
+def test_an_adult_mouse_is_as_wide_and_high_as_the_preset_says() -> None:
+    surface = Surface.of(MOUSE)
+    trunk = surface.vertices(on_floor(1, scale=65.0 / MOUSE.length))[0, : surface.n_trunk_vertices]
+    extent = np.ptp(trunk, axis=0)
+    assert 30.0 < extent[1] < 34.0
+    assert 30.0 < extent[2] < 36.0
+    np.testing.assert_allclose(trunk[:, 0].max(), 65.0, atol=0.1)  # the nose joint is the nose's tip
+    np.testing.assert_allclose(trunk[:, 0].min(), 65.0 * STATIONS[0], atol=0.1)
+
+
+def test_joints_lie_in_the_middle_of_the_body() -> None:
+    surface = Surface.of(MOUSE)
+    trunk = surface.vertices(on_floor(1))[0, : surface.n_trunk_vertices]
+    joints = on_floor(1).joints(MOUSE)[0]
+    for joint in joints[:-1]:
+        near = trunk[np.abs(trunk[:, 0] - joint[0]) < 4.0]
+        np.testing.assert_allclose(near[:, 1:].min(0) + near[:, 1:].max(0), 2 * joint[1:], atol=0.5)
+
+
+def test_the_trunk_moves_rigidly_with_its_root() -> None:
+    rng = np.random.default_rng(0)
+    surface = Surface.of(MOUSE)
+    angles = rng.uniform(-0.5, 0.5, (5, 3)) * MOUSE.axes
+    angles[0] = 0
+    pose, T = Pose(SE3.identity(), angles, np.array(1.0)), SE3.exp(rng.uniform(-2, 2, 6))
+    np.testing.assert_allclose(surface.vertices(pose.moved(T)), T @ surface.vertices(pose), atol=1e-9)
+
+
+def test_the_mesh_scales_with_the_animal() -> None:
+    surface = Surface.of(MOUSE)
+    one, two = on_floor(1, 1.0, 0.0), on_floor(1, 2.0, 0.0)
+    np.testing.assert_allclose(surface.vertices(two), 2.0 * surface.vertices(one), atol=1e-9)
+
+
+def test_a_capsule_surface_holds_its_joints_radii() -> None:
+    fish = Skeleton.load("fish")
+    surface = Surface.of(fish)
+    vertices = surface.vertices(Pose.home(fish))
+    radii = np.array(fish.surface["radii_mm"])
+    np.testing.assert_allclose(np.ptp(vertices[:, 2]), 2 * radii.max(), rtol=0.1)
+    np.testing.assert_allclose(vertices[:, 0].max(), radii[0], rtol=1e-6)
+
+
+def test_a_users_own_animal_needs_only_a_table() -> None:
+    table = {"name": "worm", "joints": [{"name": "a"}, {"name": "b", "parent": "a", "offset_mm": [10, 0, 0]}],
+             "surface": {"radii_mm": [2.0, 1.0]}}  # fmt: skip
+    worm = Skeleton.from_table(table, "worm.toml")
+    assert np.ptp(Surface.of(worm).vertices(Pose.home(worm))[:, 0]) == pytest.approx(13.0)
+    table["surface"] = {"radii_mm": [2.0]}
+    with pytest.raises(LiexError, match="one positive number for each of its 2 joints"):
+        Surface.of(Skeleton.from_table(table, "worm.toml"))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_shapes_are_bodies_and_follow_the_seed(family: str) -> None:
+    shapes = draw_shapes(np.random.default_rng(5), MOUSE, family, 300)
+    again = draw_shapes(np.random.default_rng(5), MOUSE, family, 300)
+    np.testing.assert_array_equal(shapes.half_width, again.half_width)
+    assert np.isfinite(shapes.half_width).all()
+    assert np.isfinite(shapes.half_height).all()
+    assert (shapes.half_width[:, 1:-1] > 0).all()
+    assert shapes.half_width.max(axis=1).min() > 6.0
+    assert shapes.half_width.max() < (40.0 if family == "augmented" else 25.0)  # augmented leaves the range of mice
+
+
+def slim(shape: BodyShape) -> np.ndarray:
+    """Half widths of the bodies that are narrower than the default animal."""
+    return shape.half_width[shape.half_width.max(axis=1) < max(MOUSE.surface["half_width_mm"])]
+
+
+def test_the_other_familys_profiles_are_not_the_training_familys() -> None:
+    rng = np.random.default_rng(6)
+    train, other = (draw_shapes(rng, MOUSE, family, 2000).half_width for family in ("train", "other"))
+    # what the training family's four principal shapes leave unexplained
+    relative = [np.log(width[:, 2:-2] / width.max(axis=1, keepdims=True)) for width in (train, other)]
+    mean = relative[0].mean(axis=0)
+    _, _, axes = np.linalg.svd(relative[0] - mean, full_matrices=False)
+    rest = [np.linalg.norm((r - mean) - (r - mean) @ axes[:4].T @ axes[:4], axis=1).mean() for r in relative]
+    assert rest[1] > 2.0 * rest[0]
+
+
+def test_slim_bodies_of_the_other_family_are_widest_further_forward() -> None:
+    rng = np.random.default_rng(6)
+    train = STATIONS[draw_shapes(rng, MOUSE, "train", 2000).half_width.argmax(axis=1)].mean()
+    other = STATIONS[slim(draw_shapes(rng, MOUSE, "other", 2000)).argmax(axis=1)].mean()
+    assert other > train + 0.08
+
+
+def test_the_tail_lies_on_the_floor_behind_the_animal() -> None:
+    rng = np.random.default_rng(8)
+    surface, pose = Surface.of(MOUSE), on_floor(20)
+    shape = replace(BodyShape.default(MOUSE))
+    vertices = surface.vertices(pose, shape, bends=0.3 * draw_tail_bends(rng, 20))
+    tail = vertices[:, -80:]
+    assert (tail[..., 2] > -1.5).all()
+    assert np.median(tail[:, -30:, 2]) < 6.0
+    assert (tail[:, -1, 0] < vertices[:, 0, 0]).all()
+
+
+def test_an_unknown_family_is_refused() -> None:
+    with pytest.raises(LiexError, match="known are train, augmented, other"):
+        draw_shapes(np.random.default_rng(0), MOUSE, "rats", 1)

@@ -1,0 +1,76 @@
+"""Brownian motion on SE(3): Eq. 6 at the steps, Eq. 7 between them, the stated covariance everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.geometry import SE3, brownian_path, brownian_steps
+from tests.oracles import motion
+
+DELTA = 0.04
+COVARIANCE = np.diag([0.04, 0.01, 0.09, 4.0, 9.0, 1.0])
+COVARIANCE[0, 3] = COVARIANCE[3, 0] = 0.2
+START = SE3.exp([0.3, -0.2, 2.9, 100.0, 50.0, 600.0])
+
+
+def test_steps_have_the_covariance_asked_for() -> None:
+    steps = brownian_steps(np.random.default_rng(1), COVARIANCE, 40_000)
+    assert steps.shape == (40_000, 6)
+    found = np.cov(steps.T)
+    spread = np.sqrt(np.diag(COVARIANCE))
+    np.testing.assert_allclose(found / np.outer(spread, spread), COVARIANCE / np.outer(spread, spread), atol=0.03)
+    assert brownian_steps(np.random.default_rng(1), COVARIANCE, 5, 2, 3).shape == (2, 3, 5, 6)
+
+
+def test_one_seed_gives_one_path() -> None:
+    first, second = (brownian_steps(np.random.default_rng(4), COVARIANCE, 10) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_at_the_steps_the_path_is_equation_6() -> None:
+    steps = brownian_steps(np.random.default_rng(2), COVARIANCE, 6)
+    path = brownian_path(START, steps, DELTA, DELTA * np.arange(7))
+    by_hand = START.matrix
+    for k in range(7):
+        np.testing.assert_allclose(path.matrix[k], by_hand, atol=1e-9)
+        if k < 6:
+            by_hand = by_hand @ motion.exp(np.sqrt(DELTA) * steps[k])
+
+
+def test_between_the_steps_the_path_is_equation_7() -> None:
+    steps = brownian_steps(np.random.default_rng(3), COVARIANCE, 3)
+    nodes = brownian_path(START, steps, DELTA, DELTA * np.arange(4))
+    for k, share in [(0, 0.25), (1, 0.5), (2, 0.9)]:
+        t = (k + share) * DELTA
+        by_hand = nodes.matrix[k] @ motion.exp((t - k * DELTA) / np.sqrt(DELTA) * steps[k])
+        np.testing.assert_allclose(brownian_path(START, steps, DELTA, t).matrix[0], by_hand, atol=1e-9)
+
+
+def test_the_path_is_continuous() -> None:
+    steps = brownian_steps(np.random.default_rng(6), COVARIANCE, 5)
+    for k in range(1, 5):
+        around = brownian_path(START, steps, DELTA, [k * DELTA - 1e-9, k * DELTA, k * DELTA + 1e-9])
+        assert np.abs(np.diff(around.matrix, axis=0)).max() < 1e-6
+
+
+def test_the_motion_spreads_with_time_whatever_the_step() -> None:
+    """After one second the covariance is C, in 2 steps or in 20: that is what sqrt(delta) is for."""
+    small = np.diag([1e-4, 1e-4, 1e-4, 1.0, 2.0, 3.0])  # hardly turning, so that the steps add up
+    for n_steps in (2, 20):
+        steps = brownian_steps(np.random.default_rng(8), small, n_steps, 800)
+        ends = [brownian_path(SE3.identity(), walk, 1.0 / n_steps, 1.0).log()[0] for walk in steps]
+        np.testing.assert_allclose(np.var(ends, axis=0), np.diag(small), rtol=0.15)
+
+
+def test_the_motion_is_left_invariant() -> None:
+    steps = brownian_steps(np.random.default_rng(7), COVARIANCE, 4)
+    times = np.linspace(0, 4 * DELTA, 9)
+    from_start, from_origin = (brownian_path(g, steps, DELTA, times) for g in (START, SE3.identity()))
+    np.testing.assert_allclose(from_start.matrix, (START @ from_origin).matrix, atol=1e-9)
+
+
+@pytest.mark.parametrize("times", [[-0.01], [5 * DELTA]])
+def test_a_time_outside_the_path_is_refused(times: list[float]) -> None:
+    with pytest.raises(ValueError, match="within the path"):
+        brownian_path(START, np.zeros((4, 6)), DELTA, times)

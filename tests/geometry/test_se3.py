@@ -1,0 +1,139 @@
+"""Rigid transforms are a group, and the formulas of Lie-X section 3 hold in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liex_lab.geometry import SE3, so3
+from liex_lab.geometry.se3 import product_of_exponentials
+from tests.geometry.strategies import Array, twists
+from tests.oracles import motion
+
+
+def assert_close(found: Any, expected: Any) -> None:
+    np.testing.assert_allclose(found, expected, atol=1e-9, rtol=0)
+
+
+def assert_same(first: SE3, second: SE3) -> None:
+    assert_close(first.matrix, second.matrix)
+
+
+@given(a=twists(), b=twists(), c=twists())
+def test_transforms_are_a_group(a: Array, b: Array, c: Array) -> None:
+    g, h, k = SE3.exp(a), SE3.exp(b), SE3.exp(c)
+    assert_same((g @ h) @ k, g @ (h @ k))
+    assert_same(g @ SE3.identity(), g)
+    assert_same(g @ g.inverse(), SE3.identity())
+    assert_same((g @ h).inverse(), h.inverse() @ g.inverse())
+
+
+@given(a=twists(), b=twists())
+def test_composition_is_the_product_of_matrices(a: Array, b: Array) -> None:
+    g, h = SE3.exp(a), SE3.exp(b)
+    assert_close((g @ h).matrix, g.matrix @ h.matrix)
+    assert_same(SE3.from_matrix(g.matrix), g)
+
+
+@given(a=twists(), b=twists(), p=st.tuples(*[st.floats(-500, 500)] * 3))
+def test_frames_cancel_on_points(a: Array, b: Array, p: tuple[float, float, float]) -> None:
+    T_world_camera, T_camera_body = SE3.exp(a), SE3.exp(b)
+    in_world = (T_world_camera @ T_camera_body) @ p
+    assert_close(T_world_camera @ (T_camera_body @ p), in_world)
+    assert_close((T_world_camera.matrix @ T_camera_body.matrix @ [*p, 1.0])[:3], in_world)
+
+
+@given(xi=twists())
+def test_exp_agrees_with_the_matrix_exponential(xi: Array) -> None:
+    assert_close(SE3.exp(xi).matrix, motion.exp(xi))
+
+
+@given(xi=twists())
+def test_exp_undoes_log(xi: Array) -> None:
+    g = SE3.exp(xi)
+    assert_same(SE3.exp(g.log()), g)
+
+
+@given(xi=twists())
+def test_log_undoes_exp(xi: Array) -> None:
+    # near pi the two directions of turning meet, and log may come back by the other one
+    if np.linalg.norm(xi[:3]) < np.pi - 1e-9:
+        assert_close(SE3.exp(xi).log(), xi)
+
+
+@pytest.mark.parametrize("below_pi", [1e-12, 1e-9, 1e-6, 1e-4, 1e-3])
+def test_log_undoes_exp_near_pi(below_pi: float) -> None:
+    rng = np.random.default_rng(11)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        xi = np.concatenate([(np.pi - below_pi) * axis / np.linalg.norm(axis), rng.uniform(-50, 50, 3)])
+        assert_close(SE3.exp(xi).log(), xi)
+
+
+@given(a=twists(), b=twists())
+def test_the_adjoint_carries_a_twist_into_the_other_frame(a: Array, b: Array) -> None:
+    g, xi = SE3.exp(a), 0.001 * b
+    by_matrix = g.matrix @ motion.hat(xi) @ np.linalg.inv(g.matrix)
+    assert_close(motion.hat(g.adjoint() @ xi), by_matrix)
+    assert_same(SE3.exp(g.adjoint() @ xi), g @ SE3.exp(xi) @ g.inverse())
+
+
+@given(a=twists(), b=twists())
+def test_the_adjoint_is_a_homomorphism(a: Array, b: Array) -> None:
+    g, h = SE3.exp(a), SE3.exp(b)
+    assert_close((g @ h).adjoint(), g.adjoint() @ h.adjoint())
+
+
+@given(a=twists(), b=twists())
+def test_a_geodesic_begins_and_ends_where_it_should(a: Array, b: Array) -> None:
+    g, h = SE3.exp(a), SE3.exp(b)
+    path = g.geodesic(h, np.array([0.0, 1.0]))
+    assert_close(path.matrix[0], g.matrix)
+    assert_close(path.matrix[1], h.matrix)
+
+
+@given(a=twists(), b=twists())
+def test_a_geodesic_has_constant_speed_and_takes_the_shorter_way(a: Array, b: Array) -> None:
+    g, h = SE3.exp(a), SE3.exp(b)
+    path = g.geodesic(h, np.linspace(0.0, 1.0, 9))
+    turns = [motion.angle_between(path.rotation[i], path.rotation[i + 1]) for i in range(8)]
+    steps = np.linalg.norm(np.diff(path.translation, axis=0), axis=1)
+    np.testing.assert_allclose(turns, motion.angle_between(g.rotation, h.rotation) / 8, atol=1e-7)
+    assert_close(steps, np.linalg.norm(h.translation - g.translation) / 8)
+
+
+@given(chain=st.lists(twists(), min_size=1, max_size=5))
+def test_a_product_of_exponentials_is_the_loop_a_reader_would_write(chain: list[Array]) -> None:
+    products = product_of_exponentials(np.array(chain))
+    np.testing.assert_allclose(products.matrix, motion.chain(chain), atol=1e-8)
+
+
+def test_a_batch_of_chains_is_each_of_them() -> None:
+    chains = np.random.default_rng(5).normal(size=(3, 4, 6))
+    products = product_of_exponentials(chains)
+    assert products.matrix.shape == (3, 4, 4, 4)
+    for k in range(3):
+        np.testing.assert_allclose(products.matrix[k], motion.chain(chains[k]), atol=1e-12)
+
+
+def test_one_transform_moves_a_batch_and_a_batch_moves_one_point() -> None:
+    rng = np.random.default_rng(9)
+    xis, points = rng.normal(size=(7, 6)), rng.normal(size=(7, 3))
+    batch = SE3.exp(xis)
+    for k in range(7):
+        one = SE3.exp(xis[k])
+        np.testing.assert_allclose((batch @ points)[k], one @ points[k], atol=1e-14)
+        np.testing.assert_allclose((batch @ points[0])[k], one @ points[0], atol=1e-14)
+        np.testing.assert_allclose((SE3.exp(xis[0]) @ batch).matrix[k], (SE3.exp(xis[0]) @ one).matrix, atol=1e-14)
+    np.testing.assert_array_equal(SE3.identity(2, 3).matrix, np.broadcast_to(np.eye(4), (2, 3, 4, 4)))
+
+
+def test_a_twist_about_the_vertical_is_a_circle() -> None:
+    """A quarter turn to the left while walking ahead ends ahead and to the left by the circle's radius."""
+    quarter = SE3.exp([0, 0, np.pi / 2, 100.0, 0, 0])
+    np.testing.assert_allclose(quarter.translation, [200 / np.pi, 200 / np.pi, 0], atol=1e-12)
+    np.testing.assert_allclose(so3.log(quarter.rotation), [0, 0, np.pi / 2], atol=1e-15)

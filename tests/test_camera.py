@@ -1,0 +1,80 @@
+"""The pinhole: project undoes unproject, and nothing is seen behind the lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liex_lab.camera import KINECT_V2, PRIMESENSE, Camera
+from liex_lab.errors import LiexError
+
+pixels = st.floats(-50, 700)
+cameras = st.sampled_from([KINECT_V2, PRIMESENSE, Camera(2363.0, 2360.0, 511.5, 500.0, 1024, 1024)])
+
+
+@given(camera=cameras, u=pixels, v=pixels, depth=st.floats(100, 5000))
+def test_project_undoes_unproject(camera: Camera, u: float, v: float, depth: float) -> None:
+    point = camera.unproject([u, v], depth)
+    assert point[2] == depth
+    np.testing.assert_allclose(camera.project(point), [u, v], atol=1e-9)
+
+
+@given(camera=cameras, x=st.floats(-900, 900), y=st.floats(-900, 900), z=st.floats(50, 5000))
+def test_unproject_undoes_project(camera: Camera, x: float, y: float, z: float) -> None:
+    np.testing.assert_allclose(camera.unproject(camera.project([x, y, z]), z), [x, y, z], atol=1e-9)
+
+
+@given(camera=cameras, x=st.floats(-900, 900), y=st.floats(-900, 900), z=st.floats(50, 5000))
+def test_projection_is_the_matrix_k(camera: Camera, x: float, y: float, z: float) -> None:
+    u, v, w = camera.matrix @ [x, y, z]
+    np.testing.assert_allclose(camera.project([x, y, z]), [u / w, v / w], atol=1e-9)
+
+
+@pytest.mark.parametrize("z", [0.0, -1.0, -600.0, math.nan])
+def test_behind_the_lens_is_nan(z: float) -> None:
+    assert np.isnan(PRIMESENSE.project([10.0, 20.0, z])).all()
+    assert np.isfinite(PRIMESENSE.project([[10.0, 20.0, 500.0], [10.0, 20.0, z]])[0]).all()
+
+
+def test_the_axes_point_as_agreed() -> None:
+    """x right, y down, z away; the optical axis meets the picture in (cx, cy)."""
+    u, v = PRIMESENSE.project([0.0, 0.0, 700.0])
+    assert (u, v) == (PRIMESENSE.cx, PRIMESENSE.cy)
+    assert PRIMESENSE.project([1.0, 0.0, 700.0])[0] > u
+    assert PRIMESENSE.project([0.0, 1.0, 700.0])[1] > v
+
+
+def test_a_hundred_pixels_are_as_long_as_the_focal_length_says() -> None:
+    """100 px from the centre at 673.1 mm with f = 365 px are 184.4 mm (BEHAVIOUR f2: MoSeq says 162)."""
+    x = KINECT_V2.unproject([KINECT_V2.cx + 100, KINECT_V2.cy], 673.1)[0]
+    assert round(float(x), 1) == 184.4
+
+
+def test_batches_keep_their_shape() -> None:
+    rng = np.random.default_rng(0)
+    uv, depth = rng.uniform(0, 400, (3, 5, 2)), rng.uniform(300, 900, (3, 5))
+    points = KINECT_V2.unproject(uv, depth)
+    assert points.shape == (3, 5, 3)
+    np.testing.assert_allclose(KINECT_V2.project(points), uv, atol=1e-9)
+    assert KINECT_V2.unproject(uv, 600.0).shape == (3, 5, 3)
+    assert KINECT_V2.unproject([10.0, 20.0], depth).shape == (3, 5, 3)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"fx": 0.0}, {"fy": -365.0}, {"fx": math.nan}, {"fx": math.inf}, {"cx": math.nan}, {"width": 0}, {"height": -1}],
+)
+def test_a_camera_that_cannot_be_is_refused_in_a_sentence(wrong: dict[str, Any]) -> None:
+    with pytest.raises(LiexError, match=", got ") as caught:
+        replace(KINECT_V2, **wrong)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_camera_survives_its_own_table() -> None:
+    assert Camera(**PRIMESENSE.to_dict()) == PRIMESENSE
