@@ -1,0 +1,283 @@
+"""Numba kernels of the foreground: background statistics, blobs, and the height map of one animal."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 4  # pixels a side; blobs are connected in blocks
+_MIN_IN_BLOCK = 5  # of 16 pixels
+MAX_BLOBS = 32
+
+
+@njit(cache=True)
+def far_mode(values, window):
+    """Depth and spread of the farthest cluster in sorted readings (n,) mm; (0, 0) without one.
+
+    An animal is always nearer than what it covers, so the background is the farthest depth that comes back, not the
+    most frequent: a pixel covered nine tenths of the time still shows it. A cluster needs a twentieth of the
+    readings (at least 3) within `window` mm, which lone outliers beyond the floor do not reach.
+    """
+    n = values.size
+    need = max(3, (n + 19) // 20)
+    if n < need:
+        return 0.0, 0.0
+    top = n - 1
+    while top - need + 1 >= 0:
+        if values[top] - values[top - need + 1] <= window:
+            low = top
+            while low > 0 and values[top] - values[low - 1] <= window:
+                low -= 1
+            middle = values[(low + top) // 2]
+            # re-centre on the cluster's own middle, so that a few far readings do not cut its near half off
+            low = top
+            while low > 0 and middle - values[low - 1] <= window:
+                low -= 1
+            count = top - low + 1
+            middle = values[low + count // 2]
+            spread = 0.5 * (values[low + int(0.84 * (count - 1))] - values[low + int(0.16 * (count - 1))])
+            return middle, spread
+        top -= 1
+    return 0.0, 0.0
+
+
+@njit(cache=True, parallel=True)
+def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
+    """`far_mode` of every pixel of `stack` (n, H, W) mm, 0 = unread, into depth and spread (H, W).
+
+    near (H, W) gets the depth that only `near_share` of a pixel's readings are nearer than.
+    """
+    for row in prange(stack.shape[1]):
+        values = np.empty(stack.shape[0], np.float32)
+        for column in range(stack.shape[2]):
+            n = 0
+            for k in range(stack.shape[0]):
+                if stack[k, row, column] > 0:
+                    values[n] = stack[k, row, column]
+                    n += 1
+            ordered = np.sort(values[:n])
+            window = window_mm if n == 0 else max(window_mm, window_share * ordered[-1])
+            depth[row, column], spread[row, column] = far_mode(ordered, window)
+            near[row, column] = ordered[int(near_share * n)] if n > 0 else 0.0
+
+
+@njit(cache=True)
+def label_blobs(depth, limit, on_floor, labels, blobs):
+    """Connected blobs of pixels nearer than `limit` (H, W), in blocks.
+
+    labels (H // BLOCK, W // BLOCK) int32 gets the blob of each block, -1 for none. blobs (MAX_BLOBS, 7) gets pixels,
+    first and last block row and column, the sum of depths, and the pixels that cover the floor `on_floor` (H, W).
+    Returns the number of blobs (the largest ones when there are more than fit).
+    """
+    n_rows, n_columns = labels.shape
+    for i in range(n_rows):
+        for j in range(n_columns):
+            labels[i, j] = 0
+        for r in range(BLOCK):
+            row_depth, row_limit = depth[i * BLOCK + r], limit[i * BLOCK + r]
+            for j in range(n_columns):
+                count = 0
+                for c in range(BLOCK):
+                    z = row_depth[j * BLOCK + c]
+                    count += (z > 0) & (z < row_limit[j * BLOCK + c])
+                labels[i, j] += count
+        for j in range(n_columns):
+            labels[i, j] = -2 if labels[i, j] >= _MIN_IN_BLOCK else -1
+    n_blobs = 0
+    stack = np.empty((n_rows * n_columns, 2), np.int32)
+    for i in range(n_rows):
+        for j in range(n_columns):
+            if labels[i, j] != -2:
+                continue
+            if n_blobs == MAX_BLOBS:
+                slot = int(np.argmin(blobs[:, 0]))
+                _forget(labels, slot)
+            else:
+                slot = n_blobs
+                n_blobs += 1
+            _flood(depth, limit, on_floor, labels, i, j, slot, stack, blobs[slot])
+    return n_blobs
+
+
+@njit(cache=True)
+def _forget(labels, slot):
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] == slot:
+                labels[i, j] = -1
+
+
+@njit(cache=True)
+def _flood(depth, limit, on_floor, labels, i, j, slot, stack, blob):
+    """Give every block connected with (i, j) the label `slot`, and count the blob's pixels into `blob` (7,)."""
+    blob[0], blob[1], blob[2], blob[3], blob[4], blob[5], blob[6] = 0, i, i, j, j, 0.0, 0
+    top = 1
+    stack[0, 0], stack[0, 1] = i, j
+    labels[i, j] = slot
+    while top > 0:
+        top -= 1
+        row, column = stack[top, 0], stack[top, 1]
+        blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
+        blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
+        for v in range(row * BLOCK, row * BLOCK + BLOCK):
+            for u in range(column * BLOCK, column * BLOCK + BLOCK):
+                z = depth[v, u]
+                if z > 0 and z < limit[v, u]:
+                    blob[0] += 1
+                    blob[5] += z
+                    blob[6] += on_floor[v, u]
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                a, b = row + di, column + dj
+                if 0 <= a < labels.shape[0] and 0 <= b < labels.shape[1] and labels[a, b] == -2:
+                    labels[a, b] = slot
+                    stack[top, 0], stack[top, 1] = a, b
+                    top += 1
+
+
+@njit(cache=True)
+def is_animal_block(labels, row, column, slot):
+    """Whether a block belongs to the blob or borders it without belonging to another one."""
+    if row < 0 or column < 0 or row >= labels.shape[0] or column >= labels.shape[1]:
+        return False
+    if labels[row, column] >= 0:
+        return labels[row, column] == slot
+    for di in range(-1, 2):
+        for dj in range(-1, 2):
+            a, b = row + di, column + dj
+            if 0 <= a < labels.shape[0] and 0 <= b < labels.shape[1] and labels[a, b] == slot:
+                return True
+    return False
+
+
+@njit(cache=True)
+def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
+    """Height above the floor, mm, of the blob's pixels into raw (S, S) float32: -1 background, -2 without a reading.
+
+    plane (3,): 1 / z of the floor = a u + b v + c; distance mm of the camera from it. A point at depth z seen at
+    (u, v) is `distance * (1 - z (a u + b v + c))` high. Crop pixel (r, c) is picture pixel origin + step * (c, r).
+    The outermost ring stays background, so a probe clamped to the border reads what lies outside.
+    """
+    size = raw.shape[0]
+    height, width = depth.shape
+    a, b, c0 = plane[0], plane[1], plane[2]
+    for r in range(size):
+        v = origin[1] + step * r
+        for c in range(size):
+            u = origin[0] + step * c
+            value = np.float32(-1.0)
+            if 0 < r < size - 1 and 0 < c < size - 1 and 0 <= v < height and 0 <= u < width:
+                z = depth[v, u]
+                if (z == 0 or z < limit[v, u]) and is_animal_block(labels, v // BLOCK, u // BLOCK, slot):
+                    above = max(0.0, distance * (1.0 - z * (a * u + b * v + c0)))
+                    value = np.float32(-2.0) if z == 0 else np.float32(above)
+            raw[r, c] = value
+
+
+@njit(cache=True)
+def keep_largest(raw, seen, stack):
+    """Erase from raw (S, S) all pixels but the largest group, in which no gap is wider than a pixel.
+
+    Blocks join what is a few pixels apart; pixel by pixel a neighbour is told from the animal. seen (S, S) int32 and
+    stack (S * S, 2) int32 are scratch.
+    """
+    size = raw.shape[0]
+    seen[:] = 0
+    best, best_count, group = 0, 0, 0
+    for r in range(1, size - 1):
+        for c in range(1, size - 1):
+            if raw[r, c] == -1.0 or seen[r, c] != 0:
+                continue
+            group += 1
+            count, top = 0, 1
+            stack[0, 0], stack[0, 1] = r, c
+            seen[r, c] = group
+            while top > 0:
+                top -= 1
+                i, j = stack[top, 0], stack[top, 1]
+                count += raw[i, j] >= 0.0
+                for a in range(max(i - 2, 1), min(i + 3, size - 1)):
+                    for b in range(max(j - 2, 1), min(j + 3, size - 1)):
+                        if raw[a, b] != -1.0 and seen[a, b] == 0:
+                            seen[a, b] = group
+                            stack[top, 0], stack[top, 1] = a, b
+                            top += 1
+            if count > best_count:
+                best, best_count = group, count
+    for r in range(1, size - 1):
+        for c in range(1, size - 1):
+            if seen[r, c] != best:
+                raw[r, c] = -1.0
+
+
+@njit(cache=True)
+def smooth_heights(raw, radius, out):
+    """Box-filtered heights in 1/16 mm, int16, into out (S, S): background 0, holes filled from what surrounds them.
+
+    A pixel of the animal becomes the mean of the animal's pixels within `radius`; a pixel without reading becomes that
+    mean where at least 5 of the pixels around it are the animal and more of them than are background.
+    """
+    size = raw.shape[0]
+    for r in range(size):
+        for c in range(size):
+            out[r, c] = 0
+    for r in range(1, size - 1):
+        for c in range(1, size - 1):
+            here = raw[r, c]
+            if here == -1.0:
+                continue
+            reach = radius if here >= 0.0 else radius + 1
+            total, n, n_background = 0.0, 0, 0
+            for i in range(max(r - reach, 0), min(r + reach + 1, size)):
+                for j in range(max(c - reach, 0), min(c + reach + 1, size)):
+                    value = raw[i, j]
+                    if value >= 0.0:
+                        total += value
+                        n += 1
+                    elif value == -1.0:
+                        n_background += 1
+            if here >= 0.0 or (n >= 5 and n > 2 * n_background):
+                out[r, c] = min(32000, int(total / n * 16.0 + 0.5))
+
+
+@njit(cache=True)
+def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments):
+    """Mass, area and axes of an animal from its height map, in the arena frame, into moments (8,).
+
+    moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of the long axis
+    (mod pi), and the standard deviations mm along and across it. intrinsics (fx, fy, cx, cy); rotation (3, 3) of
+    T_arena_camera, whose translation is (0, 0, distance).
+    """
+    n, area, volume = 0, 0.0, 0.0
+    sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for r in range(1, heights.shape[0] - 1):
+        v = origin[1] + step * r
+        for c in range(1, heights.shape[1] - 1):
+            if heights[r, c] <= 0:
+                continue
+            u = origin[0] + step * c
+            h = heights[r, c] / 16.0
+            z = (1.0 - h / distance) / (plane[0] * u + plane[1] * v + plane[2])
+            xc, yc = (u - cx) / fx * z, (v - cy) / fy * z
+            x = rotation[0, 0] * xc + rotation[0, 1] * yc + rotation[0, 2] * z
+            y = rotation[1, 0] * xc + rotation[1, 1] * yc + rotation[1, 2] * z
+            w = step * step * z * z / (fx * fy)
+            n += 1
+            area += w
+            volume += w * h
+            sx += w * x
+            sy += w * y
+            sxx += w * x * x
+            sxy += w * x * y
+            syy += w * y * y
+    for k in range(8):
+        moments[k] = 0.0
+    if n == 0:
+        return
+    mx, my = sx / area, sy / area
+    vxx, vxy, vyy = sxx / area - mx * mx, sxy / area - mx * my, syy / area - my * my
+    angle = 0.5 * np.arctan2(2.0 * vxy, vxx - vyy)
+    half, root = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+    moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = n, area, volume, mx, my, angle
+    moments[6], moments[7] = np.sqrt(max(half + root, 0.0)), np.sqrt(max(half - root, 0.0))

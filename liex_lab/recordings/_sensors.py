@@ -1,0 +1,246 @@
+"""Kernels of the sensor models: what a PrimeSense or a Kinect v2 makes of an ideal depth picture.
+
+Every random number comes from a small generator whose state (1,) uint64 belongs to one picture, so a picture depends on
+its seed alone, never on threads or on order. Arguments that all kernels share: depth (H, W) mm, 0 = nothing in range;
+what (H, W) uint8: NOTHING, STILL (background), ANIMAL, OBJECT; `p`: one row of sensor parameters, indexed as below.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+NOTHING, STILL, ANIMAL, OBJECT = 0, 1, 2, 3
+
+PRIMESENSE_KIND, KINECT_V2_KIND = 0, 1
+BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
+SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
+
+# columns of a row of sensor parameters
+KIND, NOISE, EROSION, FUR, BIAS, HOLES, DARK, SIDE, SMOOTH, WHITE, LUMPS, EDGE_DROP, GRID, JITTER, FLYING = range(15)
+N_PARAMETERS = 15
+
+_TABLE_BITS = 13
+_SHIFT = 64 - _TABLE_BITS
+
+
+def _normal_table() -> np.ndarray:
+    """Quantiles of the standard normal distribution at 2^13 evenly spaced probabilities."""
+    from statistics import NormalDist
+
+    n = 1 << _TABLE_BITS
+    return np.array([NormalDist().inv_cdf((k + 0.5) / n) for k in range(n)], np.float32)
+
+
+NORMAL = _normal_table()
+
+
+@njit(cache=True)
+def advance(state):
+    """The next 64 random bits (xorshift64, after Marsaglia); state (1,) must not be 0."""
+    x = state[0]
+    x ^= x << np.uint64(13)
+    x ^= x >> np.uint64(7)
+    x ^= x << np.uint64(17)
+    state[0] = x
+    return x
+
+
+@njit(cache=True)
+def uniform(state):
+    """A number in [0, 1)."""
+    return np.float64(advance(state) >> np.uint64(40)) * (1.0 / 16777216.0)
+
+
+@njit(cache=True)
+def normal(state, table):
+    """A standard normal number, to the resolution of the table."""
+    return table[np.int64(advance(state) >> np.uint64(_SHIFT))]
+
+
+@njit(cache=True)
+def smooth_field(state, table, spacing, out):
+    """Fill out (H, W) with noise of unit deviation at its nodes, `spacing` pixels apart, linear between them."""
+    height, width = out.shape
+    n_columns = int(width / spacing) + 3
+    above, below = np.empty(n_columns, np.float32), np.empty(n_columns, np.float32)
+    start_u, start_v = uniform(state), uniform(state)
+    column_of, share_of = np.empty(width, np.int32), np.empty(width, np.float32)
+    for u in range(width):
+        at = u / spacing + start_u
+        column_of[u] = int(at)
+        share_of[u] = at - int(at)
+    for k in range(n_columns):
+        above[k], below[k] = normal(state, table), normal(state, table)
+    node = 0
+    for v in range(height):
+        at = v / spacing + start_v
+        while int(at) > node:
+            node += 1
+            for k in range(n_columns):
+                above[k] = below[k]
+                below[k] = normal(state, table)
+        t = np.float32(at - node)
+        for u in range(width):
+            k, s = column_of[u], share_of[u]
+            a, b = above[k] + s * (above[k + 1] - above[k]), below[k] + s * (below[k + 1] - below[k])
+            out[v, u] = a + t * (b - a)
+
+
+@njit(cache=True)
+def soften(depth, what, p, state, table, field):
+    """What fur does before any sensor looks: lumps, a bias of dark hair, and an outline that returns less, in place.
+
+    `erosion` pixels of the animal's outline go to whatever stands behind, and a share of the next ones, after FUR.
+    """
+    height, width = depth.shape
+    smooth_field(state, table, p[GRID] * 1.3, field)
+    for v in range(height):
+        for u in range(width):
+            if what[v, u] == ANIMAL:
+                depth[v, u] += p[LUMPS] * field[v, u] + p[BIAS]
+    rounds = int(p[EROSION])
+    for k in range(rounds + 1):
+        share = 1.0 if k < rounds else 0.5 * p[FUR]
+        lost = np.empty((height * width // 4, 2), np.int32)
+        behind, n_lost = np.empty(len(lost), np.float32), 0
+        for v in range(1, height - 1):
+            for u in range(1, width - 1):
+                if what[v, u] == ANIMAL and n_lost < len(lost):
+                    far = _outside(depth, what, v, u)
+                    if far > depth[v, u] + 2.0 and uniform(state) < share:
+                        lost[n_lost, 0], lost[n_lost, 1], behind[n_lost] = v, u, far
+                        n_lost += 1
+        for i in range(n_lost):
+            depth[lost[i, 0], lost[i, 1]] = behind[i]
+            what[lost[i, 0], lost[i, 1]] = STILL
+
+
+@njit(cache=True)
+def _outside(depth, what, v, u):
+    """The farthest of the four neighbours that are not the animal, 0 if all are."""
+    far = np.float32(0.0)
+    if what[v - 1, u] != ANIMAL:
+        far = max(far, depth[v - 1, u])
+    if what[v + 1, u] != ANIMAL:
+        far = max(far, depth[v + 1, u])
+    if what[v, u - 1] != ANIMAL:
+        far = max(far, depth[v, u - 1])
+    if what[v, u + 1] != ANIMAL:
+        far = max(far, depth[v, u + 1])
+    return far
+
+
+@njit(cache=True)
+def _step(depth, v, u):
+    """Largest difference in mm to the four neighbours that exist, with its sign."""
+    height, width = depth.shape
+    here, worst = depth[v, u], np.float32(0.0)
+    if v > 0 and depth[v - 1, u] > 0 and abs(depth[v - 1, u] - here) > abs(worst):
+        worst = depth[v - 1, u] - here
+    if v < height - 1 and depth[v + 1, u] > 0 and abs(depth[v + 1, u] - here) > abs(worst):
+        worst = depth[v + 1, u] - here
+    if u > 0 and depth[v, u - 1] > 0 and abs(depth[v, u - 1] - here) > abs(worst):
+        worst = depth[v, u - 1] - here
+    if u < width - 1 and depth[v, u + 1] > 0 and abs(depth[v, u + 1] - here) > abs(worst):
+        worst = depth[v, u + 1] - here
+    return worst
+
+
+@njit(cache=True)
+def primesense(depth, what, p, focal, state, table, out):
+    """Structured light: out (H, W) uint16 mm, 0 = unread. See `soften` and the module's head for the arguments.
+
+    Disparity f b / z is read over a window (smooth errors, outlines displaced by about a pixel), in eighths of a pixel;
+    what the projector cannot see, beside anything that stands up, is unread, and so are grazing surfaces.
+    """
+    height, width = depth.shape
+    field, move_u = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    move_v = np.empty((height, width), np.float32)
+    smooth_field(state, table, p[GRID], field)
+    smooth_field(state, table, 2.5, move_u)
+    smooth_field(state, table, 2.5, move_v)
+    strength, jitter, fb = p[NOISE], p[JITTER], focal * BASELINE_MM
+    shadow = np.empty(width, np.bool_)
+    for v in range(height):
+        _shadow(depth[v], fb, p[SIDE], shadow)
+        for u in range(width):
+            row = min(max(v + int(round(jitter * move_v[v, u])), 0), height - 1)
+            column = min(max(u + int(round(jitter * move_u[v, u])), 0), width - 1)
+            z = depth[row, column]
+            if z <= 0.0 or shadow[column]:
+                out[v, u] = 0
+                continue
+            step = abs(_step(depth, row, column)) * focal / z
+            drop = p[HOLES] + (p[DARK] if what[row, column] == ANIMAL else 0.0)
+            if step > 3.0:
+                drop += p[EDGE_DROP] * min((step - 3.0) / 6.0, 1.0)
+            if uniform(state) < drop * strength:
+                out[v, u] = 0
+                continue
+            noise = strength * (p[SMOOTH] * field[v, u] + p[WHITE] * normal(state, table))
+            disparity = np.round((fb / z + noise) * SUBPIXEL) / SUBPIXEL
+            out[v, u] = int(fb / disparity + 0.5) if disparity > 0.5 else 0
+
+
+@njit(cache=True)
+def _shadow(row, fb, side, shadow):
+    """Which pixels of one row of depths (W,) the projector cannot see; it stands to the right (side > 0) or left.
+
+    Seen from the projector a point moves by its disparity; points that come to lie behind an already passed, nearer one
+    are hidden by it.
+    """
+    width = len(row)
+    front = 1e9
+    for k in range(width):
+        u = width - 1 - k if side > 0 else k
+        shadow[u] = False
+        if row[u] > 0:
+            seen = (u if side > 0 else -u) - fb / row[u]
+            # a pixel of slack: slopes seen at a grazing angle are not a shadow's edge
+            shadow[u] = seen > front + 0.7
+            front = min(front, seen)
+
+
+@njit(cache=True)
+def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
+    """Time of flight: out (H, W) uint16 mm, 0 = unread. (centre_u, centre_v): the optical axis in window pixels.
+
+    Noise grows with the squared distance, towards the corners and on slopes, part of it smooth; at an outline a pixel
+    mixes the near and the far surface (flying pixels) or is unread.
+    """
+    height, width = depth.shape
+    field = np.empty((height, width), np.float32)
+    smooth_field(state, table, p[GRID], field)
+    strength = p[NOISE]
+    for v in range(height):
+        for u in range(width):
+            z = depth[v, u]
+            if z <= 0.0:
+                out[v, u] = 0
+                continue
+            step = _step(depth, v, u)
+            slope = min(abs(step) * focal / z, 3.0)
+            far2 = (z * 1e-3) ** 2
+            corner = 1.0 + ((u - centre_u) ** 2 + (v - centre_v) ** 2) / (focal * focal)
+            drop = p[HOLES] + (p[DARK] * (1.0 + slope) if what[v, u] == ANIMAL else 0.0)
+            if abs(step) > 8.0:
+                drop += p[EDGE_DROP]
+                if uniform(state) < p[FLYING]:
+                    z += step * uniform(state) * 0.9
+            if uniform(state) < drop * strength:
+                out[v, u] = 0
+                continue
+            spread = (0.5 + 0.5 * far2) * corner * (1.0 + 0.5 * slope) * strength
+            z += spread * (p[SMOOTH] * field[v, u] + p[WHITE] * normal(state, table))
+            out[v, u] = int(z + 0.5)
+
+
+@njit(cache=True)
+def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
+    """One picture through its sensor: depth and what are consumed, `field` (H, W) float32 is scratch space."""
+    soften(depth, what, p, state, table, field)
+    if int(p[KIND]) == PRIMESENSE_KIND:
+        primesense(depth, what, p, focal, state, table, out)
+    else:
+        kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out)

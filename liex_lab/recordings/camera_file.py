@@ -1,0 +1,145 @@
+"""camera.toml: the few facts about a depth camera that pictures do not hold."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from liex_lab.camera import Camera, Lens
+from liex_lab.errors import RecordingError
+from liex_lab.recordings.times import start_of_day
+
+CAMERA_FILE = "camera.toml"
+WHAT_TO_WRITE = (
+    "write a file camera.toml with the lines [camera], fx = 575.8, fy = 575.8, cx = 319.5, cy = 239.5 (your camera's "
+    "numbers, in pixels), unit_mm = 1.0 (millimetres per stored step) and fps = 30.0 where there is no timestamps.csv"
+)
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
+_TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time")
+_KEYS = (*_NUMBERS, "unread", *_TEXTS)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a camera.toml states, under [camera] or at its top; everything may be left out.
+
+    intrinsics: any of fx, fy, cx, cy; width, height: pixels; unit_mm: millimetres per stored step; unread: stored
+    values that mean "no reading"; fps: used where there are no stamps; timestamps: name of the stamp file; pattern:
+    which pictures of the folder to read, as in "*_depth.png"; metadata: subject_id, session_start_time.
+    """
+
+    path: Path
+    intrinsics: dict[str, float] = field(default_factory=dict)
+    width: int | None = None
+    height: int | None = None
+    unit_mm: float = 1.0
+    unread: tuple[float, ...] = (0.0,)
+    fps: float | None = None
+    timestamps: str = "timestamps.csv"
+    pattern: str = "*"
+    metadata: dict[str, str] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+
+    @staticmethod
+    def read(path: Path) -> CameraFile:
+        """The file at `path`; where there is none, what holds when nothing is stated."""
+        if not path.is_file():
+            return CameraFile(path)
+        try:
+            document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise RecordingError(f"{path} should be a TOML file, but it does not parse ({error}); correct it") from None
+        table = {key: value for key, value in document.items() if not isinstance(value, dict)}
+        for name in ("camera", "recording"):
+            if isinstance(document.get(name), dict):
+                table |= document[name]
+        unknown = [key for key in table if key not in _KEYS]
+        return _from_table(path, table, tuple(_unknown_key(path, key) for key in unknown))
+
+    def camera(self, width: int, height: int, stated: Lens | None = None) -> Camera:
+        """The camera of pictures of this size; `stated` comes before the file."""
+        if stated is not None:
+            return fitting(stated, width, height, "the camera that was stated")
+        if not self.intrinsics:
+            raise RecordingError(f"the camera is not known, for there is no [camera] in {self.path}; {WHAT_TO_WRITE}")
+        missing = [name for name in _INTRINSICS if name not in self.intrinsics]
+        if missing:
+            raise RecordingError(f"{self.path} does not state {', '.join(missing)}; {WHAT_TO_WRITE}")
+        camera = Camera(**self.intrinsics, width=self.width or width, height=self.height or height, source=CAMERA_FILE)
+        return fitting(camera, width, height, str(self.path))
+
+
+def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
+    """The camera itself, if it belongs to pictures of this size; one stated without a size belongs to any."""
+    camera = lens if isinstance(lens, Camera) else Camera(lens.fx, lens.fy, lens.cx, lens.cy, width, height)
+    if (camera.width, camera.height) != (width, height):
+        raise RecordingError(
+            f"{where} is for pictures of {camera.width} x {camera.height} pixels, but these have {width} x {height}; "
+            "state the intrinsics of this picture size"
+        )
+    return camera
+
+
+def rate(fps: float | None, where: str) -> float | None:
+    """A stated frame rate, if it can be one."""
+    if fps is not None and not (math.isfinite(fps) and 0 < fps <= 100_000):
+        raise RecordingError(f"{where} states fps = {fps:g}; a frame rate is a positive number of frames per second")
+    return fps
+
+
+def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) -> CameraFile:
+    numbers = {key: _number(path, key, table[key]) for key in _NUMBERS if key in table}
+    unread = table.get("unread", [0])
+    unread = unread if isinstance(unread, list) else [unread]
+    for key in ("width", "height"):
+        if key in numbers and not (numbers[key] >= 1 and numbers[key] == int(numbers[key])):
+            raise RecordingError(f"{path} states {key} = {numbers[key]:g}; it is a positive whole number of pixels")
+    for key in ("fx", "fy"):
+        if key in numbers and not numbers[key] > 0:
+            raise RecordingError(
+                f"{path} states {key} = {numbers[key]:g}; a focal length is a positive number of pixels"
+            )
+    if numbers.get("unit_mm", 1.0) == 0.0:
+        raise RecordingError(f"{path} states unit_mm = 0; it is the number of millimetres in one stored step")
+    for key in ("timestamps", "pattern", "subject_id"):
+        if key in table and not (isinstance(table[key], str) and table[key]):
+            raise RecordingError(f"{path} states {key} = {table[key]!r}; it is a text in quotation marks")
+    metadata = {"subject_id": table["subject_id"]} if "subject_id" in table else {}
+    if "session_start_time" in table:
+        start = start_of_day(table["session_start_time"])
+        if start is None:
+            problems += (
+                f"session_start_time in {path} has no time zone, so it was not used; write 2024-05-01T10:00:00Z",
+            )
+        else:
+            metadata["session_start_time"] = start
+    return CameraFile(
+        path=path,
+        intrinsics={key: numbers[key] for key in _INTRINSICS if key in numbers},
+        width=int(numbers["width"]) if "width" in numbers else None,
+        height=int(numbers["height"]) if "height" in numbers else None,
+        unit_mm=numbers.get("unit_mm", 1.0),
+        unread=tuple(_number(path, "unread", value, finite=False) for value in unread),
+        fps=rate(numbers.get("fps"), str(path)),
+        timestamps=table.get("timestamps", "timestamps.csv"),
+        pattern=table.get("pattern", "*"),
+        metadata=metadata,
+        problems=problems,
+    )
+
+
+def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:
+    good = isinstance(value, int | float) and not isinstance(value, bool)
+    if not good or (finite and not math.isfinite(value)):
+        raise RecordingError(f"{path} states {key} = {value!r} where a number was expected; correct it")
+    return float(value)
+
+
+def _unknown_key(path: Path, key: str) -> str:
+    near = difflib.get_close_matches(key, _KEYS, n=1)
+    return f"{path.name} has a key {key!r} that means nothing here{f'; did you mean {near[0]!r}?' if near else ''}"

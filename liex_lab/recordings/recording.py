@@ -1,0 +1,181 @@
+"""A recording: what a depth camera saw, frame by frame, read when asked for and never wholly in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.camera import Camera
+from liex_lab.errors import RecordingError
+from liex_lab.progress import Progress, silent
+from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.times import Gap, find_gaps, median_step
+
+Times = NDArray[np.int64]
+
+_BLOCK = 1 << 20
+
+
+class Recording:
+    """Depth frames in order of time, from one camera.
+
+    A format makes one by handing over `read`, which turns a stored frame's number into depth (H, W) float32 mm. Frames
+    are read one at a time, so memory does not grow with length; iterating twice reads twice and yields the same.
+
+    name; format ("images", "moseq", "mcap", ...); camera; times_ns (n,) int64 on the recording's own clock, strictly
+    increasing; problems: sentences about what is odd in the file, also those found while reading; truncated: the file
+    is cut or damaged, and n_whole of its frames are whole; metadata: subject_id and session_start_time (ISO 8601 with
+    zone) where the file tells them.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        format: str,
+        camera: Camera,
+        times_ns: Times,
+        read: Callable[[int], Depth],
+        sources: Sequence[Path] = (),
+        problems: list[str] | None = None,
+        truncated: bool = False,
+        n_whole: int | None = None,
+        metadata: dict[str, Any] | None = None,
+        close: Callable[[], None] | None = None,
+        step_ns: int | None = None,
+        stored: NDArray[np.int64] | None = None,
+    ) -> None:
+        """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from its parent."""
+        self.name, self.format, self.camera = name, format, camera
+        self.times_ns = np.ascontiguousarray(times_ns, np.int64)
+        self.problems: list[str] = [] if problems is None else problems
+        self.truncated = truncated
+        self.n_whole = len(self.times_ns) if n_whole is None else n_whole
+        self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
+        self._read, self._sources = read, tuple(sources)
+        self._stored = np.arange(len(self.times_ns)) if stored is None else stored
+        self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
+        self._digest: str | None = None
+        self._whole: Recording | None = None
+        if not len(self.times_ns):
+            raise RecordingError(f"{name} holds no frame; a recording has at least one")
+        if not np.all(np.diff(self.times_ns) > 0):
+            raise RecordingError(f"the time stamps of {name} do not increase strictly; pass them through `increasing`")
+        self.times_ns.flags.writeable = False
+        # at the latest when nobody holds the recording any more, or the program ends
+        self._close = None if close is None else weakref.finalize(self, close)
+
+    @property
+    def width(self) -> int:
+        """Pixels in a row."""
+        return self.camera.width
+
+    @property
+    def height(self) -> int:
+        """Rows in a picture."""
+        return self.camera.height
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second while none is missing: one over the median step; NaN for a single frame."""
+        return 1e9 / self._step_ns if self._step_ns else float("nan")
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first frame to the last."""
+        return int(self.times_ns[-1] - self.times_ns[0]) / 1e9
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """Where the camera left out frames: steps of more than 1.5 median steps."""
+        return find_gaps(self.times_ns, self._step_ns)
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    def __repr__(self) -> str:
+        return f"<Recording {self.name}: {len(self)} frames of {self.width} x {self.height}, {self.format}>"
+
+    def frame(self, index: int) -> DepthFrame:
+        """Frame `index`, counted from 0, or from the end when negative."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"frame {index} of a recording of {len(self)} frames")
+        row = index % len(self)
+        return DepthFrame(row, int(self.times_ns[row]), self._read(int(self._stored[row])))
+
+    def __iter__(self) -> Iterator[DepthFrame]:
+        return (self.frame(i) for i in range(len(self)))
+
+    def chunks(self, n_frames: int) -> Iterator[list[DepthFrame]]:
+        """All frames in lists of `n_frames` (the last may be shorter); only one list needs to be in memory."""
+        if n_frames < 1:
+            raise ValueError(f"a chunk has at least one frame, got {n_frames}")
+        for start in range(0, len(self), n_frames):
+            yield [self.frame(i) for i in range(start, min(start + n_frames, len(self)))]
+
+    def __getitem__(self, part: slice) -> Recording:
+        """Some of the frames as a recording of its own, with rows counted anew; it reads from the same files."""
+        if not isinstance(part, slice):
+            raise TypeError("a recording is cut with a slice, as in recording[10:20]; one frame is recording.frame(10)")
+        start, stop, step = part.indices(len(self))
+        if step < 1 or start >= stop:
+            raise RecordingError(f"the part {start}:{stop}:{step} of {self.name} holds no frame in order of time")
+        rows = slice(start, stop, step)
+        cut = Recording(
+            name=self.name, format=self.format, camera=self.camera, times_ns=self.times_ns[rows].copy(),
+            read=self._read, sources=self._sources, problems=self.problems, truncated=self.truncated,
+            metadata=self.metadata, step_ns=self._step_ns * step, stored=self._stored[rows],
+        )  # fmt: skip
+        cut._whole = self._whole or self
+        return cut
+
+    def digest(self, progress: Progress = silent) -> str:
+        """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in order of name.
+
+        A recording that is in no file is its times and depths. A slice has the digest of the whole input.
+        """
+        if self._whole is not None:
+            return self._whole.digest(progress)
+        if self._digest is None:
+            self._digest = file_digest(self._sources, progress) if self._sources else self._content_digest()
+        return self._digest
+
+    def _content_digest(self) -> str:
+        whole = hashlib.sha256(self.times_ns.astype("<i8").tobytes())
+        for frame in self:
+            whole.update(frame.depth.astype("<f4").tobytes())
+        return whole.hexdigest()
+
+    def close(self) -> None:
+        """Let go of files, and remove what was unpacked; a slice leaves that to the recording it was cut from."""
+        if self._close is not None:
+            self._close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
+    """sha256, hex: of one file its bytes; of several, for each in order of name its name, its size and its bytes."""
+    ordered = sorted(files, key=lambda path: path.name)
+    sizes = [path.stat().st_size for path in ordered]
+    whole, done, total = hashlib.sha256(), 0, sum(sizes) // _BLOCK + 1
+    for path, size in zip(ordered, sizes, strict=True):
+        if len(ordered) > 1:
+            whole.update(f"{path.name}\0{size}\0".encode())
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                whole.update(block)
+                done += len(block)
+                progress(done // _BLOCK, total, "reading the recording's hash (MB)")
+    return whole.hexdigest()

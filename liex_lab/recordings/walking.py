@@ -1,0 +1,193 @@
+"""A synthetic recording in which the mouse moves as one animal: it walks, turns, pauses, rears, hunches and curls."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import parse_qsl
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.shape import BodyShape, draw_shapes
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.camera import Lens
+from liex_lab.errors import RecordingError
+from liex_lab.recordings.camera_file import fitting
+from liex_lab.recordings.postures import KINDS, SIZE_RANGE, Posture, draw_postures, stand
+from liex_lab.recordings.sensors import BY_NAME, KINECT_V2_SENSOR, Sensor
+from liex_lab.recordings.stage import Stage, floor_point
+from liex_lab.recordings.synthetic import SyntheticSession, assemble
+
+Array = NDArray[np.float64]
+
+_RATE_HZ = 30.0
+# the stretches of a walk: how many in a shuffled deck, shortest and longest duration in s, speed in spines a second
+_WALK, _CURL, _REAR, _HUNCH, _REACH = range(len(KINDS))
+_STRETCHES = {
+    _WALK: (4, 0.7, 3.0, (0.6, 2.8)),
+    _CURL: (1, 0.5, 1.5, (0.0, 0.6)),
+    _REAR: (2, 0.7, 2.0, (0.0, 0.0)),
+    _HUNCH: (1, 1.0, 3.0, (0.0, 0.0)),
+    _REACH: (2, 0.4, 1.2, (0.0, 0.4)),
+}
+_BLEND_S = 0.12  # postures flow into one another over about this long
+_STRIDE_HZ_PER_SPINE = 1.6
+_EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
+_MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
+_SPINES_MM = (30.0, 150.0)
+
+
+def open_synthetic(address: str, camera: Lens | None = None) -> SyntheticSession:
+    """The virtual recording of an address, as in synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
+
+    Each setting may be left out: seed 0, 300 frames, a Kinect v2 (or primesense, primesense-qvga), and a size drawn
+    from the seed. camera: taken for the one that the pictures were made with, to see what a wrong one does.
+    """
+    kind, _, query = address.removeprefix("synthetic:").partition("?")
+    if kind != "walk":
+        raise RecordingError(f"{address} is no virtual recording; the only kind is walk, as in {_EXAMPLE}")
+    stated = dict(parse_qsl(query, keep_blank_values=True))
+    for key in stated:
+        if key not in _SETTINGS:
+            near = difflib.get_close_matches(key, _SETTINGS, 1, cutoff=0.0)[0]
+            raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
+    values = {key: _setting(address, key, text) for key, text in stated.items()}
+    seed = values.get("seed", 0)
+    session = walking_session(
+        seed, values.get("frames", 300), sensor=values.get("sensor", KINECT_V2_SENSOR),
+        spine_mm=values.get("spine_mm"), name=f"synthetic-walk-{seed}",
+    )  # fmt: skip
+    if camera is not None:
+        session.camera = fitting(camera, session.width, session.height, "the camera that was stated")
+    return session
+
+
+def _setting(address: str, key: str, text: str) -> Any:
+    """The value of one setting of an address."""
+    read, holds, expected = _SETTINGS[key]
+    try:
+        value = read(text)
+        if holds(value):
+            return value
+    except (KeyError, ValueError):
+        pass
+    raise RecordingError(f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}")
+
+
+# setting: (how to read it, what holds for it, what to say otherwise)
+_SETTINGS: dict[str, tuple[Callable[[str], Any], Callable[[Any], bool], str]] = {
+    "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
+    "frames": (int, lambda n: 1 <= n <= _MOST_FRAMES, f"a whole number from 1 to {_MOST_FRAMES}"),
+    "sensor": (BY_NAME.__getitem__, lambda _: True, f"one of {', '.join(BY_NAME)}"),
+    "spine_mm": (float, lambda mm: math.isfinite(mm) and _SPINES_MM[0] <= mm <= _SPINES_MM[1],
+                 f"a length from {_SPINES_MM[0]:g} to {_SPINES_MM[1]:g} mm"),
+}  # fmt: skip
+
+
+def walking_session(
+    seed: int | list[int],
+    n_frames: int,
+    *,
+    sensor: Sensor = KINECT_V2_SENSOR,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    thing_share: float = 0.0,
+    spine_mm: float | None = None,
+    skeleton: Skeleton | None = None,
+    name: str = "walking",
+) -> SyntheticSession:
+    """n_frames of one animal at 30 frames/s, drawn from the seed; arguments as in `SyntheticSession.draw`."""
+    rng = np.random.default_rng(seed)
+    skeleton = Skeleton.load("mouse") if skeleton is None else skeleton
+    spine = skeleton.length * float(rng.uniform(*SIZE_RANGE)) if spine_mm is None else float(spine_mm)
+    stage = Stage.draw(rng, sensor.camera, spine)
+    shape = draw_shapes(rng, skeleton, family, 1)
+    kinds, spines_per_s = _script(rng, n_frames)
+    posture = _flow(rng, skeleton, shape[0].broadcast(n_frames), kinds)
+    position, heading = _path(rng, stage, spine, spines_per_s * spine)
+    # the trunk sways with the stride
+    phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
+    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [1.0, -0.5, -0.5]
+    pose, girth = stand(
+        skeleton, posture, heading, np.full(n_frames, spine / skeleton.length), shape[0].broadcast(n_frames),
+        _smooth(rng.uniform(0.0, 3.0, n_frames)[:, None])[:, 0],
+    )  # fmt: skip
+    middle = pose.joints(skeleton)[..., :2].mean(axis=1)
+    pose.root.translation[:, :2] += position - middle
+    cast = assemble(rng, stage, sensor, skeleton, spine, shape, pose, girth, noise, erosion_px, thing_share, False)
+    cast.bends[:] = cast.bends[:1] + 4.0 * _smooth(rng.normal(0.0, 0.05, cast.bends.shape))
+    return SyntheticSession(name, stage, cast)
+
+
+def _script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
+    """What the animal does in each frame (n,), and how fast it goes (n,) spines/s."""
+    kinds, speed = np.empty(n, np.int64), np.empty(n)
+    deck: list[int] = []
+    at = 0
+    while at < n:
+        if not deck:  # dealt out before it is shuffled again, so that nothing is long absent
+            deck = [int(k) for k in rng.permutation(np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(5)]))]
+        kind = deck.pop()
+        _, shortest, longest, (slow, fast) = _STRETCHES[kind]
+        stop = at + int(_RATE_HZ * rng.uniform(shortest, longest))
+        kinds[at:stop], speed[at:stop] = kind, rng.uniform(slow, fast)
+        at = stop
+    return kinds, np.maximum(_smooth(speed[:, None])[:, 0], 0.0)
+
+
+def _flow(rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]) -> Posture:
+    """One posture a stretch, held with slow changes within it, and blended where the next begins."""
+    drawn = draw_postures(rng, skeleton, kinds, shape)
+    n = len(kinds)
+    change = np.concatenate([[True], (kinds[1:] != kinds[:-1]) | (rng.random(n - 1) < 0.04)])
+    keep = np.maximum.accumulate(np.where(change, np.arange(n), 0))
+    rows = [drawn.elevation, drawn.turn, drawn.roll[:, None], drawn.stretch[:, None]]
+    elevation, turn, roll, stretch = (_smooth(row[keep]) for row in rows)
+    return Posture(elevation, turn, roll[:, 0], stretch[:, 0])
+
+
+def _smooth(rows: Array) -> Array:
+    """Columns of (n, k) passed through a bell of _BLEND_S, ends held."""
+    reach = int(4 * _BLEND_S * _RATE_HZ)
+    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_BLEND_S * _RATE_HZ)) ** 2)
+    padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
+    return np.stack([np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1)
+
+
+def _path(rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array) -> tuple[Array, Array]:
+    """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back before a wall."""
+    n, camera = len(speed), stage.camera
+    middle = floor_point(camera, stage.T_arena_camera, np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]))
+    home = stage.centre if _freedom(stage, stage.centre) > _freedom(stage, middle) else middle
+    margin = min(0.85 * spine_mm, 0.7 * _freedom(stage, home))
+    position, heading = np.empty((n, 2)), np.empty(n)
+    at, way, rate = home + rng.normal(0.0, 0.2 * margin, 2), rng.uniform(-np.pi, np.pi), 0.0
+    for i in range(n):
+        rate = 0.93 * rate + rng.normal(0.0, 0.25)
+        back = np.arctan2(home[1] - at[1], home[0] - at[0])
+        away = (back - way + np.pi) % (2 * np.pi) - np.pi
+        close = np.clip(1.0 - (_freedom(stage, at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
+        # it turns back faster the faster it goes, and stays within a mouse's turning rate
+        pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
+        way += np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
+        step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
+        if _freedom(stage, at + step) > margin or _freedom(stage, at + step) > _freedom(stage, at):
+            at = at + step
+        position[i], heading[i] = at, way
+    return position, heading
+
+
+def _freedom(stage: Stage, xy: Array) -> float:
+    """How far (mm) a point of the floor is from the nearest wall, clutter and border of the picture."""
+    c = stage.camera
+    p = stage.T_arena_camera.inverse() @ np.array([xy[0], xy[1], 0.0])
+    uv = c.project(p)
+    border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min() * p[2] / c.fx
+    free = min(float(stage.room(xy)), float(border))
+    if len(stage.clutter):
+        free = min(free, float(np.linalg.norm(stage.clutter - xy, axis=1).min()))
+    return free

@@ -1,0 +1,232 @@
+"""What every recording promises, whatever file it comes from."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings import DepthFrame, Recording, open_recording
+from liex_lab.recordings.frame import depth_mm
+from liex_lab.recordings.recording import file_digest
+from tests.recordings.writers import (
+    SMALL,
+    Frames,
+    depth_frames,
+    even_times,
+    write_archive,
+    write_camera,
+    write_mcap,
+    write_moseq_folder,
+    write_png_folder,
+    write_tiff_stack,
+)
+
+N = 7
+STORED = depth_frames(N)
+
+
+def in_memory(n: int = N, times_ns: list[int] | None = None, reads: list[int] | None = None) -> Recording:
+    def read(index: int) -> NDArray[np.float32]:
+        if reads is not None:
+            reads.append(index)
+        return np.full((48, 64), float(index), np.float32)
+
+    times = np.array(even_times(n) if times_ns is None else times_ns)
+    return Recording(name="memory", format="synthetic", camera=SMALL, times_ns=times, read=read)
+
+
+def moseq(folder: Path, frames: Frames) -> Path:
+    write_moseq_folder(folder / "session", frames)
+    write_camera(folder / "session")
+    return folder / "session"
+
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "png": lambda folder: write_png_folder(folder / "pictures", STORED),
+    "tiff": lambda folder: write_tiff_stack(folder / "stack" / "depth.tif", STORED).parent,
+    "moseq": lambda folder: moseq(folder, STORED),
+    "archive": lambda folder: write_archive(moseq(folder, STORED), folder / "session.tar.gz"),
+    "mcap": lambda folder: write_mcap(folder / "recording.mcap", STORED),
+}
+
+
+@pytest.fixture(params=list(WRITERS))
+def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return WRITERS[request.param](tmp_path)
+
+
+def test_every_format_gives_the_stored_millimetres_and_increasing_times(path: Path) -> None:
+    with open_recording(path) as recording:
+        assert (len(recording), recording.width, recording.height) == (N, 64, 48)
+        assert recording.times_ns.dtype == np.int64
+        assert np.all(np.diff(recording.times_ns) > 0)
+        assert not recording.truncated
+        assert recording.rate_hz == pytest.approx(30.0, rel=1e-5)
+        assert recording.duration_s == pytest.approx((N - 1) / 30, rel=1e-5)
+        assert recording.camera.fx == SMALL.fx
+        for index, frame in enumerate(recording):
+            assert (frame.index, frame.time_ns) == (index, int(recording.times_ns[index]))
+            assert frame.depth.dtype == np.float32
+            np.testing.assert_array_equal(frame.depth, STORED[index])
+
+
+def test_every_format_reads_in_any_order_and_again(path: Path) -> None:
+    with open_recording(path) as recording:
+        for index in (5, 0, 3, 3, -1):
+            np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
+        first, second = list(recording), list(recording)
+        np.testing.assert_array_equal([f.depth for f in first], [f.depth for f in second])
+        interleaved = zip(recording, recording[2:], strict=False)
+        for here, later in interleaved:
+            np.testing.assert_array_equal(here.depth, STORED[here.index])
+            np.testing.assert_array_equal(later.depth, STORED[here.index + 2])
+
+
+def test_every_format_hands_out_pictures_that_may_be_written_on(path: Path) -> None:
+    with open_recording(path) as recording:
+        recording.frame(1).depth[:] = -1
+        np.testing.assert_array_equal(recording.frame(1).depth, STORED[1])
+
+
+def test_strict_is_content_with_a_whole_recording(path: Path) -> None:
+    open_recording(path, strict=True).close()
+
+
+def test_an_open_recording_that_nobody_holds_lets_go_of_its_files(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(path.parent))
+    recording = open_recording(path)
+    recording.frame(0)
+    del recording
+    gc.collect()  # an unclosed file is a ResourceWarning, and a warning is an error here
+    assert not list(path.parent.glob("liex-*"))
+
+
+def test_a_recording_reads_only_what_is_asked_for() -> None:
+    reads: list[int] = []
+    recording = in_memory(100, reads=reads)
+    assert recording.duration_s > 0
+    assert recording.gaps == []
+    assert recording[10:90].rate_hz > 0
+    assert reads == []
+    chunks = recording.chunks(8)
+    assert [frame.index for frame in next(chunks)] == list(range(8))
+    assert reads == list(range(8))
+
+
+def test_chunks_hold_every_frame_once() -> None:
+    sizes = [[frame.index for frame in chunk] for chunk in in_memory(7).chunks(3)]
+    assert sizes == [[0, 1, 2], [3, 4, 5], [6]]
+    with pytest.raises(ValueError, match="at least one"):
+        next(in_memory(7).chunks(0))
+
+
+@given(st.slices(12).filter(lambda s: s.step is None or s.step > 0), st.slices(5).filter(lambda s: s.step in (None, 1)))
+def test_a_slice_of_a_slice_holds_the_frames_a_list_would(first: slice, second: slice) -> None:
+    recording = in_memory(12)
+    expected = list(range(12))[first]
+    if not expected:
+        with pytest.raises(RecordingError, match="no frame"):
+            recording[first]
+        return
+    part = recording[first]
+    assert [int(f.depth[0, 0]) for f in part] == expected
+    assert [f.index for f in part] == list(range(len(expected)))
+    np.testing.assert_array_equal(part.times_ns, recording.times_ns[expected])
+    if again := expected[second]:
+        assert [int(f.depth[0, 0]) for f in part[second]] == again
+
+
+def test_a_short_slice_keeps_the_rate_and_so_sees_its_gap() -> None:
+    recording = in_memory(times_ns=[0, 10, 20, 60, 70, 80], n=6)
+    (gap,) = recording[2:4].gaps
+    assert gap.n_frames_missing == 3
+    assert recording[2:4].rate_hz == recording.rate_hz
+    assert recording[::2].rate_hz == pytest.approx(recording.rate_hz / 2)
+
+
+def test_one_frame_is_taken_by_name_not_by_index() -> None:
+    recording = in_memory()
+    with pytest.raises(TypeError, match="frame"):
+        recording[3]  # type: ignore[index]
+    with pytest.raises(IndexError, match="7 of a recording of 7"):
+        recording.frame(7)
+    with pytest.raises(RecordingError, match="order of time"):
+        recording[::-1]
+    assert isinstance(recording.frame(3), DepthFrame)
+
+
+def test_a_recording_holds_frames_and_its_times_increase() -> None:
+    with pytest.raises(RecordingError, match="no frame"):
+        in_memory(0)
+    with pytest.raises(RecordingError, match="strictly"):
+        in_memory(times_ns=[0, 5, 5], n=3)
+    with pytest.raises(ValueError, match="read-only"):
+        in_memory().times_ns[0] = 1
+
+
+def test_a_single_frame_has_no_rate_and_no_gap() -> None:
+    recording = in_memory(1)
+    assert np.isnan(recording.rate_hz)
+    assert (recording.duration_s, recording.gaps) == (0.0, [])
+
+
+def test_the_digest_of_one_file_is_its_own(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "r.mcap", STORED)
+    with open_recording(path) as recording:
+        assert recording.digest() == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert recording[2:4].digest() == recording.digest()
+
+
+def test_the_digest_of_a_folder_sees_names_bytes_and_nothing_else(tmp_path: Path) -> None:
+    folder = write_png_folder(tmp_path / "pictures", STORED)
+    digest = open_recording(folder).digest()
+    (folder / "notes.txt").write_text("mouse 7")
+    assert open_recording(folder).digest() == digest
+    (folder / "frame_3.png").rename(folder / "frame_33.png")
+    renamed = open_recording(folder).digest()
+    write_camera(folder, SMALL, unit_mm=2.0)
+    assert len({digest, renamed, open_recording(folder).digest()}) == 3
+
+
+def test_a_boundary_between_files_is_part_of_the_digest(tmp_path: Path) -> None:
+    for name, content in (("a", b"12"), ("b", b"3")):
+        (tmp_path / name).write_bytes(content)
+    before = file_digest([tmp_path / "a", tmp_path / "b"])
+    (tmp_path / "a").write_bytes(b"1")
+    (tmp_path / "b").write_bytes(b"23")
+    assert file_digest([tmp_path / "b", tmp_path / "a"]) != before
+
+
+def test_a_recording_without_a_file_is_known_by_its_content() -> None:
+    assert in_memory().digest() == in_memory().digest()
+    assert in_memory().digest() != in_memory(6).digest()
+    assert in_memory()[1:4].digest() == in_memory().digest()
+
+
+@given(
+    st.sampled_from(["<u2", ">u2", "<f4"]),
+    st.lists(st.sampled_from([0.0, 1.0, 700.0, 2047.0, 65535.0]), min_size=1, max_size=6),
+    st.sampled_from([1.0, 0.2, -1.0, 1000.0]),
+    st.lists(st.sampled_from([0.0, 2047.0, 65535.0, float("nan")]), max_size=3),
+)
+def test_unread_is_told_by_the_stored_value(kind: str, values: list[float], unit: float, unread: list[float]) -> None:
+    stored = np.array([values], kind)
+    by_hand = [0.0 if v == 0 or v in unread or v * unit < 0 else v * unit for v in values]
+    depth = depth_mm(stored, unit, unread)
+    assert depth.dtype == np.float32
+    np.testing.assert_allclose(depth[0], by_hand, rtol=1e-6)
+
+
+def test_depth_is_finite_whatever_is_stored() -> None:
+    stored = np.array([[np.nan, np.inf, -np.inf, -5.0, 3e38]], np.float32)
+    np.testing.assert_array_equal(depth_mm(stored), np.array([[0, 0, 0, 0, 3e38]], np.float32))
+    np.testing.assert_array_equal(depth_mm(stored, 1000.0), np.zeros((1, 5)))

@@ -1,0 +1,153 @@
+"""Time stamps: exact, strictly increasing, and honest about what was not."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings.times import (
+    find_gaps,
+    from_rate,
+    increasing,
+    match_counts,
+    median_step,
+    read_column_times,
+    read_csv_times,
+    start_of_clock,
+    start_of_day,
+    to_ns,
+)
+
+stamps = st.lists(st.integers(-20, 20), min_size=1, max_size=9)
+
+
+@given(stamps)
+def test_settled_times_increase_and_stay_where_they_already_did(times: list[int]) -> None:
+    given_ns = np.array(times, np.int64)
+    settled, sentence = increasing(given_ns)
+    assert np.all(np.diff(settled) > 0)
+    if np.all(np.diff(given_ns) > 0):
+        np.testing.assert_array_equal(settled, given_ns)
+        assert sentence is None
+    else:
+        assert sentence is not None
+        assert f"{(settled != given_ns).sum()} of {len(times)}" in sentence
+
+
+@given(stamps)
+def test_no_other_choice_moves_fewer_stamps(times: list[int]) -> None:
+    settled, _ = increasing(np.array(times, np.int64))
+    kept = int((settled == times).sum())
+
+    def can_stay(chosen: tuple[int, ...]) -> bool:
+        """Room for the stamps between: at least one nanosecond each."""
+        return all(times[b] - times[a] >= b - a for a, b in pairwise(chosen))
+
+    assert kept == max(n for n in range(len(times) + 1) for c in combinations(range(len(times)), n) if can_stay(c))
+
+
+def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
+    settled, sentence = increasing(np.array([0, 33, 10**12, 100, 133]))
+    np.testing.assert_array_equal(settled, [0, 33, 99, 100, 133])
+    assert sentence is not None
+    assert "1 of 5" in sentence
+
+
+def test_a_repeated_stamp_moves_by_one_nanosecond() -> None:
+    np.testing.assert_array_equal(increasing(np.array([0, 33, 33, 66]))[0], [0, 32, 33, 66])
+
+
+def test_gaps_are_steps_of_more_than_one_and_a_half_medians() -> None:
+    times = np.cumsum([0, 10, 10, 10, 30, 10, 15, 10, 16, 10]).astype(np.int64)
+    first, second = find_gaps(times, median_step(times))
+    assert (first.start_frame, first.stop_frame, first.n_frames_missing) == (4, 4, 2)
+    assert (first.start_ns, first.stop_ns) == (40, 60)  # from when the next frame was due until the one that came
+    assert (second.start_frame, second.n_frames_missing) == (8, 1)
+    assert find_gaps(times[:1], 0) == []
+
+
+def test_a_rate_gives_stamps_that_do_not_drift() -> None:
+    times = from_rate(100_001, 30.0)
+    assert times[-1] == round(100_000 / 30 * 1e9)
+    assert np.diff(times).max() - np.diff(times).min() <= 1
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "ns"),
+    [
+        ("666649624.5888", 10**6, 666649624588800),
+        ("1760000000.123456789", 10**9, 1760000000123456789),
+        ("-1.5", 10**9, -1_500_000_000),
+        ("1.76e9", 10**9, 1_760_000_000 * 10**9),
+    ],
+)
+def test_decimal_times_are_exact(text: str, unit: int, ns: int) -> None:
+    assert to_ns(text, unit) == ns
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "time_ns\n5\n7\n",
+        "frame,time_ns\na,5\nb,7\n",
+        'frame;"time_ns"\r\na;5\r\nb;7\r\n',
+        "\ufefftime_s\n0.000000005\n0.000000007\n",
+        "time_ms\n0.000005\n\n0.000007",
+    ],
+)
+def test_a_csv_is_read_whatever_program_wrote_it(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_text(content, encoding="utf-8")
+    np.testing.assert_array_equal(read_csv_times(path), [5, 7])
+
+
+def test_moseq_stamps_may_have_a_header_and_commas(tmp_path: Path) -> None:
+    path = tmp_path / "depth_ts.txt"
+    path.write_text("time,other\n1.5, 0\n2.5, 0\n")
+    np.testing.assert_array_equal(read_column_times(path, 10**6), [1_500_000, 2_500_000])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "missing"),
+        (b"1\n2\n3\n", "time_ns or time_s"),
+        (b"time_ns\n1\nnan\n", "'nan' on line 3"),
+        (b"time_s\n1\n1e30\n", "'1e30' on line 3"),
+        (b"time_s\n1\ninf\n", "'inf' on line 3"),
+        (b"time_s\n" + b"x" * 500, "..."),
+        (b"frame,time_ns\n1\n", "'' on line 2"),
+        (b"\xff\xfe\x00\x01\x02\x80", "not text"),
+    ],
+)
+def test_a_wrong_csv_is_told_in_a_sentence(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"timestamps\.csv") as error:
+        read_csv_times(path)
+    assert says in str(error.value)
+    assert len(str(error.value)) < 400 + len(str(tmp_path))
+
+
+def test_two_counts_give_the_smaller_and_a_sentence_with_both() -> None:
+    assert match_counts(5, np.arange(5), "a", "b") == (5, None)
+    n, sentence = match_counts(5, np.arange(7), "depth.dat", "depth_ts.txt")
+    assert n == 5
+    assert sentence is not None
+    assert "depth.dat holds 5" in sentence
+    assert "depth_ts.txt holds 7" in sentence
+
+
+def test_a_start_needs_a_zone_to_be_a_moment() -> None:
+    assert start_of_day("2017-01-25T10:42:07.1734698-05:00") == "2017-01-25T10:42:07.173469-05:00"
+    assert start_of_day("2017-01-25T10:42:07") is None
+    assert start_of_day("yesterday") is None
+    assert start_of_day(None) is None
+    assert start_of_clock(1_760_000_000 * 10**9) == "2025-10-09T08:53:20+00:00"
+    assert start_of_clock(666_649_624_588_800) is None  # a week since some machine was switched on
