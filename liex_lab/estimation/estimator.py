@@ -1,0 +1,193 @@
+"""PoseEstimator: depth frames in, a pose with its expected error for each of them out (Lie-X Algorithm 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.catalog import find_model
+from liex_lab.errors import EstimationError
+from liex_lab.estimation import _estimate as kernels
+from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.estimation.model import Model
+from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.training import base_at_front
+from liex_lab.geometry import SE3
+from liex_lab.recordings.foreground import Crops, Scene
+from liex_lab.threads import threads
+
+Array = NDArray[np.float64]
+
+_START_SEED = 20170125
+_SIZE_PASSES = 8  # of estimating the size with the size just found; each goes about a third of the way
+_MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as `Chosen`; found (n,)."""
+
+    chosen: Chosen
+    found: NDArray[np.bool_]
+    crops: Crops
+
+
+@dataclass(frozen=True)
+class PoseEstimator:
+    """A trained model at work."""
+
+    model: Model
+    n_candidates: int = 0  # 0: as the model's method says
+
+    @staticmethod
+    def load(name: str | Path = "mouse") -> PoseEstimator:
+        """An estimator from a bundled model's name or the path of a model file. Raises ModelError."""
+        return PoseEstimator(Model.load(find_model(name)))
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The animal's skeleton."""
+        return self.model.skeleton
+
+    @cached_property
+    def _packed(self) -> tuple[NDArray[np.generic], ...]:
+        """All regressors in one node array: nodes, roots (F, T), leaves, leaf base (F,) and width (F,) of each."""
+        forests = [forest for rounds in self.model.cascade.forests for forest in rounds]
+        nodes, roots, leaves, bases, widths = [], [], [], [], []
+        n_nodes = n_leaves = 0
+        for forest in forests:
+            shifted = forest.nodes.copy()
+            shifted[shifted[:, 2] >= 0, 2] += n_nodes
+            nodes.append(shifted)
+            roots.append(forest.roots + n_nodes)
+            leaves.append(forest.leaves.ravel())
+            bases.append(n_leaves)
+            widths.append(forest.leaves.shape[1])
+            n_nodes += len(forest.nodes)
+            n_leaves += forest.leaves.size
+        metric = self.model.metric
+        return (
+            np.concatenate(nodes), np.stack(roots), np.concatenate(leaves), np.array(bases), np.array(widths),
+            metric.nodes, metric.roots, metric.leaves.ravel(),
+        )  # fmt: skip
+
+    @cached_property
+    def _starts(self) -> Array:
+        k = self.n_candidates or self.model.method.n_candidates
+        return draw_starts(np.random.default_rng(_START_SEED), 1, k)
+
+    def candidates(
+        self, crops: Crops, looks: Array, size: float, parallel: bool = True
+    ) -> tuple[Array, Array, Array, Array]:
+        """All candidates of n frames in their view frames: rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scales
+        (n, K), and the metric's scores (n, K), mm at home size.
+        """
+        method, skeleton = self.model.method, self.skeleton
+        n, k = len(looks), self._starts.shape[1]
+        sizes = np.full((n, k), size)
+        base_rotation, base_position, scales = start_poses(
+            crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start
+        )
+        rotations = np.zeros((n, k, skeleton.n_joints, 3, 3))
+        positions = np.zeros((n, k, skeleton.n_joints, 3))
+        rotations[:, :, 0], positions[:, :, 0] = base_rotation, base_position
+        scores = np.full((n, k), np.inf)
+        with threads(parallel):
+            kernels.estimate_all(
+                crops.heights, looks, crops.moments, crops.found, size, skeleton.parents, skeleton.offsets,
+                skeleton.rest, skeleton.axes, np.array(skeleton.solved), method.rounds, method.reach_mm,
+                np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
+                *self._packed, rotations, positions, scales, scores,
+            )  # fmt: skip
+        return rotations, positions, scales, scores
+
+    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Estimates:
+        """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
+        method = self.model.method
+        size = size if method.session_size else 1.0
+        crops = scene.extract(depths, size, parallel, method.camera_view)
+        looks = scene.looks(crops, method.camera_view)
+        rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
+        unsure = np.flatnonzero(crops.n_blobs > 1)
+        if len(unsure):
+            other = scene.extract(depths[unsure], size, parallel, method.camera_view, rank=1)
+            other_looks = scene.looks(other, method.camera_view)
+            found = self.candidates(other, other_looks, size, parallel)
+            first, second = scores[unsure].min(axis=1), found[3].min(axis=1)
+            better = self._is_animal(depths[unsure], scene, size, first, second)
+            rows = unsure[better]
+            crops.put(rows, other[better])
+            looks[rows], rotations[rows], positions[rows], scores[rows] = (
+                values[better] for values in (other_looks, found[0], found[1], found[3])
+            )
+        usable = crops.found
+        picked = choose(self.skeleton, method, self.model.calibration, size,
+                        rotations[usable], positions[usable], scores[usable])  # fmt: skip
+        picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
+        whole = _spread_out(picked, usable, self.skeleton.n_joints)
+        T_camera_view = SE3(
+            np.broadcast_to(scene.view_rotation(method.camera_view), (len(looks), 3, 3)),
+            np.stack([np.zeros(len(looks)), np.zeros(len(looks)), crops.distance], axis=-1),
+        ).inverse()
+        return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+
+    def _is_animal(
+        self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
+    ) -> NDArray[np.bool_]:
+        """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
+
+        Told by area and volume and, where the metric has learned what is no animal, by its scores first, second (n,).
+        """
+        likeness = [_MM_PER_MISFIT * scene.misfit(scene.extract(depths, size, rank=rank)) for rank in (0, 1)]
+        if not self.model.method.metric_on_own:
+            return likeness[1] < likeness[0]
+        return second + likeness[1] < first + likeness[0]
+
+    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+        """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm of the recording.
+
+        The area seen from above gives the first guess; the model then measures the spine in every frame, the median of
+        the frames that it trusts most becomes the next guess, a few times over.
+        """
+        guess = self.size_from_area(scene.area_mm2)
+        if not self.model.method.session_size:
+            return 1.0
+        for _ in range(_SIZE_PASSES):
+            estimates = self.estimate(sample, scene, guess)
+            scale, score = estimates.chosen.pose.scale, estimates.chosen.score
+            seen = np.flatnonzero(estimates.found)
+            if not len(seen):
+                raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
+            trusted = seen[np.argsort(score[seen])[: max(8, len(seen) * 2 // 3)]]
+            guess = float(np.median(scale[trusted]))
+        return guess
+
+    def size_from_area(self, area_mm2: float) -> float:
+        """A first guess of the size from the animal's usual area."""
+        return float(np.sqrt(area_mm2 / self.model.calibration.area_mm2))
+
+
+def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Chosen:
+    """The chosen poses of the usable frames as rows of all frames, NaN elsewhere."""
+    n = len(usable)
+
+    def rows(values: Array, *shape: int) -> Array:
+        out = np.full((n, *shape), np.nan)
+        out[usable] = values
+        return out
+
+    pose = Pose(
+        SE3(rows(picked.pose.root.rotation, 3, 3), rows(picked.pose.root.translation, 3)),
+        rows(picked.pose.angles, n_joints, 3),
+        rows(picked.pose.scale),
+    )
+    return Chosen(
+        pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
+        rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+    )  # fmt: skip

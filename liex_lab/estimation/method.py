@@ -1,0 +1,85 @@
+"""The variants of the method: the paper's, and ours. One code reads these numbers; nothing else tells them apart."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from liex_lab.errors import PlanError
+from liex_lab.forests.grow import GrowthPlan
+
+
+@dataclass(frozen=True)
+class Method:
+    """Everything that training and estimation do differently from variant to variant.
+
+    Angles rad; lengths mm of an animal of home size; METHOD lessons in brackets.
+    """
+
+    variant: str
+    rounds: int  # C
+    n_candidates: int  # Kt
+    training_candidates: int  # K initial poses a training image
+    regressors: GrowthPlan
+    metric: GrowthPlan
+    reach_mm: float  # offsets of the features reach this far from the joint
+    axis_start: bool  # start along the animal's long axis, both ways [8]; else any heading
+    camera_view: bool  # depth along the optical axis, as the paper; else height above the floor
+    session_size: bool  # the animal's size is estimated over the recording; else home size
+    regress_scale: bool  # the base joint also corrects the bones' scale
+    point_at: bool  # labels aim the bone at the true next joint [7]
+    keep_turned: float  # base: train on samples turned by less than this [1]
+    keep_bent: float  # other joints: train on corrections smaller than this [1]
+    keep_off_mm: float  # other joints: train on samples no farther off than this [1]
+    out_of_bag: bool  # move a training sample only with trees that have not seen its image [6]
+    metric_on_own: bool  # train the metric on the cascade's own candidates [6]; else on perturbed truth
+    metric_shrinkage: float  # of each boosting stage of the metric; 0 grows a plain forest
+    mean_shift_mm: float  # bandwidth of the mode over tree votes; 0 averages them
+    top_k: int  # candidates that are averaged [3]; 1 takes the best one
+    top_tau: float  # weights fall off with the predicted error by this, mm
+    top_radius_mm: float  # only candidates within this of the best one are averaged
+    base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
+    joint_lever_mm: float = 20.0
+    scale_lever_mm: float = 50.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for the model file and its card."""
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> Method:
+        """The method of a model file."""
+        plain = dict(values)
+        plain["regressors"] = GrowthPlan(**plain["regressors"])
+        plain["metric"] = GrowthPlan(**plain["metric"])
+        return Method(**plain)
+
+
+_FULL_TURN = 10.0  # rad: no filter
+
+METHODS = {
+    "default": Method(
+        variant="default", rounds=5, n_candidates=10, training_candidates=8,
+        regressors=GrowthPlan(12, 18, 22, 100, 0.3, 0.15, 0.3, 0.63),
+        metric=GrowthPlan(80, 9, 50, 100, 0.45, 0.1, 0.3, 0.5),
+        reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
+        keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
+        metric_shrinkage=0.15, mean_shift_mm=0.0,
+        top_k=10, top_tau=1.0, top_radius_mm=15.0,
+    ),
+    "paper": Method(
+        variant="paper", rounds=3, n_candidates=40, training_candidates=6,
+        regressors=GrowthPlan(10, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        metric=GrowthPlan(20, 15, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        reach_mm=50.0, axis_start=False, camera_view=True, session_size=False, regress_scale=False, point_at=False,
+        keep_turned=_FULL_TURN, keep_bent=_FULL_TURN, keep_off_mm=1e9, out_of_bag=False, metric_on_own=False,
+        metric_shrinkage=0.0, mean_shift_mm=10.0, top_k=1, top_tau=1.0, top_radius_mm=15.0,
+    ),
+}  # fmt: skip
+
+
+def method_of(variant: str) -> Method:
+    """The method of a variant's name."""
+    if variant not in METHODS:
+        raise PlanError(f"there is no variant '{variant}'; known are {', '.join(METHODS)}")
+    return METHODS[variant]

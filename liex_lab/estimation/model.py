@@ -1,0 +1,186 @@
+"""A trained model: skeleton, method, forests, metric and calibration, as one .npz file without pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import lzma
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import ModelError
+from liex_lab.estimation.cascade import Cascade
+from liex_lab.estimation.method import Method
+from liex_lab.forests.forest import Forest
+
+SCHEMA = 1
+_DAMAGE = (
+    OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
+    lzma.LZMAError,
+)  # fmt: skip
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # every file in the archive bears this date, so equal models are equal bytes
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the metric's score means, learned on images that no tree has seen.
+
+    error = offset + slope * score + spread_slope * spread, mm at home size; quantiles (2,): the ratio of true to
+    predicted error that 5 % and 95 % of the images stay below; joint_share (J,): each joint's error over the mean;
+    doubtful_mm: a predicted error above this, at home size, is flagged; area_mm2: usual area of a home-sized animal
+    seen from above.
+    """
+
+    offset: float = 0.0
+    slope: float = 1.0
+    spread_slope: float = 0.0
+    quantiles: tuple[float, float] = (0.5, 2.0)
+    joint_share: tuple[float, ...] = ()
+    doubtful_mm: float = 10.0
+    area_mm2: float = 1300.0
+
+
+@dataclass(frozen=True)
+class Model:
+    """Everything an estimator needs.
+
+    expectation turns what is known of a chosen pose into its expected error; card says how the model was made.
+    """
+
+    cascade: Cascade
+    metric: Forest
+    expectation: Forest | None
+    skeleton_table: dict[str, Any]
+    calibration: Calibration = field(default_factory=Calibration)
+    card: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The animal's skeleton."""
+        return self.cascade.skeleton
+
+    @property
+    def method(self) -> Method:
+        """The variant of the method."""
+        return self.cascade.method
+
+    def to_bytes(self) -> bytes:
+        """The model file's content; equal models give equal bytes."""
+        head = {
+            "schema": SCHEMA,
+            "method": self.method.to_dict(),
+            "skeleton": self.skeleton_table,
+            "calibration": vars(self.calibration),
+            "card": self.card,
+        }
+        arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)}
+        forests = [forest for rounds in self.cascade.forests for forest in rounds]
+        for k, forest in enumerate([*forests, self.metric, *([self.expectation] if self.expectation else [])]):
+            arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
+            for name, values in arrays.items():
+                content = io.BytesIO()
+                np.lib.format.write_array(content, values, allow_pickle=False)
+                entry = zipfile.ZipInfo(f"{name}.npy", _EPOCH)
+                entry.compress_type = zipfile.ZIP_LZMA
+                archive.writestr(entry, content.getvalue())
+        return packed.getvalue()
+
+    @staticmethod
+    def load(path: Path) -> Model:
+        """Read a model file. Raises ModelError where it is not one, is damaged, or is newer than this program."""
+        try:
+            # opened here, for numpy leaves a damaged archive open
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                head = json.loads(archive["head"].tobytes())
+                if head.get("schema", 0) > SCHEMA:
+                    raise ModelError(f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab")
+                names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
+                forests = [_join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names]
+            method = Method.from_dict(head["method"])
+            values = head["calibration"]
+            for name in ("quantiles", "joint_share"):
+                values[name] = tuple(values[name])
+            calibration = Calibration(**values)
+            table, card = head["skeleton"], head["card"]
+        except FileNotFoundError:
+            raise ModelError(f"there is no model file {path}; name a bundled model or the path of an .npz") from None
+        except _DAMAGE as error:
+            raise ModelError(f"{path} is not a whole model file ({error}); train it again or copy it anew") from None
+        skeleton = Skeleton.from_table(table, str(path))
+        n = method.rounds
+        n_regressors = n * len(skeleton.solved)
+        if len(forests) not in (n_regressors + 1, n_regressors + 2):
+            raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
+        cascade = Cascade(skeleton, method, [forests[k * n : (k + 1) * n] for k in range(len(skeleton.solved))])
+        expectation = forests[n_regressors + 1] if len(forests) > n_regressors + 1 else None
+        return Model(cascade, forests[n_regressors], expectation, table, calibration, card)
+
+    def digest(self) -> str:
+        """SHA-256 of the model file."""
+        return hashlib.sha256(self.to_bytes()).hexdigest()
+
+
+_PARTS = ("tests", "threshold", "kind", "is_leaf", "roots", "leaves")
+
+
+def _split(forest: Forest) -> dict[str, NDArray[Any]]:
+    """A forest as arrays that compress well: the child pointers follow from which nodes are leaves."""
+    words = forest.nodes
+    inner = words[:, 2] >= 0
+    tests = np.ascontiguousarray(words[inner, :2]).view(np.int8).reshape(-1, 8)
+    return {
+        "tests": np.ascontiguousarray(tests[:, :6].T),
+        "threshold": np.ascontiguousarray(tests[:, 6:]).view(np.int16).ravel(),
+        "kind": words[inner, 3].astype(np.uint8),
+        "is_leaf": np.packbits(~inner),
+        "roots": forest.roots,
+        "leaves": np.ascontiguousarray(forest.leaves.astype(np.float16).T),
+    }
+
+
+def _join(parts: dict[str, NDArray[Any]]) -> Forest:
+    """The inverse of `_split`.
+
+    Growth numbers nodes and leaves in one order: a tree's children are appended as a pair when their parent splits, the
+    left side of the stack first, so walking the trees again in that order gives every pointer back.
+    """
+    n_inner, n_leaves = len(parts["threshold"]), parts["leaves"].shape[1]
+    n_nodes = n_inner + n_leaves
+    is_leaf = np.unpackbits(parts["is_leaf"], count=n_nodes).astype(bool)
+    nodes = np.zeros((n_nodes, 4), np.int32)
+    words = np.empty((n_inner, 8), np.int8)
+    words[:, :6] = parts["tests"].T
+    words[:, 6:] = parts["threshold"].view(np.int8).reshape(-1, 2)
+    nodes[~is_leaf, :2] = words.view(np.int32)
+    nodes[~is_leaf, 3] = parts["kind"]
+    leaf = 0
+    for tree, root in enumerate(parts["roots"]):
+        stop = parts["roots"][tree + 1] if tree + 1 < len(parts["roots"]) else n_nodes
+        leaf = _number(is_leaf[root:stop].tolist(), nodes[root:stop], int(root), leaf)
+    return Forest(nodes, parts["roots"], np.ascontiguousarray(parts["leaves"].T.astype(np.float32)))
+
+
+def _number(is_leaf: list[bool], nodes: NDArray[np.int32], root: int, leaf: int) -> int:
+    """Child pointers of one tree, in the order in which `_grow_tree` made them; the next free leaf."""
+    children = [0] * len(is_leaf)
+    stack, made = [0], 1
+    while stack:
+        at = stack.pop()
+        if is_leaf[at]:
+            leaf += 1
+            children[at] = -leaf
+        else:
+            children[at] = root + made
+            stack += [made + 1, made]
+            made += 2
+    nodes[:, 2] = children
+    return leaf

@@ -1,0 +1,133 @@
+"""From many candidates to one pose: the learned metric's choice, its average, and how far it may be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.estimation.method import Method
+from liex_lab.estimation.model import Calibration, Model
+from liex_lab.forests._kernels import VIEW
+from liex_lab.forests.forest import Samples, predict
+from liex_lab.geometry import SE3, so3
+
+Array = NDArray[np.float64]
+
+_NO_OPPOSITE_MM = 40.0  # stands for the score of the opposite direction where no candidate points there
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """One pose for each of n frames, in the view frame of the frame, NaN where no animal was found.
+
+    pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n, J) of each joint;
+    error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home size behind it; doubts (n, 4) mm at
+    home size: best score, the best score of a candidate that points the other way, the spread of the good scores, and
+    how far the candidates of all scores lie from the chosen pose.
+    """
+
+    pose: Pose
+    sd_root: Array
+    sd_angles: Array
+    sd_mm: Array
+    error_mm: Array
+    score: Array
+    spread: Array
+    doubts: Array
+
+
+def choose(
+    skeleton: Skeleton, method: Method, calibration: Calibration, size: float,
+    rotations: Array, positions: Array, scores: Array,
+) -> Chosen:  # fmt: skip
+    """The weighted mean of the best candidates, on the manifold.
+
+    rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k` candidates with the
+    lowest predicted error that lie near the best one are averaged with weights exp(-(score - best) / tau) (METHOD
+    lesson 3); each bone then turns by the smallest rotation onto its mean direction and the scale follows from the
+    total length.
+    """
+    order = np.argsort(scores, axis=1, kind="stable")[:, : method.top_k]
+    score = np.take_along_axis(scores, order, axis=1)
+    joints = np.take_along_axis(positions, order[..., None, None], axis=1)
+    turned = np.take_along_axis(rotations, order[..., None, None, None], axis=1)
+    near = np.linalg.norm(joints - joints[:, :1], axis=-1).mean(-1) < method.top_radius_mm * size
+    weight = np.where(near, np.exp(-(score - score[:, :1]) / method.top_tau), 0.0)
+    weight = weight / weight.sum(axis=1, keepdims=True)
+    mean = np.einsum("nk,nkjd->njd", weight, joints)
+    up = np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2])
+    pose = Pose.from_joints(skeleton, mean, up)
+    off = np.linalg.norm(joints - mean[:, None], axis=-1)
+    variance = np.einsum("nk,nkj->nj", weight, off**2)
+    mean_score = np.sum(weight * score, axis=1)
+    spread = np.sqrt(variance.mean(axis=1)) / size
+    expected = calibration.offset + calibration.slope * mean_score + calibration.spread_slope * spread
+    expected = np.maximum(expected, 0.1) * size
+    share = np.array(calibration.joint_share or (1.0,) * skeleton.n_joints)
+    sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
+    sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
+    doubts = _doubts(positions, scores, mean, score, size)
+    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts)
+
+
+def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float) -> Array:
+    """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good scores (n, k)."""
+    along = positions[:, :, -1] - positions[:, :, 0]
+    backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
+    opposite = np.where(backwards, scores, _NO_OPPOSITE_MM).min(axis=1)
+    off = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
+    return np.stack([scores.min(axis=1), opposite, good.std(axis=1), off], axis=1)
+
+
+def with_expected_error(chosen: Chosen, model: Model, moments: Array, looks: Array, size: float) -> Chosen:
+    """The same poses with the error that the model's expectation forest predicts for them, from its clues."""
+    if model.expectation is None or not len(chosen.score):
+        return chosen
+    n = len(chosen.score)
+    samples = clue_samples(chosen, moments, looks, size)
+    error = np.maximum(predict(model.expectation, samples)[:n, 0].astype(float), 0.1) * size
+    scale = error / chosen.error_mm
+    return replace(chosen, error_mm=error, sd_mm=chosen.sd_mm * scale[:, None])
+
+
+def clue_samples(chosen: Chosen, moments: Array, looks: Array, size: float) -> Samples:
+    """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
+
+    Scores and doubts; the posture; how large, round and high the animal looks; how many millimetres a pixel covers.
+    """
+    pose = chosen.pose
+    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / size
+    clues = np.stack(
+        [
+            chosen.score, chosen.spread, *chosen.doubts.T, 10 * pose.root.rotation[:, 2, 0],
+            10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
+            5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
+            moments[:, 6] / size, moments[:, 7] / size, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
+        ],
+        axis=1,
+    )  # fmt: skip
+    n = len(clues)
+    blank = np.zeros((1, 2, 2), np.int16), np.zeros(n, np.int32), np.ones(n, np.float32)
+    return Samples(*blank, np.zeros((n, 1, VIEW), np.float32), (100.0 * clues).astype(np.float32))
+
+
+def _spread_of_coordinates(
+    skeleton: Skeleton, pose: Pose, turned: Array, joints: Array, weight: Array
+) -> tuple[Array, Array]:
+    """Standard deviations of the root's twist (n, 6) and of the joints' rotation vectors (n, J, 3) over candidates."""
+    root = SE3(pose.root.rotation[:, None], pose.root.translation[:, None])
+    twist = (root.inverse() @ SE3(turned[:, :, 0], joints[:, :, 0])).log()
+    sd_root = np.sqrt(np.einsum("nk,nkd->nd", weight, twist**2))
+    mean = pose.frames(skeleton).rotation
+    sd_angles = np.zeros((*mean.shape[:2], 3))
+    for j in skeleton.solved[1:]:
+        p = skeleton.parents[j]
+        local = np.swapaxes(turned[:, :, p], -1, -2) @ turned[:, :, j]
+        mean_local = np.swapaxes(mean[:, p], -1, -2) @ mean[:, j]
+        turn = so3.log(np.swapaxes(mean_local, -1, -2)[:, None] @ local)
+        sd_angles[:, j] = np.sqrt(np.einsum("nk,nkd->nd", weight, turn**2)) * skeleton.axes[j]
+    return sd_root, sd_angles

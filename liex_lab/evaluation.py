@@ -1,0 +1,89 @@
+"""The numbers by which a measurement is judged, and the protocol that goes beside each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+POSE_PROTOCOL = (
+    "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm; mean, median and 95 % "
+    "over the frames in which an animal was measured. lost_rate: share of frames with no measurement. flip_rate: share "
+    "of the measured frames whose base-to-tip direction is more than 90 degrees from the true one. "
+    "spearman_predicted_error: rank correlation of predicted and true error over frames. interval90_coverage: share of "
+    "frames whose true error lies in the 90 % interval predicted for it."
+)
+_FIGURES = (
+    "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm", "flip_rate", "lost_rate",
+    "spearman_predicted_error", "interval90_coverage",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Measured against true poses, n frames: error_mm (n,) mean joint error, NaN where lost; joint_mm (n, J);
+    flipped (n,); predicted_mm (n,); low_mm and high_mm (n,) the predicted 90 % interval of the error.
+    """
+
+    error_mm: Array
+    joint_mm: Array
+    flipped: NDArray[np.bool_]
+    predicted_mm: Array
+    low_mm: Array
+    high_mm: Array
+
+    @staticmethod
+    def compare(joints: Array, true_joints: Array, tip: int, predicted_mm: Array, quantiles: Array) -> PoseErrors:
+        """Errors of joints (n, J, 3) mm, NaN where lost; `tip` is the joint that the base's heading points at."""
+        joint_mm = np.linalg.norm(joints - true_joints, axis=-1)
+        measured, true = joints[:, tip] - joints[:, 0], true_joints[:, tip] - true_joints[:, 0]
+        flipped = np.sum(measured * true, axis=-1) < 0
+        return PoseErrors(
+            joint_mm.mean(axis=1), joint_mm, flipped, predicted_mm, predicted_mm * quantiles[0],
+            predicted_mm * quantiles[1],
+        )  # fmt: skip
+
+    @staticmethod
+    def join(parts: list[PoseErrors]) -> PoseErrors:
+        """The errors of several recordings as one."""
+        return PoseErrors(*(np.concatenate([getattr(p, name) for p in parts]) for name in PoseErrors.__annotations__))
+
+    def summary(self) -> dict[str, Any]:
+        """The figures of `liex evaluate pose`."""
+        seen = np.isfinite(self.error_mm)
+        if not seen.any():
+            return dict.fromkeys(_FIGURES) | {"lost_rate": 1.0}
+        error, predicted = self.error_mm[seen], self.predicted_mm[seen]
+        inside = (error >= self.low_mm[seen]) & (error <= self.high_mm[seen])
+        return {
+            "mean_joint_error_mm": float(error.mean()),
+            "median_joint_error_mm": float(np.median(error)),
+            "p95_joint_error_mm": float(np.quantile(error, 0.95)),
+            "flip_rate": float(self.flipped[seen].mean()),
+            "lost_rate": float(1.0 - seen.mean()),
+            "spearman_predicted_error": rank_correlation(predicted, error),
+            "interval90_coverage": float(inside.mean()),
+        }
+
+
+def rank_correlation(a: Array, b: Array) -> float:
+    """Spearman's rank correlation of two series (n,)."""
+    from scipy.stats import spearmanr
+
+    return float(spearmanr(a, b).statistic)
+
+
+def angle_between_axes(a: Array, b: Array) -> Array:
+    """Difference (n,) of two undirected axes given by angles (n,) rad, in [0, pi / 2]."""
+    off = np.mod(a - b, np.pi)
+    return np.minimum(off, np.pi - off)
+
+
+def count_reversals(heading: Array) -> int:
+    """How often a heading (n,) rad turns by more than a right angle between frames; NaN frames are skipped."""
+    seen = heading[np.isfinite(heading)]
+    return int((np.cos(np.diff(seen)) < 0).sum())

@@ -1,0 +1,127 @@
+"""Numba kernels of the forests: one probe, one test, one descent.
+
+A node is four int32, 16 bytes, one quarter of a cache line:
+    word 0: u_x, u_y, u_z, v_x as int8, lowest byte first
+    word 1: v_y, v_z as int8, then the threshold as int16
+    word 2: index of the left child (the right one follows it); negative: leaf -(word 2) - 1
+    word 3: kind + 4 * channel: which test, on which view or scalar
+
+Tests compare a response with the threshold and go right when it is at least as large:
+    TWO_PROBES  height under x + g(u) minus height under x + g(v)         (Lie-X Eq. 15)
+    ONE_PROBE   height under x + g(u) minus the joint's own height        (METHOD lesson 2)
+    SCALAR      a number that describes the whole animal from the joint's point of view
+Heights are 1/16 mm of an animal of home size, so one forest serves animals of every size.
+
+A view, 9 float32, is how a joint of a candidate pose looks onto a height map: crop pixel (column, row) of the joint, a
+2x3 matrix from offsets (1/127 of the reach, in the joint's frame) to crop pixels, and the joint's own height.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+TWO_PROBES, ONE_PROBE, SCALAR = 0, 1, 2
+VIEW = 9
+
+
+@njit(cache=True, inline="always")
+def probe(heights, view, a, b, c):
+    """Height in the map (S, S) under offset (a, b, c); a probe outside reads the border, which is background."""
+    limit = heights.shape[0] - 1
+    column = int(view[0] + view[2] * a + view[3] * b + view[4] * c + 0.5)
+    row = int(view[1] + view[5] * a + view[6] * b + view[7] * c + 0.5)
+    column = min(max(column, 0), limit)
+    row = min(max(row, 0), limit)
+    return heights[row, column]
+
+
+@njit(cache=True, inline="always")
+def byte(word, index):
+    """Signed byte `index` of an int32."""
+    return (((word >> (8 * index)) & 0xFF) ^ 0x80) - 0x80
+
+
+@njit(cache=True, inline="always")
+def response(heights, inverse_size, views, scalars, word0, word1, word3):
+    """The number that a test compares with its threshold, for one sample.
+
+    heights (S, S) int16; views (V, 9); scalars (n,); words 0, 1 and 3 of a node.
+    """
+    kind, channel = word3 & 3, word3 >> 2
+    if kind == SCALAR:
+        return scalars[channel]
+    view = views[channel]
+    first = probe(heights, view, byte(word0, 0), byte(word0, 1), byte(word0, 2)) * inverse_size
+    if kind == ONE_PROBE:
+        return first - view[8]
+    return first - probe(heights, view, byte(word0, 3), byte(word1, 0), byte(word1, 1)) * inverse_size
+
+
+@njit(cache=True, inline="always")
+def descend(nodes, root, heights, inverse_size, views, scalars):
+    """The leaf that a sample reaches in the tree at `root`."""
+    at = root
+    child = nodes[at, 2]
+    while child >= 0:
+        value = response(heights, inverse_size, views, scalars, nodes[at, 0], nodes[at, 1], nodes[at, 3])
+        at = child + (value >= (nodes[at, 1] >> 16))
+        child = nodes[at, 2]
+    return -child - 1
+
+
+@njit(cache=True, inline="always")
+def pack_offsets(u, v, threshold):
+    """Words 0 and 1 of a node from two offsets (3,) of -127..127 and an int16 threshold."""
+    word0 = (
+        (np.int32(u[0]) & 0xFF)
+        | ((np.int32(u[1]) & 0xFF) << 8)
+        | ((np.int32(u[2]) & 0xFF) << 16)
+        | ((np.int32(v[0]) & 0xFF) << 24)
+    )
+    word1 = (
+        (np.int32(v[1]) & 0xFF) | ((np.int32(v[2]) & 0xFF) << 8) | ((np.int32(threshold) & 0xFFFF) << 16)
+    )
+    return np.int32(word0), np.int32(word1)
+
+
+@njit(cache=True, inline="always")
+def next_random(state):
+    """The next 64 random bits of a splitmix64 sequence whose state is `state` (1,) uint64."""
+    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = state[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, inline="always")
+def random_below(state, n):
+    """A random integer of 0 .. n - 1."""
+    return np.int64((next_random(state) >> np.uint64(33)) % np.uint64(n))
+
+
+@njit(cache=True)
+def descend_many(nodes, root, heights, inverse_size, views, scalars, at, active, leaf):
+    """The leaf of each of K samples of one height map in one tree: all take one step together.
+
+    The reads of different samples overlap, which one sample after the other cannot (METHOD 2.7). views (K, V, 9),
+    scalars (K, n); at and active (K,) int64 are scratch; leaf (K,) int64 gets the answers.
+    """
+    n = views.shape[0]
+    for k in range(n):
+        at[k] = root
+        active[k] = k
+    while n > 0:
+        i = 0
+        while i < n:
+            k = active[i]
+            node = nodes[at[k]]
+            if node[2] < 0:
+                leaf[k] = -node[2] - 1
+                n -= 1
+                active[i] = active[n]
+                continue
+            value = response(heights, inverse_size, views[k], scalars[k], node[0], node[1], node[3])
+            at[k] = node[2] + (value >= (node[1] >> 16))
+            i += 1

@@ -1,0 +1,270 @@
+"""How a forest is grown: which tests a node tries, and which one it keeps (Lie-X Eq. 16 and 17)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from liex_lab.forests._kernels import (
+    ONE_PROBE,
+    SCALAR,
+    TWO_PROBES,
+    next_random,
+    pack_offsets,
+    random_below,
+    response,
+)
+from liex_lab.forests.forest import Forest, Samples, predict
+
+_N_THRESHOLDS = 20
+_TREES_A_STAGE = 2
+_N_FIRST, _N_SECOND, _N_KEPT = 96, 1500, 12  # samples of the first and second look at a test; tests that get the second
+
+
+@dataclass(frozen=True)
+class GrowthPlan:
+    """How trees grow. Shares are of the tests tried at a node; the rest compare two probes.
+
+    depth_share: how far offsets reach along the joint's z axis, of their reach across; bag_share: share of the images
+    that a tree sees, drawn without replacement, all samples of an image together (1: every tree sees all).
+    """
+
+    n_trees: int
+    max_depth: int
+    min_leaf: int
+    n_tests: int
+    one_probe_share: float
+    scalar_share: float
+    depth_share: float
+    bag_share: float
+
+
+def grow_forest(
+    samples: Samples, labels: NDArray[np.float32], keep: NDArray[np.bool_], plan: GrowthPlan, rng: np.random.Generator
+) -> tuple[Forest, NDArray[np.bool_]]:
+    """A forest for labels (n, D) of the kept samples, and which images each tree saw (T, n_images).
+
+    Trees grow in parallel from seeds drawn here, so the forest does not depend on the number of threads.
+    """
+    n_images = len(samples.heights)
+    in_bag = np.zeros((plan.n_trees, n_images), np.bool_)
+    for t in range(plan.n_trees):
+        in_bag[t, rng.permutation(n_images)[: max(1, round(plan.bag_share * n_images))]] = True
+    members = [np.flatnonzero(keep & in_bag[t][samples.image]).astype(np.int32) for t in range(plan.n_trees)]
+    starts = np.concatenate([[0], np.cumsum([len(m) for m in members])]).astype(np.int64)
+    order = np.concatenate(members)
+    capacity = max(1, max(len(m) for m in members) // max(1, plan.min_leaf)) + 1
+    nodes = np.zeros((plan.n_trees, 2 * capacity + 1, 4), np.int32)
+    leaves = np.zeros((plan.n_trees, capacity + 1, labels.shape[1]), np.float32)
+    counts = np.zeros((plan.n_trees, 2), np.int64)
+    seeds = rng.integers(0, 2**63, plan.n_trees, dtype=np.uint64)
+    _grow_all(
+        samples.heights, samples.image, samples.inverse_size, samples.views, samples.scalars, labels, order, starts,
+        seeds, plan.max_depth, plan.min_leaf, plan.n_tests, plan.one_probe_share, plan.scalar_share, plan.depth_share,
+        nodes, leaves, counts,
+    )  # fmt: skip
+    trees = [(nodes[t, : counts[t, 0]], leaves[t, : counts[t, 1]]) for t in range(plan.n_trees)]
+    return Forest.pack(trees), in_bag
+
+
+def boost_forest(
+    samples: Samples, labels: NDArray[np.float32], plan: GrowthPlan, shrinkage: float, rng: np.random.Generator
+) -> Forest:
+    """A forest whose trees correct one another: each pair is grown on what the pairs before it left of labels (n, D).
+
+    Stochastic gradient boosting of squared error (Friedman 2002) with two trees a stage, grown in parallel on different
+    images. Leaves are scaled so that the mean over trees, which is how every forest predicts, is the boosted sum.
+    """
+    mean = labels.mean(axis=0)
+    left = (labels - mean).astype(np.float32)
+    everything = np.ones(len(labels), np.bool_)
+    n_stages = max(1, plan.n_trees // _TREES_A_STAGE)
+    trees = []
+    for _ in range(n_stages):
+        stage, _ = grow_forest(samples, left, everything, replace(plan, n_trees=_TREES_A_STAGE), rng)
+        left -= shrinkage * predict(stage, samples)
+        trees.append(Forest(stage.nodes, stage.roots, stage.leaves * np.float32(shrinkage * n_stages) + mean))
+    return Forest.join(trees)
+
+
+@njit(cache=True, parallel=True)
+def _grow_all(
+    heights, image, inverse_size, views, scalars, labels, order, starts, seeds, max_depth, min_leaf, n_tests,
+    one_probe_share, scalar_share, depth_share, nodes, leaves, counts,
+):  # fmt: skip
+    for t in prange(seeds.size):
+        _grow_tree(
+            heights, image, inverse_size, views, scalars, labels, order[starts[t] : starts[t + 1]], seeds[t],
+            max_depth, min_leaf, n_tests, one_probe_share, scalar_share, depth_share, nodes[t], leaves[t], counts[t],
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def _draw_test(state, n_views, n_scalars, one_probe_share, scalar_share, depth_share, test):
+    """A random test into `test` (3,) int32: words 0, 1 and 3 of a node, threshold still 0."""
+    kind_draw = (next_random(state) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+    kind, channel = TWO_PROBES, random_below(state, n_views)
+    if kind_draw < scalar_share and n_scalars > 0:
+        kind, channel = SCALAR, random_below(state, n_scalars)
+    elif kind_draw < scalar_share + one_probe_share:
+        kind = ONE_PROBE
+    u, v = np.empty(3, np.int64), np.empty(3, np.int64)
+    deep = max(1, int(127 * depth_share))
+    for k in range(3):
+        reach = deep if k == 2 else 127
+        u[k] = random_below(state, 2 * reach + 1) - reach
+        v[k] = random_below(state, 2 * reach + 1) - reach
+    test[0], test[1] = pack_offsets(u, v, 0)
+    test[2] = kind + 4 * channel
+
+
+@njit(cache=True)
+def _best_threshold(values, n, chosen, labels, min_share, sums, result):
+    """Best of evenly spread thresholds for responses values (n,) of samples `chosen`: gain and it, into result (2,).
+
+    Plain variance reduction (Eq. 16 with Eq. 17 as a mean): up to a constant, |sum_left|^2 / n_left + the same right.
+    """
+    result[0], result[1] = -1.0, 0.0
+    low, high = values[0], values[0]
+    for i in range(1, n):
+        low, high = min(low, values[i]), max(high, values[i])
+    if not high - low >= 1.0:
+        return
+    n_labels = labels.shape[1]
+    for b in range(_N_THRESHOLDS + 1):
+        for d in range(n_labels + 1):
+            sums[b, d] = 0.0
+    scale = _N_THRESHOLDS / (high - low)
+    for i in range(n):
+        b = int((values[i] - low) * scale + 0.5)
+        sums[b, n_labels] += 1.0
+        for d in range(n_labels):
+            sums[b, d] += labels[chosen[i], d]
+    for b in range(1, _N_THRESHOLDS + 1):
+        for d in range(n_labels + 1):
+            sums[b, d] += sums[b - 1, d]
+    total = sums[_N_THRESHOLDS]
+    least = max(1.0, min_share * n)
+    for b in range(_N_THRESHOLDS):
+        n_left = sums[b, n_labels]
+        n_right = total[n_labels] - n_left
+        if n_left < least or n_right < least:
+            continue
+        gain = 0.0
+        for d in range(n_labels):
+            right = total[d] - sums[b, d]
+            gain += sums[b, d] * sums[b, d] / n_left + right * right / n_right
+        if gain > result[0]:
+            result[0], result[1] = gain, low + (b + 0.5) / scale
+
+
+@njit(cache=True)
+def _look(heights, image, inverse_size, views, scalars, chosen, n, test, values):
+    """Responses of samples `chosen` (n,) to a test into `values`."""
+    for i in range(n):
+        s = chosen[i]
+        values[i] = response(heights[image[s]], inverse_size[s], views[s], scalars[s], test[0], test[1], test[2])
+
+
+@njit(cache=True)
+def _find_split(
+    heights, image, inverse_size, views, scalars, labels, members, state, min_leaf, n_tests, one_probe_share,
+    scalar_share, depth_share, chosen, values, sums, best,
+):  # fmt: skip
+    """The test that a node keeps into best (4,): words 0, 1, 3 and the threshold. False when none separates it."""
+    n = members.size
+    n_tried = n_tests if n >= 128 else min(n_tests, max(20, n_tests * n // 128))
+    n_first = min(n, _N_FIRST)
+    for i in range(n_first):
+        chosen[i] = members[i] if n <= _N_FIRST else members[random_below(state, n)]
+    tests = np.empty((n_tried, 3), np.int32)
+    gains = np.empty(n_tried)
+    result = np.empty(2)
+    for k in range(n_tried):
+        _draw_test(state, views.shape[1], scalars.shape[1], one_probe_share, scalar_share, depth_share, tests[k])
+        _look(heights, image, inverse_size, views, scalars, chosen, n_first, tests[k], values)
+        _best_threshold(values, n_first, chosen, labels, min_leaf / n, sums, result)
+        gains[k] = -result[0]
+    n_second = min(n, _N_SECOND)
+    for i in range(n_second):
+        chosen[i] = members[i] if n <= _N_SECOND else members[random_below(state, n)]
+    found, best_gain = False, -1.0
+    ranked = np.argsort(gains)
+    for r in range(min(_N_KEPT, n_tried)):
+        k = ranked[r]
+        if gains[k] > 0.0:
+            break
+        _look(heights, image, inverse_size, views, scalars, chosen, n_second, tests[k], values)
+        _best_threshold(values, n_second, chosen, labels, min_leaf / n, sums, result)
+        if result[0] > best_gain:
+            found, best_gain = True, result[0]
+            best[0], best[1], best[2] = tests[k, 0], tests[k, 1], tests[k, 2]
+            best[3] = min(max(int(np.ceil(result[1])), -32768), 32767)
+    return found
+
+
+@njit(cache=True)
+def _part(heights, image, inverse_size, views, scalars, members, best):
+    """Order `members` so that those going left come first; how many do."""
+    left, right = 0, members.size - 1
+    while left <= right:
+        s = members[left]
+        value = response(heights[image[s]], inverse_size[s], views[s], scalars[s], best[0], best[1], best[2])
+        if value >= best[3]:
+            members[left], members[right] = members[right], members[left]
+            right -= 1
+        else:
+            left += 1
+    return left
+
+
+@njit(cache=True)
+def _grow_tree(
+    heights, image, inverse_size, views, scalars, labels, members, seed, max_depth, min_leaf, n_tests,
+    one_probe_share, scalar_share, depth_share, nodes, leaves, counts,
+):  # fmt: skip
+    """Grow one tree on `members` into nodes and leaves; counts (2,) gets how many of each there are."""
+    state = np.empty(1, np.uint64)
+    state[0] = seed
+    n_labels = labels.shape[1]
+    chosen = np.empty(max(_N_FIRST, _N_SECOND), np.int32)
+    values = np.empty(max(_N_FIRST, _N_SECOND), np.float32)
+    sums = np.empty((_N_THRESHOLDS + 1, n_labels + 1))
+    best = np.empty(4, np.int32)
+    stack = np.empty((4 * max_depth + 8, 4), np.int64)  # node, first member, past the last, depth
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, members.size, 0
+    top, n_nodes, n_leaves = 1, 1, 0
+    while top > 0:
+        top -= 1
+        node, first, stop, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        here = members[first:stop]
+        middle = 0
+        if here.size >= 2 * min_leaf and depth < max_depth and _find_split(
+            heights, image, inverse_size, views, scalars, labels, here, state, min_leaf, n_tests, one_probe_share,
+            scalar_share, depth_share, chosen, values, sums, best,
+        ):  # fmt: skip
+            middle = _part(heights, image, inverse_size, views, scalars, here, best)
+            if middle < min_leaf or here.size - middle < min_leaf:
+                middle = 0
+        if middle == 0:
+            for d in range(n_labels):
+                total = 0.0
+                for i in range(here.size):
+                    total += labels[here[i], d]
+                leaves[n_leaves, d] = total / max(1, here.size)
+            nodes[node, 2] = -n_leaves - 1
+            n_leaves += 1
+            continue
+        nodes[node, 0] = best[0]
+        nodes[node, 1] = (best[1] & 0xFFFF) | (best[3] << 16)
+        nodes[node, 2] = n_nodes
+        nodes[node, 3] = best[2]
+        right, left = stack[top], stack[top + 1]
+        right[0], right[1], right[2], right[3] = n_nodes + 1, first + middle, stop, depth + 1
+        left[0], left[1], left[2], left[3] = n_nodes, first, first + middle, depth + 1
+        top += 2
+        n_nodes += 2
+    counts[0], counts[1] = n_nodes, n_leaves

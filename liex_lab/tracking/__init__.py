@@ -1,0 +1,1 @@
+"""From poses to a track: the curve of one animal over a recording."""

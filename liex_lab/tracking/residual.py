@@ -1,0 +1,81 @@
+"""How well a pose explains the picture: the rendered body against the observed depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.surface import Surface, render_meshes
+from liex_lab.geometry import SE3
+from liex_lab.recordings.foreground import CROP, Crops, Scene
+
+Array = NDArray[np.float64]
+
+_GIRTHS = np.linspace(0.75, 1.35, 13)  # of the default body at the animal's size
+_MIN_OVERLAP_PX = 20
+
+
+@dataclass(frozen=True)
+class BodyResidual:
+    """The default body of a skeleton, fattened or thinned by `girth`, held against depth."""
+
+    surface: Surface
+    girth: float = 1.0
+
+    def of(self, pose_arena: Pose, crops: Crops, scene: Scene) -> Array:
+        """Median absolute difference (n,) mm between body and reading over the pixels that both cover; NaN without.
+
+        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth.
+        """
+        n = len(pose_arena.scale)
+        if n == 0:
+            return np.zeros(0)
+        rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
+        out = np.empty(n)
+        floor = scene.floor
+        _compare(rendered, crops.heights, crops.origin, crops.step, floor.inverse_depth, floor.distance_mm, out)
+        return out
+
+    @staticmethod
+    def fit(surface: Surface, pose_arena: Pose, crops: Crops, scene: Scene) -> BodyResidual:
+        """The girth with which the default body explains these frames best."""
+        cost = [np.nanmedian(BodyResidual(surface, float(g)).of(pose_arena, crops, scene)) for g in _GIRTHS]
+        return BodyResidual(surface, float(_GIRTHS[int(np.argmin(cost))]))
+
+
+def render_crops(
+    surface: Surface, pose_arena: Pose, girth: float, crops: Crops, scene: Scene
+) -> NDArray[np.float32]:
+    """The body's depth (n, CROP, CROP) mm on the pixels of the height maps, 0 where it is not."""
+    camera = scene.camera
+    n = len(pose_arena.scale)
+    vertices = surface.vertices(pose_arena, girth=girth * pose_arena.scale)
+    # a crop of every second pixel is the picture of a camera of half the resolution
+    step = crops.step.astype(float)
+    scaled = np.stack([camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step], axis=1)
+    T = scene.floor.T_arena_camera.inverse()
+    T_camera_arena = SE3(np.broadcast_to(T.rotation, (n, 3, 3)).copy(), np.broadcast_to(T.translation, (n, 3)).copy())
+    origin = crops.origin / step[:, None]
+    return render_meshes(vertices, surface.faces, T_camera_arena, scaled, origin, (CROP, CROP))
+
+
+@njit(cache=True, parallel=True)
+def _compare(rendered, heights, origin, step, plane, distance, out):
+    """Median |rendered - observed| depth of each frame over pixels where both are, into out (n,)."""
+    for i in prange(rendered.shape[0]):
+        size = rendered.shape[1]
+        off = np.empty(size * size)
+        n = 0
+        for r in range(size):
+            v = origin[i, 1] + step[i] * r
+            for c in range(size):
+                if rendered[i, r, c] > 0 and heights[i, r, c] > 0:
+                    u = origin[i, 0] + step[i] * c
+                    observed = (1.0 - heights[i, r, c] / 16.0 / distance) / (plane[0] * u + plane[1] * v + plane[2])
+                    off[n] = abs(rendered[i, r, c] - observed)
+                    n += 1
+        out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan

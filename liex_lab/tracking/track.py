@@ -1,0 +1,89 @@
+"""A track: the curve of one animal's poses over a recording, one row for every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import SE3
+
+Array = NDArray[np.float64]
+
+FLAGS = {
+    "": "a pose was measured and is trusted",
+    "doubtful": "a pose was measured, but its predicted error is large for this animal",
+    "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN",
+    "no_depth": "the frame holds no depth at all; the row is NaN",
+}
+
+
+@dataclass(frozen=True)
+class Track:
+    """Poses over time: one row for EVERY frame of the recording, NaN where nothing was measured.
+
+    times_ns (n,) int64; joints_mm (n, J, 3) arena frame; uv_px (n, J, 2) pixels of the depth image; sd_mm (n, J);
+    root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; sd_root (n, 6) rad and mm, in the root's own frame;
+    angles_rad (n, J, 3) rotation vectors relative to the parent joint; sd_angles_rad (n, J, 3); scale (n,) of the
+    skeleton's bones; predicted_error_mm (n,) mean joint error expected by the learned metric; residual_mm (n,) median
+    distance between the rendered body and the observed depth; n_foreground_px (n,); centroid_mm (n, 3) centre of the
+    animal as seen from above and its mean height, arena frame; centroid_px (n, 2); flag (n,) a word of `FLAGS`.
+    """
+
+    skeleton: Skeleton
+    times_ns: NDArray[np.int64]
+    joints_mm: Array
+    uv_px: Array
+    sd_mm: Array
+    root_rotation: Array
+    root_mm: Array
+    sd_root: Array
+    angles_rad: Array
+    sd_angles_rad: Array
+    scale: Array
+    predicted_error_mm: Array
+    residual_mm: Array
+    n_foreground_px: NDArray[np.int64]
+    centroid_mm: Array
+    centroid_px: Array
+    flag: NDArray[np.str_]
+
+    @staticmethod
+    def empty(skeleton: Skeleton, times_ns: NDArray[np.int64], flag: str = "not_found") -> Track:
+        """A track of these times in which nothing has been measured yet."""
+        n, j = len(times_ns), skeleton.n_joints
+        nan = np.full
+        return Track(
+            skeleton, np.asarray(times_ns, np.int64), nan((n, j, 3), np.nan), nan((n, j, 2), np.nan),
+            nan((n, j), np.nan), nan((n, 3, 3), np.nan), nan((n, 3), np.nan), nan((n, 6), np.nan),
+            nan((n, j, 3), np.nan), nan((n, j, 3), np.nan), nan(n, np.nan), nan(n, np.nan), nan(n, np.nan),
+            np.zeros(n, np.int64), nan((n, 3), np.nan), nan((n, 2), np.nan), np.full(n, flag, dtype="<U12"),
+        )  # fmt: skip
+
+    @staticmethod
+    def join(parts: list[Track]) -> Track:
+        """One track from consecutive parts of the same recording."""
+        columns = [f.name for f in fields(Track) if f.name != "skeleton"]
+        return Track(parts[0].skeleton, *(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the recording, measured or not."""
+        return len(self.times_ns)
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(n,) True where a pose was measured."""
+        return np.isfinite(self.joints_mm[:, 0, 0])
+
+    @property
+    def root(self) -> SE3:
+        """T_arena_root, a batch (n,)."""
+        return SE3(self.root_rotation, self.root_mm)
+
+    @property
+    def spine_mm(self) -> Array:
+        """(n,) length of the fitted chain, all bones added up, mm."""
+        return self.scale * self.skeleton.length

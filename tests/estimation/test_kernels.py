@@ -1,0 +1,197 @@
+"""What a candidate sees is what the camera sees, and corrections are the group's own products."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.body.kinematics import forward_kinematics
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.camera import KINECT_V2, PRIMESENSE, Camera
+from liex_lab.estimation import _kernels as kernels
+from liex_lab.forests._kernels import VIEW
+from liex_lab.geometry import SE3, so3
+from liex_lab.recordings.arena import Floor
+from liex_lab.recordings.foreground import Crops, Scene
+
+REACH = 50.0
+
+
+class Window:
+    """One height map's look, and the exact way from a point of its view frame to a crop pixel."""
+
+    def __init__(self, camera: Camera, tilt_deg: float, step: int, camera_view: bool) -> None:
+        tilt = np.radians(tilt_deg)
+        floor = Floor.from_plane(np.array([np.sin(tilt), -0.4 * np.sin(tilt), np.cos(tilt)]), 700.0, camera)
+        scene = Scene.from_floor(camera, floor)
+        distance = 655.0 if camera_view else floor.distance_mm
+        origin = np.array([[camera.width // 2 - 30, camera.height // 2 - 70]], np.int32)
+        crops = Crops(
+            np.zeros((1, 96, 96), np.int16), origin, np.array([step], np.int32), np.ones(1, np.int64),
+            np.zeros((1, 8)), np.array([distance]), np.ones(1, np.int64),
+        )  # fmt: skip
+        self.look = scene.looks(crops, camera_view)[0]
+        self.camera, self.origin, self.step = camera, origin[0], step
+        self.T_camera_view = SE3(scene.view_rotation(camera_view), np.array([0.0, 0.0, distance])).inverse()
+
+    def crop_pixel(self, p_view: np.ndarray) -> np.ndarray:
+        """Crop pixels (..., 2) under points (..., 3) mm of the view frame."""
+        return (self.camera.project(self.T_camera_view @ p_view) - self.origin) / self.step
+
+    def view(self, rotation: np.ndarray, position: np.ndarray, size: float = 1.0, reach: float = REACH) -> np.ndarray:
+        view = np.empty(VIEW)
+        kernels.fill_view(rotation, position, self.look, size, reach, view)
+        return view
+
+
+CASES = (
+    (PRIMESENSE, 0.0, 1, False), (PRIMESENSE, 9.0, 2, False), (KINECT_V2, 5.0, 1, False),
+    (Camera(900.0, 850.0, 500.0, 420.0, 1024, 1024), 12.0, 3, False), (KINECT_V2, 7.0, 2, True),
+)  # fmt: skip
+WINDOWS = [Window(*case) for case in CASES]
+
+
+def drawn_joint(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return so3.exp(rng.normal(0, 1.0, 3)), rng.uniform([-120, -90, 2], [120, 90, 60])
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_a_joint_is_seen_at_its_exact_crop_pixel_and_height(window):
+    rng = np.random.default_rng(1)
+    for size in (0.8, 1.0, 1.9):
+        rotation, position = drawn_joint(rng)
+        view = window.view(rotation, position, size)
+        np.testing.assert_allclose(view[:2], window.crop_pixel(position), atol=1e-9)
+        assert view[8] == pytest.approx(16.0 * position[2] / size)
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_offsets_move_over_the_crop_as_the_exact_projection_does_to_first_order(window):
+    rng = np.random.default_rng(2)
+    for size in (0.8, 1.0, 1.9):
+        rotation, position = drawn_joint(rng)
+        matrix = window.view(rotation, position, size)[2:8].reshape(2, 3)
+        unit = REACH * size / 127.0
+        for k in range(3):
+            h = 1e-3
+            ahead, behind = (window.crop_pixel(position + sign * h * unit * rotation[:, k]) for sign in (1, -1))
+            np.testing.assert_allclose(matrix[:, k], (ahead - behind) / (2 * h), atol=1e-8)
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+def test_what_the_first_order_leaves_out_shrinks_with_the_square_of_the_offset(window):
+    rng = np.random.default_rng(3)
+    rotation, position = drawn_joint(rng)
+    view = window.view(rotation, position)
+    offset = rng.integers(-127, 128, 3).astype(float)
+
+    def error(share: float) -> float:
+        exact = window.crop_pixel(position + rotation @ (share * offset * REACH / 127.0))
+        return float(np.linalg.norm(view[:2] + view[2:8].reshape(2, 3) @ (share * offset) - exact))
+
+    assert error(0.1) == pytest.approx(0.25 * error(0.2), rel=0.1, abs=1e-9)
+
+
+def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
+    rng = np.random.default_rng(4)
+    window, n = WINDOWS[1], 7
+    rotations, positions = so3.exp(rng.normal(0, 1, (n, 3, 3))), rng.uniform(-50, 50, (n, 3, 3))
+    moments = rng.uniform(10, 100, (2, 8))
+    size, scale, image = rng.uniform(0.8, 1.2, n), rng.uniform(0.8, 1.2, n), np.arange(n, dtype=np.int32) % 2
+    views, scalars = np.empty((n, 2, VIEW)), np.empty((n, kernels.N_SCALARS))
+    kernels.look_all(
+        np.array([2, 0]), np.stack([window.look] * 2), moments, image, size, REACH, rotations, positions, scale, views,
+        scalars,
+    )  # fmt: skip
+    for s in range(n):
+        own = np.empty(kernels.N_SCALARS)
+        kernels.fill_scalars(rotations[s, 2], positions[s, 2], scale[s], moments[image[s]], size[s], own)
+        np.testing.assert_array_equal(scalars[s], own)
+        for v, joint in enumerate((2, 0)):
+            np.testing.assert_array_equal(views[s, v], window.view(rotations[s, joint], positions[s, joint], size[s]))
+
+
+@pytest.mark.parametrize(("turned", "grown"), [(0.7, 1.0), (-2.9, 1.0), (0.0, 1.6), (2.0, 0.7)])
+def test_the_numbers_about_the_whole_animal_do_not_change_when_it_turns_or_grows(turned, grown):
+    rng = np.random.default_rng(5)
+    rotation, position = drawn_joint(rng)
+    moments = np.array([900.0, 1300.0, 21000.0, 12.0, -7.0, 0.4, 16.0, 7.0])
+    before, after = np.empty((2, kernels.N_SCALARS))
+    kernels.fill_scalars(rotation, position, 0.95, moments, 1.0, before)
+    turn = so3.exp(np.array([0.0, 0.0, turned]))
+    centre = grown * turn[:2, :2] @ moments[3:5]
+    moved = moments * [1, grown**2, grown**3, 0, 0, 1, grown, grown] + [0, 0, 0, *centre, turned, 0, 0]
+    kernels.fill_scalars(turn @ rotation, grown * turn @ position, 0.95 * grown, moved, grown, after)
+    np.testing.assert_allclose(after, before, atol=1e-8)
+
+
+TURNS = [0.0, 1e-12, 1e-7, 0.99e-4, 1.01e-4, 0.99e-3, 1.01e-3, 0.3, 2.0, np.pi - 1e-9, np.pi, np.pi + 0.4]
+
+
+@pytest.mark.parametrize("angle", TURNS)
+def test_a_correction_of_the_base_is_a_product_on_the_right(angle):
+    rng = np.random.default_rng(6)
+    for size in (1.0, 1.7):
+        axis = rng.normal(0, 1, 3)
+        twist = np.concatenate([angle * axis / np.linalg.norm(axis), rng.normal(0, 15, 3), [0.11]])
+        rotation, position = drawn_joint(rng)
+        expected = SE3(rotation, position) @ SE3.exp(twist[:6] * [1, 1, 1, size, size, size])
+        got_rotation, got_position = rotation.copy(), position.copy()
+        scale = kernels.correct_base(got_rotation, got_position, 0.9, twist, size)
+        np.testing.assert_allclose(got_rotation, expected.rotation, atol=1e-12)
+        np.testing.assert_allclose(got_position, expected.translation, atol=1e-9)
+        assert scale == pytest.approx(0.9 * np.exp(0.11))
+
+
+def test_corrections_of_a_batch_count_in_levers_and_leave_the_scale_alone_without_a_seventh_value():
+    rng = np.random.default_rng(7)
+    rotations, positions = so3.exp(rng.normal(0, 1, (4, 2, 3))), rng.normal(0, 20, (4, 2, 3))
+    scale, size = rng.uniform(0.8, 1.2, 4), rng.uniform(0.8, 1.2, 4)
+    values = rng.normal(0, 5, (4, 7)).astype(np.float32)
+    for width in (6, 7):
+        got_rotation, got_position, got_scale = rotations.copy(), positions.copy(), scale.copy()
+        kernels.correct_base_all(got_rotation, got_position, got_scale, values[:, :width], np.array([30.0, 50.0]), size)
+        twist = values[:, :6].astype(float) * (1 / 30.0, 1 / 30.0, 1 / 30.0, 1, 1, 1)
+        twist[:, 3:] *= size[:, None]
+        expected = SE3(rotations[:, 0], positions[:, 0]) @ SE3.exp(twist)
+        np.testing.assert_allclose(got_rotation[:, 0], expected.rotation, atol=1e-12)
+        np.testing.assert_allclose(got_position[:, 0], expected.translation, atol=1e-9)
+        np.testing.assert_array_equal(got_rotation[:, 1], rotations[:, 1])
+        grown = np.exp(values[:, 6].astype(float) / 50.0) if width == 7 else 1.0
+        np.testing.assert_allclose(got_scale, scale * grown, rtol=1e-12)
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 1), (0, 0, 1), (1, 0, 0), (1, 1, 1)])
+def test_a_joint_turns_on_the_right_about_its_free_axes_only(axes):
+    rng = np.random.default_rng(8)
+    free = np.array(axes, bool)
+    for strength in (0.0, 1e-6, 0.5, 3.0):
+        values = strength * 20.0 * rng.normal(0, 1, int(free.sum()))
+        turn = np.zeros(3)
+        turn[free] = values / 20.0
+        rotation = so3.exp(rng.normal(0, 1, 3))
+        got = rotation.copy()
+        kernels.correct_joint(got, free, values, 20.0)
+        np.testing.assert_allclose(got, rotation @ so3.exp(turn), atol=1e-12)
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_joints_placed_and_turned_one_after_the_other_give_the_forward_kinematics(animal):
+    rng = np.random.default_rng(9)
+    skeleton = Skeleton.load(animal)
+    angles = rng.normal(0, 0.4, (skeleton.n_joints, 3)) * skeleton.axes
+    angles[0] = 0.0
+    root, scale = SE3(*drawn_joint(rng)), 1.13
+    expected = forward_kinematics(skeleton, root, angles, np.array(scale))
+    rotations, positions = np.zeros((skeleton.n_joints, 3, 3)), np.zeros((skeleton.n_joints, 3))
+    rotations[0], positions[0] = root.rotation, root.translation
+    home = (skeleton.parents, skeleton.offsets, skeleton.rest, scale, rotations, positions)
+    for joint in skeleton.solved[1:]:
+        kernels.place_joint(joint, *home)
+        kernels.correct_joint(rotations[joint], skeleton.axes[joint], angles[joint][skeleton.axes[joint]], 1.0)
+    solved = (rotations.copy(), positions.copy())
+    kernels.place_rest(np.array(skeleton.solved), *home)
+    np.testing.assert_allclose(rotations, expected[0], atol=1e-12)
+    np.testing.assert_allclose(positions, expected[1], atol=1e-10)
+    np.testing.assert_array_equal(rotations[skeleton.solved], solved[0][skeleton.solved])
+    np.testing.assert_array_equal(positions[skeleton.solved], solved[1][skeleton.solved])

@@ -1,0 +1,102 @@
+"""Forests: nodes hold what was put in, fast descents agree with the slow twin, growth learns and is repeatable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+
+from liex_lab.forests import _kernels as kernels
+from liex_lab.forests.forest import Samples, predict
+from liex_lab.forests.grow import GrowthPlan, grow_forest
+from tests.oracles.forest import leaf_by_hand
+
+PLAN = GrowthPlan(
+    n_trees=4, max_depth=8, min_leaf=5, n_tests=60, one_probe_share=0.3, scalar_share=0.2, depth_share=0.3,
+    bag_share=0.63,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bumps() -> tuple[Samples, np.ndarray]:
+    """Height maps with one bump, seen by a joint beside it; the label is where the bump is, mm."""
+    rng = np.random.default_rng(3)
+    n, size = 400, 48
+    where = rng.uniform(-8, 8, (n, 2))
+    rows, columns = np.mgrid[:size, :size]
+    off = (columns - 24 - where[:, :1, None]) ** 2 + (rows - 24 - where[:, 1:, None]) ** 2
+    heights = (np.maximum(20.0 - 0.4 * off, 0.0) * 16).astype(np.int16)
+    views = np.zeros((n, 1, kernels.VIEW), np.float32)
+    views[:, 0, :2] = 24
+    views[:, 0, 2] = views[:, 0, 6] = 20 / 127
+    views[:, 0, 8] = 16 * 10
+    scalars = rng.normal(0, 100, (n, 3)).astype(np.float32)
+    image, inverse_size = np.arange(n, dtype=np.int32), np.ones(n, np.float32)
+    return Samples(heights, image, inverse_size, views, scalars), where.astype(np.float32)
+
+
+def test_a_node_holds_offsets_and_threshold_of_any_sign():
+    for u, v, threshold in (((-127, 5, 0), (127, -1, -128 + 1), -32768), ((1, 2, 3), (-4, -5, -6), 32767)):
+        word0, word1 = kernels.pack_offsets(np.array(u), np.array(v), threshold)
+        assert [kernels.byte(word0, k) for k in range(4)] == [*u, v[0]]
+        assert [kernels.byte(word1, k) for k in range(2)] == list(v[1:])
+        assert word1 >> 16 == threshold
+
+
+def test_descents_agree_with_the_walk_a_reader_would_write(bumps):
+    samples, labels = bumps
+    forest, _ = grow_forest(samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0))
+    at, active, leaf = np.empty((3, 1), np.int64)
+    for s in range(0, 400, 7):
+        for root in forest.roots:
+            scene = (samples.heights[s], samples.inverse_size[s], samples.views[s], samples.scalars[s])
+            by_hand = leaf_by_hand(forest.nodes, root, *scene)
+            assert kernels.descend(forest.nodes, root, *scene) == by_hand
+            kernels.descend_many(
+                forest.nodes, root, *scene[:2], samples.views[s : s + 1], samples.scalars[s : s + 1], at, active, leaf
+            )
+            assert leaf[0] == by_hand
+
+
+def test_a_forest_learns_where_the_bump_is(bumps):
+    samples, labels = bumps
+    forest, in_bag = grow_forest(samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0))
+    off = np.linalg.norm(predict(forest, samples, in_bag) - labels, axis=1).mean()
+    assert off < 0.5 * np.linalg.norm(labels - labels.mean(0), axis=1).mean()
+
+
+def test_out_of_bag_predictions_use_only_trees_that_did_not_see_the_image(bumps):
+    samples, labels = bumps
+    plan = replace(PLAN, n_trees=1)
+    forest, in_bag = grow_forest(samples, labels, np.ones(len(samples), bool), plan, np.random.default_rng(0))
+    assert in_bag.sum() == round(0.63 * len(samples))
+    two = np.concatenate([in_bag, ~in_bag])
+    doubled = replace(forest, roots=np.repeat(forest.roots, 2))
+    np.testing.assert_allclose(predict(doubled, samples, two), predict(forest, samples), atol=1e-6)
+
+
+def test_growth_does_not_depend_on_the_number_of_threads(bumps):
+    samples, labels = bumps
+    everything = np.ones(len(samples), bool)
+    grown = []
+    for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+        numba.set_num_threads(threads)
+        grown.append(grow_forest(samples, labels, everything, PLAN, np.random.default_rng(5))[0])
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    np.testing.assert_array_equal(grown[0].nodes, grown[1].nodes)
+    np.testing.assert_array_equal(grown[0].leaves, grown[1].leaves)
+
+
+def test_no_leaf_is_smaller_than_allowed(bumps):
+    samples, labels = bumps
+    forest, _ = grow_forest(
+        samples, labels, np.ones(len(samples), bool), replace(PLAN, bag_share=1.0), np.random.default_rng(1)
+    )
+    for root in forest.roots:
+        reached = [
+            kernels.descend(forest.nodes, root, samples.heights[s], 1.0, samples.views[s], samples.scalars[s])
+            for s in range(len(samples))
+        ]
+        assert np.unique(reached, return_counts=True)[1].min() >= PLAN.min_leaf

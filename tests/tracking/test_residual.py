@@ -1,0 +1,102 @@
+"""The body held against the picture: the true pose explains it, a wrong one does not, and a fat mouse stays fat."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.surface import Surface
+from liex_lab.camera import Camera
+from liex_lab.geometry import SE3
+from liex_lab.recordings.arena import Floor
+from liex_lab.recordings.foreground import Scene
+from liex_lab.tracking.residual import BodyResidual, render_crops
+from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice
+
+LARGE = Camera(1150.0, 1150.0, 319.5, 239.5, 640, 480)  # so near that every second pixel fills a height map
+LARGE_FLOOR = Floor.from_plane(np.array([-0.05, 0.03, 1.0]), 600.0, LARGE)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Toy:
+    return toy_mice(40, 7, noise_mm=0.0)
+
+
+@pytest.fixture(scope="module")
+def surface(clean: Toy) -> Surface:
+    return Surface.of(clean.skeleton)
+
+
+def moved(pose: Pose, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
+    return pose.moved(SE3(np.eye(3), np.array([x, y, z])))
+
+
+def test_the_true_pose_explains_a_clean_picture(clean, surface):
+    off = BodyResidual(surface).of(clean.pose, SCENE.extract(clean.depths, 1.0), SCENE)
+    assert off.shape == (40,)
+    assert np.median(off) < 0.5
+    assert off.max() < 1.0
+
+
+def test_a_crop_of_every_second_pixel_is_explained_as_well(clean, surface):
+    few = clean.pose[slice(0, 6)]
+    scene = Scene.from_floor(LARGE, LARGE_FLOOR)
+    depths = rendered(clean.skeleton, few, camera=LARGE, floor=LARGE_FLOOR).astype(np.float32)
+    crops = scene.extract(depths, 1.0)
+    assert (crops.step > 1).all()
+    assert BodyResidual(surface).of(few, crops, scene).max() < 1.0
+
+
+def test_the_body_is_drawn_on_the_pixels_of_the_height_map(clean, surface):
+    crops = SCENE.extract(clean.depths, 1.0)
+    drawn = render_crops(surface, clean.pose, 1.0, crops, SCENE)
+    for k in range(0, 40, 8):
+        (u, v), size = crops.origin[k], drawn.shape[1]
+        v0, u0 = max(v, 0), max(u, 0)
+        whole = clean.depths[k, v0 : v + size, u0 : u + size]
+        part = drawn[k, v0 - v :, u0 - u :][: whole.shape[0], : whole.shape[1]]
+        bare = FLOOR.depth(CAMERA.width, CAMERA.height)[v0 : v + size, u0 : u + size]
+        here = (part > 0) & (part < bare)
+        np.testing.assert_allclose(whole[here], part[here], atol=1e-3)
+        np.testing.assert_allclose(whole[~here], bare[~here], atol=1e-3)
+
+
+@pytest.mark.parametrize("lifted", [4.0, -4.0, 9.0])
+def test_a_body_that_is_held_too_high_is_off_by_about_as_much(clean, surface, lifted):
+    off = BodyResidual(surface).of(moved(clean.pose, z=lifted), SCENE.extract(clean.depths, 1.0), SCENE)
+    assert np.median(off) == pytest.approx(abs(lifted), abs=0.8)
+
+
+def test_a_wrong_pose_explains_the_picture_worse_than_the_true_one(clean, surface):
+    crops = SCENE.extract(clean.depths, 1.0)
+    true = BodyResidual(surface).of(clean.pose, crops, SCENE)
+    wrong = BodyResidual(surface).of(moved(clean.pose, x=8.0), crops, SCENE)
+    assert (wrong > true).all()
+
+
+def test_a_body_that_does_not_touch_the_animal_has_no_residual(clean, surface):
+    off = BodyResidual(surface).of(moved(clean.pose, x=150.0), SCENE.extract(clean.depths, 1.0), SCENE)
+    assert np.isnan(off).all()
+
+
+def test_of_no_frames_there_is_no_residual(clean, surface):
+    none = np.zeros(40, np.bool_)
+    assert BodyResidual(surface).of(clean.pose[none], SCENE.extract(clean.depths, 1.0)[none], SCENE).shape == (0,)
+
+
+@pytest.mark.parametrize("girth", [0.8, 1.0, 1.25])
+def test_the_girth_of_an_animal_is_found_again(clean, surface, girth):
+    depths = rendered(clean.skeleton, clean.pose, girth).astype(np.float32)
+    body = BodyResidual.fit(surface, clean.pose, SCENE.extract(depths, 1.0), SCENE)
+    assert body.girth == pytest.approx(girth, abs=0.051)
+
+
+def test_frames_that_cannot_be_compared_do_not_disturb_the_girth(clean, surface):
+    depths = rendered(clean.skeleton, clean.pose, 1.2).astype(np.float32)
+    place = clean.pose.root.translation.copy()
+    place[:5, 0] += 150.0
+    pose = replace(clean.pose, root=SE3(clean.pose.root.rotation, place))
+    assert BodyResidual.fit(surface, pose, SCENE.extract(depths, 1.0), SCENE).girth == pytest.approx(1.2, abs=0.051)
