@@ -1,0 +1,1 @@
+"""The views: they read session folders and compute no science."""

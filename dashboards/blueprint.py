@@ -1,0 +1,42 @@
+"""The layout in which a session's replay opens in Rerun: 3D scene and depth picture above, lanes and curves below."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def replay_blueprint(session: dict[str, Any]) -> Any:
+    """A Rerun blueprint from the content of session.json; handed to `Session.create` as `blueprint`."""
+    import rerun.blueprint as rrb
+
+    body_m = float(session["animal"].get("spine_mm") or session["animal"]["home_length_mm"]) / 1000.0
+    scene = rrb.Spatial3DView(
+        origin="arena",
+        contents=["$origin/**", "- /arena/camera/image/overlay/**"],
+        name="3D: the animal, followed (metres)",
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=body_m * np.array([0.8, -2.6, 2.2]),
+            look_target=[0.0, 0.0, 0.0],
+            eye_up=[0.0, 0.0, 1.0],
+            tracking_entity="/arena/skeleton/joints",
+        ),
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    picture = rrb.Spatial2DView(
+        origin="arena/camera/image", contents=["$origin/**"], name="depth with the fitted skeleton"
+    )
+    lanes = rrb.StateTimelineView(origin="ethogram", name="actions (predicted) and frames to distrust (tracking)")
+    curves = rrb.Horizontal(
+        rrb.TimeSeriesView(origin="kinematics/speed_mm_s", name="speed"),
+        rrb.TimeSeriesView(origin="kinematics/nose_height_mm", name="nose above the floor"),
+        rrb.TimeSeriesView(origin="error/predicted", name="predicted error"),
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(rrb.Horizontal(scene, picture), lanes, curves, row_shares=[5, 1.6, 2]),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )

@@ -1,0 +1,304 @@
+"""Small figures as SVG text: they take the page's colours, print sharply and weigh a few kilobytes.
+
+Numbers come in as arrays, text goes out; nothing is computed here but where a mark stands on the paper. Colours that
+belong to the page (ink, grid) are CSS classes of the report's template.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+WIDTH, LEFT, RIGHT = 920, 64, 22  # shared by all figures over time, so that their axes stand below each other
+_MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
+ACTION_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933")
+_VIRIDIS = np.array(
+    [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
+     [170, 220, 50], [253, 231, 37]], float
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A straight map from numbers to places on the paper."""
+
+    low: float
+    high: float
+    start: float
+    stop: float
+
+    def __call__(self, value: Array | float) -> Array:
+        """Places of values."""
+        share = (np.asarray(value, float) - self.low) / (self.high - self.low)
+        return np.asarray(self.start + share * (self.stop - self.start))
+
+    def ticks(self, about: int) -> list[float]:
+        """Round numbers inside the scale."""
+        step = (self.high - self.low) / max(about, 1)
+        power = 10.0 ** np.floor(np.log10(step))
+        step = power * next(m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= 0.999 * step)
+        first = np.ceil(self.low / step - 1e-9)
+        return [float(k * step) + 0.0 for k in np.arange(first, np.floor(self.high / step + 1e-9) + 1)]
+
+
+def time_scale(duration_s: float) -> Scale:
+    """The axis that all figures over time share, s."""
+    return Scale(0.0, max(duration_s, 1e-3), LEFT, WIDTH - RIGHT)
+
+
+def curve(
+    time_s: Array, values: Array, time: Scale, unit: str, colour: str, shaded: Sequence[tuple[float, float]] = (),
+    from_zero: bool = True, last: bool = False,
+) -> str:  # fmt: skip
+    """Values over time, broken where they are unknown; `shaded` spans (start, stop) in s; `last` writes the times."""
+    top, bottom = 10.0, 110.0
+    height = bottom + (34 if last else 10)
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    low = min(low, 0.0) if from_zero else low
+    spread = max(high - low, 1e-9, 0.02 * abs(high))
+    scale = Scale(low, low + spread * 1.06, bottom, top)
+    parts = [_y_axis(scale, unit, 4), _x_axis(time, bottom, top, last)]
+    for start, stop in shaded:
+        x0, x1 = float(time(start)), float(time(stop))
+        parts.append(f'<rect class="shade" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 0.5):.1f}" '
+                     f'height="{bottom - top}"/>')  # fmt: skip
+    parts += [f'<path class="curve" stroke="{colour}" d="{d}"/>' for d in _paths(time(time_s), scale(values))]
+    return _svg(WIDTH, height, parts)
+
+
+def lanes(
+    spans: Sequence[tuple[float, float, str]], words: Sequence[str], lost: Sequence[tuple[float, float]], time: Scale
+) -> str:
+    """One row per word of the ethogram, its bouts as bars (start, stop, word) in s; times without a pose hatched."""
+    row, top = 18.0, 6.0
+    bottom = top + row * max(len(words), 1)
+    parts = [_x_axis(time, bottom, top, False)]
+    for start, stop in lost:
+        parts.append(_bar(time, start, stop, top, bottom - top, "url(#hatch)", "no pose"))
+    for k, word in enumerate(words):
+        y = top + k * row
+        parts.append(f'<text class="label" x="{LEFT - 8}" y="{y + row / 2 + 4:.1f}" text-anchor="end">'
+                     f"{escape(word.replace('_', ' '))}</text>")  # fmt: skip
+        for start, stop, action in spans:
+            if action == word:
+                parts.append(_bar(time, start, stop, y + 2, row - 4, action_colour(k), f"{word} {stop - start:.2f} s"))
+    return _svg(WIDTH, bottom + 8, [_HATCH, *parts])
+
+
+def trajectory(x_mm: Array, y_mm: Array, time_s: Array, size: int = 420) -> str:
+    """The way over the floor seen from above, coloured by time from dark to light; y points up in the picture."""
+    known = np.isfinite(x_mm) & np.isfinite(y_mm)
+    if not known.any():
+        return _svg(size, 40, ['<text class="label" x="10" y="24">no position is known</text>'])
+    margin, plot = 52.0, size - 64.0
+    middle = [0.5 * (float(v[known].min()) + float(v[known].max())) for v in (x_mm, y_mm)]
+    reach = 0.55 * max(float(np.ptp(x_mm[known])), float(np.ptp(y_mm[known])), 20.0)
+    across = Scale(middle[0] - reach, middle[0] + reach, margin, margin + plot)
+    up = Scale(middle[1] - reach, middle[1] + reach, 8 + plot, 8.0)
+    parts = [_frame(across, up)]
+    keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), 4000)).astype(int))
+    x, y, t = across(x_mm)[keep], up(y_mm)[keep], time_s[keep]
+    span = max(float(t[-1] - t[0]), 1e-9)
+    for piece in np.array_split(np.arange(len(keep)), min(64, max(1, len(keep) // 2))):
+        rows = np.append(piece, piece[-1] + 1)[: len(keep) - piece[0]]
+        colour = viridis(0.92 * float(t[piece[0]] - t[0]) / span)
+        parts += [f'<path class="way" stroke="{colour}" d="{d}"/>' for d in _broken(x[rows], y[rows])]
+    first, final = np.flatnonzero(known)[[0, -1]]
+    for row, colour, word in ((first, viridis(0.0), "start"), (final, viridis(0.92), "end")):
+        px, py = float(across(x_mm[row])), float(up(y_mm[row]))
+        parts.append(f'<circle class="mark" fill="{colour}" cx="{px:.1f}" cy="{py:.1f}" r="5">'
+                     f"<title>{word}</title></circle>")  # fmt: skip
+        parts.append(_label_beside(px, py - 6.0, word, size - 52.0, 8.0))
+    return _svg(size, size, parts)
+
+
+def histogram(values: Array, unit: str, colour: str, width: int = 420, height: int = 200) -> str:
+    """How often values occur, over the range that holds 99 % of them; a line marks the median."""
+    known = values[np.isfinite(values)]
+    if len(known) == 0:
+        return _svg(width, 40, ['<text class="label" x="10" y="24">no value is known</text>'])
+    bottom = height - 34.0
+    top_value = max(float(np.quantile(known, 0.99)), 1e-6)
+    counts, edges = np.histogram(np.minimum(known, top_value), bins=30, range=(0.0, top_value))
+    across = Scale(0.0, top_value, 52.0, width - 12.0)
+    up = Scale(0.0, max(float(counts.max()), 1.0) * 1.08, bottom, 8.0)
+    parts = [_y_axis(up, "frames", 3, 52.0, width - 12.0), _x_ticks(across, bottom, unit, 5)]
+    for count, a, b in zip(counts, edges[:-1], edges[1:], strict=True):
+        x0, x1, y = float(across(a)), float(across(b)), float(up(float(count)))
+        parts.append(f'<rect fill="{colour}" x="{x0 + 0.5:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 1, 0.5):.1f}" '
+                     f'height="{bottom - y:.1f}"/>')  # fmt: skip
+    at = float(across(float(np.median(known))))
+    parts.append(f'<line class="median" x1="{at:.1f}" x2="{at:.1f}" y1="8" y2="{bottom}"/>')
+    parts.append(_label_beside(at, 18.0, f"median {float(np.median(known)):.2f} {unit}", width - 120.0, 5.0))
+    return _svg(width, height, parts)
+
+
+def budget(shares: Sequence[tuple[str, float, str]]) -> str:
+    """One bar of shares (word, share, colour) that fills the width of the page."""
+    parts, at = [], 0.0
+    for word, share, colour in shares:
+        if share > 0:
+            parts.append(f'<rect fill="{colour}" x="{at * WIDTH:.1f}" y="0" width="{share * WIDTH:.1f}" height="26">'
+                         f"<title>{escape(word)} {share:.1%}</title></rect>")  # fmt: skip
+        at += share
+    return _svg(WIDTH, 26, parts)
+
+
+def picture(
+    depth: NDArray[np.uint16], uv: Array, bones: Sequence[tuple[int, int]], left: int, top: int, reach_mm: float
+) -> str:
+    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) over it.
+
+    Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not take all the colours.
+    """
+    h, w = depth.shape
+    points = uv - [left, top] + 0.5  # the paper counts from the corner of the picture, we from a pixel's centre
+    r = w / 70.0
+    parts = [f'<image href="{png_uri(shade(depth, reach_mm))}" width="{w}" height="{h}"/>']
+    for a, b in bones:
+        (x0, y0), (x1, y1) = points[a], points[b]
+        parts.append(f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="#fff" '
+                     f'stroke-width="{0.8 * r:.2f}"/>')  # fmt: skip
+    for k, (x, y) in enumerate(points):
+        fill = "#fff" if k < len(points) - 1 else "#EE6677"
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.2f}" fill="{fill}" stroke="#222" '
+                     f'stroke-width="{0.25 * r:.2f}"/>')  # fmt: skip
+    return _svg(w, h, parts)
+
+
+def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
+    """Colours (h, w, 3) RGB of depth (h, w) mm: far dark, `reach_mm` nearer and beyond light, unread grey."""
+    read = depth > 0
+    if not read.any():
+        return np.full((*depth.shape, 3), 90, np.uint8)
+    far = float(np.percentile(depth[read], 95.0)) + 3.0
+    share = np.clip((far - depth) / reach_mm, 0.0, 1.0)
+    at = share * (len(_VIRIDIS) - 1)
+    low = np.minimum(at.astype(int), len(_VIRIDIS) - 2)
+    rgb = _VIRIDIS[low] + (at - low)[..., None] * (_VIRIDIS[low + 1] - _VIRIDIS[low])
+    rgb[~read] = 90.0
+    return rgb.astype(np.uint8)
+
+
+def png_uri(rgb: NDArray[np.uint8]) -> str:
+    """A picture (h, w, 3) as a data URI."""
+    import cv2
+
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
+    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def viridis(share: float) -> str:
+    """A colour from dark (0) to light (1)."""
+    at = min(max(share, 0.0), 1.0) * (len(_VIRIDIS) - 1)
+    low = min(int(at), len(_VIRIDIS) - 2)
+    r, g, b = _VIRIDIS[low] + (at - low) * (_VIRIDIS[low + 1] - _VIRIDIS[low])
+    return f"#{int(r):02x}{int(g):02x}{int(b):02x}"
+
+
+def action_colour(place: int) -> str:
+    """The colour of the word at this place of the vocabulary, as in the replay."""
+    return ACTION_COLOURS[place % len(ACTION_COLOURS)]
+
+
+_HATCH = (
+    '<defs><pattern id="hatch" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">'
+    '<line class="hatch" x1="0" y1="0" x2="0" y2="6"/></pattern></defs>'
+)
+
+
+def _svg(width: float, height: float, parts: Sequence[str]) -> str:
+    return f'<svg viewBox="0 0 {width:g} {height:g}" role="img">{"".join(parts)}</svg>'
+
+
+def _label_beside(x: float, y: float, text: str, right_until: float, away: float) -> str:
+    """A label to the right of x, or to the left of it where it would run out of the paper."""
+    right = x <= right_until
+    at, anchor = (x + away, "start") if right else (x - away, "end")
+    return f'<text class="label" x="{at:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+
+
+def _bar(time: Scale, start: float, stop: float, y: float, height: float, fill: str, title: str) -> str:
+    x0, x1 = float(time(start)), float(time(stop))
+    return (f'<rect fill="{fill}" x="{x0:.2f}" y="{y:.1f}" width="{max(x1 - x0, 0.5):.2f}" height="{height:.1f}">'
+            f"<title>{escape(title)}</title></rect>")  # fmt: skip
+
+
+def _y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WIDTH - RIGHT) -> str:
+    marks = []
+    for tick in scale.ticks(about):
+        y = float(scale(tick))
+        marks.append(f'<line class="grid" x1="{x0}" x2="{x1}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        marks.append(f'<text class="tick" x="{x0 - 6}" y="{y + 3.5:.1f}" text-anchor="end">{tick:g}</text>')
+    middle = 0.5 * (scale.start + scale.stop)
+    label = (f'<text class="label" transform="translate({x0 - 42:.0f} {middle:.0f}) rotate(-90)" text-anchor="middle">'
+             f"{escape(unit)}</text>")  # fmt: skip
+    return "".join(marks) + label
+
+
+def _x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
+    """Times below the last of several figures; thin lines in the others."""
+    unit, size = ("min", 60.0) if time.high > 180 else ("s", 1.0)
+    shown = Scale(time.low / size, time.high / size, time.start, time.stop)
+    marks = [f'<line class="axis" x1="{time.start}" x2="{time.stop}" y1="{bottom}" y2="{bottom}"/>']
+    for tick in shown.ticks(8):
+        x = float(shown(tick))
+        marks.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>')
+        if last:
+            text = f"{tick:g} {unit}"
+            marks.append(f'<text class="tick" x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{text}</text>')
+    return "".join(marks)
+
+
+def _x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
+    marks = [f'<line class="axis" x1="{scale.start}" x2="{scale.stop}" y1="{bottom}" y2="{bottom}"/>']
+    marks += [
+        f'<text class="tick" x="{float(scale(tick)):.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>'
+        for tick in scale.ticks(about)
+    ]
+    middle = 0.5 * (scale.start + scale.stop)
+    label = f'<text class="label" x="{middle:.0f}" y="{bottom + 31}" text-anchor="middle">{escape(unit)}</text>'
+    return "".join(marks) + label
+
+
+def _frame(across: Scale, up: Scale) -> str:
+    """A square plot's frame with millimetres on both sides."""
+    bottom, top = up.start, up.stop
+    box = (f'<rect class="box" x="{across.start}" y="{top}" width="{across.stop - across.start}" '
+           f'height="{bottom - top}"/>')  # fmt: skip
+    return box + _y_axis(up, "mm", 5, across.start, across.stop) + _x_ticks(across, bottom, "mm", 5)
+
+
+def _paths(x: Array, y: Array) -> list[str]:
+    """Path data of a curve; of a long one every column keeps its lowest and highest point."""
+    if len(x) > 2 * _MAX_COLUMNS:
+        edges = np.linspace(0, len(x), _MAX_COLUMNS + 1).astype(int)
+        rows: list[int] = []
+        for a, b in pairwise(edges):
+            part = y[a:b]
+            if np.isfinite(part).all():
+                rows += sorted({a + int(part.argmin()), a + int(part.argmax())})
+            else:  # a column with a hole shows the hole
+                rows += [a, a + int(np.flatnonzero(~np.isfinite(part))[0])]
+        x, y = x[rows], y[rows]
+    return _broken(x, y)
+
+
+def _broken(x: Array, y: Array) -> list[str]:
+    """Path data of a line that is interrupted where a point is unknown; a lone point becomes a dot."""
+    known = np.isfinite(x) & np.isfinite(y)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    paths = []
+    for a, b in edges.reshape(-1, 2):
+        points = [f"{px:.1f} {py:.1f}" for px, py in zip(x[a:b], y[a:b], strict=True)]
+        paths.append("M" + "L".join(points) + ("h0.1" if len(points) == 1 else ""))
+    return paths

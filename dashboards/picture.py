@@ -1,0 +1,56 @@
+"""The picture in README.md: some of the report's own figures on one small page, photographed by a browser.
+
+After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+from liex_lab.dashboards.report import TEMPLATES, charts, pictures
+
+from liex_lab.sessions import Session
+
+WIDTH, HEIGHT = 860, 610
+_STYLE = f"""
+:root {{ color-scheme: light; }}
+main {{ width: {WIDTH}px; padding: 18px 22px; }}
+.strip {{ grid-template-columns: repeat(4, 1fr); }}
+.title {{ margin-top: 8px; }}
+.pair div svg .tick, .pair div svg .label {{ font-size: 15px; }}
+svg image {{ image-rendering: pixelated; }}
+.pair {{ display: grid; grid-template-columns: 310px 1fr; gap: 22px; margin-top: 8px; }}
+"""
+
+
+def page(session: Session) -> str:
+    """A page of four fitted frames, the way over the floor, and actions, speed and nose height over time."""
+    template = (TEMPLATES / "report.html.j2").read_text(encoding="utf-8")
+    style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
+    drawn = charts(session, list(session.metadata["actions"]))
+    strip = "".join(
+        f"<figure>{svg}<figcaption>{caption}</figcaption></figure>" for svg, caption in pictures(session)
+    )
+    titled = {"lanes": "Actions", "speed": "Speed of the body centre", "nose": "Height of the nose",
+              "error": "Joint error to be expected"}  # fmt: skip
+    lines = "".join(f'<p class="title">{title}</p><figure>{drawn[name]}</figure>' for name, title in titled.items())
+    way = f'<figure><p class="title">Way over the floor</p>{drawn["way"]}</figure>'
+    css = (style[1] if style else "") + _STYLE
+    body = f'<div class="strip">{strip}</div><div class="pair">{way}<div>{lines}</div></div>'
+    return f'<!doctype html><meta charset="utf-8"><style>{css}</style><main>{body}</main>'
+
+
+def photograph(session: str | Path, png: str | Path, browser: str = "chromium") -> Path:
+    """Write the page of a session as a PNG; `browser` is the command of a Chromium."""
+    with tempfile.TemporaryDirectory(prefix="liex-") as folder:
+        html = Path(folder) / "page.html"
+        html.write_text(page(Session.open(session)), encoding="utf-8")
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        subprocess.run(
+            [*command, f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={Path(png).resolve()}", html.as_uri()],
+            check=True, capture_output=True, timeout=120,
+        )  # fmt: skip
+    return Path(png)

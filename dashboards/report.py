@@ -1,0 +1,250 @@
+"""report.html: one file that needs no network, made from a session folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from liex_lab.dashboards import figures
+from numpy.typing import NDArray
+
+from liex_lab.sessions import Session
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+TEMPLATES = Path(__file__).parent / "templates"
+_SPEED, _HEIGHT, _ERROR = "#4477AA", "#228833", "#EE6677"
+_TABLES = {
+    "frames": "frames.parquet", "poses": "poses.parquet", "rotations": "rotations.parquet",
+    "kinematics": "kinematics.parquet", "bouts": "bouts.parquet", "gaps": "gaps.parquet", "flips": "flips.parquet",
+    "sessions": "sessions.parquet", "summary": "summary.csv",
+}  # fmt: skip
+
+
+def write_report(folder: str | Path) -> Path:
+    """Make report.html in a session's folder from what lies in it, and return its path."""
+    path = Path(folder) / "report.html"
+    path.write_text(render(Session.open(folder)), encoding="utf-8")
+    return path
+
+
+def render(session: Session) -> str:
+    """The report of a session as one HTML text."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    pages = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    words = list(session.metadata.get("actions", {}))
+    return pages.get_template("report.html.j2").render(
+        name=session.name,
+        animal=session.metadata["animal"]["name"],
+        headline=headline(session),
+        cards=cards(session),
+        problems=session.metadata["problems"],
+        pictures=pictures(session),
+        charts=charts(session, words),
+        actions=[(word, figures.action_colour(k), session.metadata["actions"][word]) for k, word in enumerate(words)],
+        summary=summary_rows(session),
+        facts=facts(session),
+        gaps=gap_rows(session),
+        methods=methods(session),
+        glossary=glossary(session),
+    )
+
+
+def headline(session: Session) -> str:
+    """What was recorded, in one line."""
+    frames = session.metadata["frames"]
+    parts = [f"{frames['n_frames']:,} frames", _clock(frames["duration_s"])]
+    if frames["fps_median"]:
+        parts.append(f"{frames['fps_median']:.1f} frames/s")
+    if session.metadata["session_start_time"]:
+        parts.append(str(session.metadata["session_start_time"]))
+    return " · ".join(parts)
+
+
+def cards(session: Session) -> list[tuple[str, str, str]]:
+    """The few numbers to see first: (value, unit, what)."""
+    frames = session.metadata["frames"]
+    shown = [(f"{frames['n_observed'] / frames['n_frames']:.1%}", "", "of the frames with a pose")]
+    error = session.frames["predicted_error_mm"].median()
+    if np.isfinite(error):
+        shown.append((f"{error:.1f}", "mm", "predicted joint error, median"))
+    if (session.path / "summary.csv").is_file():
+        row = session.summary.iloc[0]
+        shown = [
+            (f"{row['distance_m']:.2f}", "m", "distance"),
+            (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed"),
+            (f"{int(row['rear_count'])}", "", f"rears, {row['rear_s']:.1f} s in all"),
+            *shown,
+        ]
+    return shown
+
+
+def pictures(session: Session) -> list[tuple[str, str]]:
+    """The kept depth pictures with the skeleton over them: (SVG, caption)."""
+    import cv2
+
+    made = []
+    kept = session.metadata.get("thumbnails", [])
+    frames = session.frames.set_index("frame_index")
+    poses = session.table("poses", ["frame_index", "u_px", "v_px"], [entry["frame_index"] for entry in kept])
+    bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
+    for entry in kept:
+        depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
+        if depth is None:
+            continue
+        index = entry["frame_index"]
+        uv = poses.loc[poses["frame_index"] == index, ["u_px", "v_px"]].to_numpy(float)
+        reach_mm = 0.9 * float(frames["spine_mm"].median())  # an animal on its feet is about half its length high
+        drawn = figures.picture(np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm)
+        made.append((drawn, f"frame {index}, {frames.loc[index, 'time_s']:.2f} s"))
+    return made
+
+
+def charts(session: Session, words: list[str]) -> dict[str, str]:
+    """All figures, by name; empty where the session has no numbers for one."""
+    frames, bouts = session.frames, session.bouts
+    time_s = frames["time_s"].to_numpy(float)
+    time = figures.time_scale(session.metadata["frames"]["duration_s"])
+    spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
+    lost = list(zip(session.gaps["start_s"], session.gaps["stop_s"], strict=True))
+    error = frames["predicted_error_mm"].to_numpy(float)
+    drawn = dict.fromkeys(("lanes", "way", "speed", "nose", "error", "errors", "budget"), "")
+    if words or lost:
+        drawn["lanes"] = figures.lanes(spans, words, lost, time)
+    if (session.path / "kinematics.parquet").is_file():
+        moved = session.kinematics
+        rears = [(start, stop) for start, stop, action in spans if action == "rear"]
+        speed, nose = (_across_gaps(moved[name], frames) for name in ("speed_mm_s", "nose_height_mm"))
+        drawn["way"] = figures.trajectory(*(_across_gaps(moved[name], frames) for name in ("x_mm", "y_mm")), time_s)
+        drawn["speed"] = figures.curve(time_s, speed, time, "mm/s", _SPEED)
+        drawn["nose"] = figures.curve(time_s, nose, time, "mm", _HEIGHT, shaded=rears)
+    drawn["error"] = figures.curve(time_s, _across_gaps(frames["predicted_error_mm"], frames), time, "mm", _ERROR,
+                                   last=True)  # fmt: skip
+    drawn["errors"] = figures.histogram(error, "mm", _ERROR)
+    if (session.path / "summary.csv").is_file():
+        row = session.summary.iloc[0]
+        shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
+                  if f"{word}_share" in row]  # fmt: skip
+        drawn["budget"] = figures.budget(shares)
+    return drawn
+
+
+def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:
+    """Values (n,) with the first one after a gap of the camera taken out, so that no line is drawn across it."""
+    return np.asarray(values.where(frames["gap_before"] == 0), float)
+
+
+def summary_rows(session: Session) -> list[tuple[str, str, str, str]]:
+    """The summary as (column, value, unit, meaning)."""
+    if not (session.path / "summary.csv").is_file():
+        return []
+    described = session.columns[session.columns["table"] == "summary"].set_index("name")
+    row = session.summary.iloc[0]
+    return [
+        (name, f"{row[name]:.1%}" if name.endswith("_share") else _number(row[name]),
+         "" if name.endswith("_share") else str(described.loc[name, "unit"]), str(described.loc[name, "meaning"]))
+        for name in session.summary.columns if name not in ("session_id", "individual")
+    ]  # fmt: skip
+
+
+def facts(session: Session) -> list[tuple[str, str]]:
+    """Where the numbers come from: recording, camera, animal, software, cost."""
+    about = session.metadata
+    camera, frames, animal = about["camera"], about["frames"], about["animal"]
+    flags = ", ".join(f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items())
+    size = f"{animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else "unknown"
+    memory = about.get("peak_memory_mb")
+    known = [
+        ("Recording", f"{about['input']['name']} ({about['input']['format']})"),
+        ("Input, sha256", about["input"]["sha256"]),
+        ("Animal", f"{about['individual']}, {animal['name']}, spine {size} ({animal.get('origin', 'origin unknown')})"),
+        ("Frames", f"{frames['n_frames']:,} recorded ({flags}); {frames['n_missing']} not delivered, in "
+         f"{frames['n_gaps']} gaps"),
+        ("Camera", f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy {camera['fy']:.1f}, "
+         f"cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px ({camera['source']}), {camera['floor_distance_mm']:.0f} mm "
+         "from the floor"),
+        ("Model", f"{about['model'].get('name', 'none')} {about['model'].get('sha256', '')[:16]}".strip()),
+        ("Software", ", ".join(f"{name} {v}" for name, v in about["versions"].items() if v != "unknown")),
+        ("Run", f"{about['timings_s']['total']:.1f} s, {about['frames_per_s']:.0f} frames/s"
+         + (f", peak memory {memory:.0f} MB" if memory else "")),
+    ]  # fmt: skip
+    subject = ", ".join(f"{name} {value}" for name, value in about["subject"].items())
+    return known + ([("Subject", subject)] if subject else [])
+
+
+def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
+    """The longest gaps, at most twelve, in order of time: (from, to, frames, reason)."""
+    shown = session.gaps.nlargest(12, "n_frames_missing").sort_values("start_s")
+    return [
+        (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", str(row.n_frames_missing), str(row.reason).replace("_", " "))
+        for row in shown.itertuples()
+    ]
+
+
+def methods(session: Session) -> list[str]:
+    """Paragraphs for a methods section, from the run's own record."""
+    about = session.metadata
+    camera, frames, animal, model = about["camera"], about["frames"], about["animal"], about["model"]
+    error = session.frames["predicted_error_mm"].median()
+    rate = f" at {frames['fps_median']:.1f} frames/s" if frames["fps_median"] else ""
+    learned = f" with the model {model['name']} (sha256 {model.get('sha256', '')[:16]})" if model.get("name") else ""
+    size = f"; the animal's length along them is {animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else ""
+    origin = f" ({animal['origin']})" if size and animal.get("origin") else ""
+    known = f" The median joint error that the model predicts is {error:.1f} mm." if np.isfinite(error) else ""
+    first = (
+        f"Depth images of one {animal['name']} ({camera['width']} x {camera['height']} pixels, {frames['n_frames']:,} "
+        f"frames{rate}, camera {camera['floor_distance_mm']:.0f} mm from the floor) were analysed with liex_lab "
+        f"{about['versions']['liex_lab']}{learned}. A skeleton of {len(animal['joints'])} joints "
+        f"({', '.join(animal['joints'])}) on the body's mid-axis was fitted to every frame{size}{origin}. "
+        f"{frames['n_observed']:,} of {frames['n_frames']:,} recorded frames have a pose, "
+        f"{frames['flags'].get('doubtful', 0)} of them flagged as doubtful; {frames['n_missing']} further frames were "
+        f"not delivered by the camera.{known} Positions are millimetres in the arena frame, z up from the floor."
+    )
+    return [first, *_behaviour_methods(session)]
+
+
+def _behaviour_methods(session: Session) -> list[str]:
+    rules, actions = session.metadata.get("rules"), session.metadata.get("actions", {})
+    if not rules or not actions:
+        return []
+    named = "; ".join(f"{word.replace('_', ' ')}: {meaning}" for word, meaning in actions.items())
+    return [
+        "Speed is that of the mean of all joints but the nose over the floor, from its positions "
+        f"{rules['speed_half_window_s']:g} s before and after at the frames' true times, never across a gap. Every "
+        f"frame has at most one name, given by rule, the first that applies of: {named}. Bouts of one kind with less "
+        f"than {rules['merge_pauses_s']:g} s between them were joined, then those shorter than "
+        f"{rules['min_bout_s']:g} s dropped. Shares are of the {session.metadata['frames']['observed_s']:.1f} s in "
+        "which the animal was observed."
+    ]
+
+
+def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
+    """The columns of every table that the session holds: (file, columns)."""
+    columns = session.columns.fillna("")
+    return [
+        (file, columns[columns["table"] == table].to_dict("records"))
+        for table, file in _TABLES.items() if (session.path / file).is_file()
+    ]  # fmt: skip
+
+
+def _number(value: Any) -> str:
+    """A number as a person would write it: counts whole, the rest with four digits."""
+    if isinstance(value, int | np.integer):
+        return f"{value:,}"
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60)
+    return f"{rest:.1f} s" if minutes < 1 else f"{minutes:.0f} min {rest:.0f} s"

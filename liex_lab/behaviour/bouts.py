@@ -1,0 +1,171 @@
+"""Named stretches of behaviour by rule: rear, run, walk, pause. A thin first ethogram for the mouse.
+
+One label per frame, half-open bouts, never across a gap. For every action: hysteresis, then interruptions shorter than
+`merge_pauses_s` are bridged, then bouts shorter than `min_bout_s` are dropped; where two actions claim a frame the
+first of `ACTIONS` has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from liex_lab.behaviour.columns import ACTIONS, BOUT_MEASURES
+from liex_lab.behaviour.kinematics import segments, smallest_turn
+from liex_lab.sessions.rows import frame_count, stop_times, stretches
+from liex_lab.sessions.tables import BOUTS, to_pandas
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MouseRules:
+    """Thresholds of the first ethogram, by the names they have in a plan: `MouseRules(**plan.behaviour.model_dump())`.
+
+    Starting values: Live Mouse Tracker's. Its 40 mm of rearing belong to an adult of some 90 mm; a smaller animal rears
+    from 0.6 of its own length on. A bout of rearing reaches to where the nose is below two thirds of that height.
+    """
+
+    speed_half_window_s: float = 0.034
+    pause_below_mm_s: float = 50.0
+    run_above_mm_s: float = 300.0
+    impossible_above_mm_s: float = 3000.0
+    rear_height_mm: float = 40.0
+    rear_height_bl: float = 0.6
+    rear_leave: float = 2.0 / 3.0
+    speed_hysteresis: float = 0.1  # a threshold is crossed upwards 10 % above it, downwards 10 % below
+    merge_pauses_s: float = 0.33
+    min_bout_s: float = 0.23
+
+    def rear_mm(self, spine_mm: float) -> float:
+        """How much higher than the tail's base the nose of an animal of this length is when it rears."""
+        return min(self.rear_height_mm, self.rear_height_bl * spine_mm)
+
+    def definitions(self) -> dict[str, str]:
+        """What each word of `ACTIONS` means with these numbers."""
+        walk, run = f"{self.pause_below_mm_s:g} mm/s", f"{self.run_above_mm_s:g} mm/s"
+        return {
+            "rear": f"the nose is {self.rear_height_mm:g} mm or more above the tail's base, or {self.rear_height_bl:g} "
+            f"body lengths for an animal shorter than {self.rear_height_mm / self.rear_height_bl:.0f} mm; rising and "
+            f"descending belong to it, down to {self.rear_leave:.0%} of that height",
+            "run": f"the body's centre moves faster than {run}",
+            "walk": f"the body's centre moves at {walk} to {run}",
+            "pause": f"the body's centre moves slower than {walk}",
+        }
+
+
+def find_bouts(
+    frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None
+) -> pd.DataFrame:
+    """The table `bouts` of one animal from its tables `frames` and `kinematics`."""
+    rules = rules or MouseRules()
+    time_s = kinematics["time_s"].to_numpy(float)
+    observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
+    number = segments(time_s, observed)
+    stop_s = stop_times(time_s)
+    raw = raw_labels(kinematics, float(np.nanmedian(frames["spine_mm"])) if observed.any() else np.nan, number, rules)
+    label = np.full(len(time_s), "", dtype=object)
+    for action in ACTIONS:
+        free = (label == "") & observed
+        for start, stop in tidy(raw[action] & free, free, number, time_s, stop_s, rules):
+            label[start:stop] = action
+    return _table(kinematics, label, raw, number, stop_s)
+
+
+def raw_labels(
+    kinematics: pd.DataFrame, spine_mm: float, number: NDArray[np.int64], rules: MouseRules
+) -> dict[str, Mask]:
+    """(n,) per action: the frames that satisfy its rule, with hysteresis inside each unbroken stretch."""
+    slope, speed = (kinematics[name].to_numpy(float) for name in ("nose_over_rump_mm", "speed_mm_s"))
+    rear_mm = rules.rear_mm(spine_mm)
+    low, high = 1.0 - rules.speed_hysteresis, 1.0 + rules.speed_hysteresis
+    moving = hysteresis(speed, rules.pause_below_mm_s * high, rules.pause_below_mm_s * low, number)
+    running = hysteresis(speed, rules.run_above_mm_s * high, rules.run_above_mm_s * low, number)
+    known = np.isfinite(speed)
+    return {
+        "rear": hysteresis(slope, rear_mm, rules.rear_leave * rear_mm, number),
+        "run": running & known,
+        "walk": moving & ~running & known,
+        "pause": ~moving & known,
+    }
+
+
+def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int64]) -> Mask:
+    """(n,) True from where `values` reach `enter` until they fall below `leave`, afresh in every stretch `number`.
+
+    Rising belongs to it: the frames between `leave` and `enter` just before the threshold is reached count as well.
+    """
+    high, inside = values >= enter, values >= leave
+    out = np.zeros(len(values), bool)
+    group = np.where(inside, number, -1 - number)  # a run of equal group lies in one stretch, above `leave` or not
+    for start, stop, which in stretches(group):
+        out[start:stop] = which >= 0 and bool(high[start:stop].any())
+    return out
+
+
+def tidy(
+    mask: Mask, free: Mask, number: NDArray[np.int64], time_s: Array, stop_s: Array, rules: MouseRules
+) -> Iterator[tuple[int, int]]:
+    """Bouts (start, stop) of a rule's frames: short pauses bridged over free frames, then short bouts dropped."""
+    merged: list[tuple[int, int]] = []
+    for start, stop, which in stretches(np.where(mask, number, -1)):
+        if which < 0:
+            continue
+        if merged:
+            last_start, last_stop = merged[-1]
+            bridge = number[last_stop - 1] == which and free[last_stop:start].all()
+            if bridge and time_s[start] - stop_s[last_stop - 1] < rules.merge_pauses_s:
+                merged[-1] = (last_start, stop)
+                continue
+        merged.append((start, stop))
+    for start, stop in merged:
+        if stop_s[stop - 1] - time_s[start] >= rules.min_bout_s:
+            yield start, stop
+
+
+def _table(
+    kinematics: pd.DataFrame, label: NDArray[np.object_], raw: dict[str, Mask], number: NDArray[np.int64], stop_s: Array
+) -> pd.DataFrame:
+    """One row per run of equal labels inside one stretch."""
+    time_s, count = kinematics["time_s"].to_numpy(float), frame_count(kinematics["frame_index"].to_numpy())
+    code = {action: k for k, action in enumerate(ACTIONS)}
+    runs = np.array([code.get(word, -1) for word in label], np.int64)
+    pieces = [
+        (start, stop)
+        for start, stop, key in stretches(np.where(runs >= 0, runs + len(code) * number, -1))
+        if key >= 0
+    ]
+    rows = [(str(label[a]), time_s[a], stop_s[b - 1], count[a], count[b]) for a, b in pieces]
+    action, start_s, end_s, start_frame, stop_frame = zip(*rows, strict=True) if rows else ([], [], [], [], [])
+    measures = [measure_bout(kinematics.iloc[a:b], stop_s[a:b]) for a, b in pieces]
+    columns = {name: [m[name] for m in measures] for name in (c.name for c in BOUT_MEASURES)}
+    return to_pandas([*BOUTS, *BOUT_MEASURES], {
+        "session_id": [kinematics["session_id"].iloc[0]] * len(rows),
+        "individual": [kinematics["individual"].iloc[0]] * len(rows),
+        "action": list(action), "start_s": list(start_s), "stop_s": list(end_s),
+        "duration_s": list(np.subtract(end_s, start_s)), "start_frame": list(start_frame),
+        "stop_frame": list(stop_frame), "score": [float(raw[str(label[a])][a:b].mean()) for a, b in pieces],
+        "source": ["rule"] * len(rows), "model_hash": [""] * len(rows), **columns,
+    })  # fmt: skip
+
+
+def measure_bout(rows: pd.DataFrame, stop_s: Array) -> dict[str, float]:
+    """The measures of one bout from its rows of `kinematics`."""
+    speed, step = rows["speed_mm_s"].to_numpy(float), rows["step_mm"].to_numpy(float)
+    known = np.isfinite(speed)
+    time = float((stop_s - rows["time_s"].to_numpy(float))[known].sum())
+    heading = rows["heading_rad"].to_numpy(float)
+    heading = heading[np.isfinite(heading)]
+    nose = rows["nose_height_mm"].to_numpy(float)
+    return {
+        "path_mm": float(np.nansum(step)),
+        "mean_speed_mm_s": float(np.nansum(step)) / time if time > 0 else np.nan,
+        "peak_speed_mm_s": float(speed[known].max()) if known.any() else np.nan,
+        "net_turn_rad": float(smallest_turn(np.diff(heading)).sum()) if len(heading) else np.nan,
+        "peak_nose_height_mm": float(np.nanmax(nose)) if np.isfinite(nose).any() else np.nan,
+    }

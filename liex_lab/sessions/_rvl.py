@@ -1,0 +1,82 @@
+"""RVL, the run-length code for depth images: zeros are counted, steps between readings are stored in nibbles."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+@njit(cache=True, inline="always")
+def _put(value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int) -> tuple[np.uint32, int, int]:
+    """Append a number as nibbles of three bits and one that says more follow; eight nibbles make a word."""
+    while True:
+        nibble = value & 7
+        value >>= 3
+        if value:
+            nibble |= 8
+        word = np.uint32(word << np.uint32(4)) | np.uint32(nibble)
+        held += 1
+        if held == 8:
+            words[at] = word
+            at, held, word = at + 1, 0, np.uint32(0)
+        if value == 0:
+            return word, at, held
+
+
+@njit(cache=True, nogil=True)
+def _pack(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
+    """Encode pixels (n,) into words (at least n + 2) and return how many words were used."""
+    n, i, at, held = len(pixels), 0, 0, 0
+    last = np.int64(0)
+    word = np.uint32(0)
+    while i < n:
+        start = i
+        while i < n and pixels[i] == 0:
+            i += 1
+        word, at, held = _put(i - start, words, word, at, held)
+        start = i
+        while i < n and pixels[i] != 0:
+            i += 1
+        word, at, held = _put(i - start, words, word, at, held)
+        for k in range(start, i):
+            here = np.int64(pixels[k])
+            step = here - last
+            last = here
+            word, at, held = _put((step << 1) ^ (step >> 63), words, word, at, held)
+    if held:
+        words[at] = word << np.uint32(4 * (8 - held))
+        at += 1
+    return at
+
+
+def pack_rvl(depth: NDArray[np.uint16]) -> NDArray[np.uint32]:
+    """The RVL words of a depth image (H, W)."""
+    pixels = np.ascontiguousarray(depth, np.uint16).ravel()
+    # a pixel costs at most 6 nibbles, and every second pixel may add two counts of one nibble each
+    words = np.empty(pixels.size + 8, np.uint32)
+    return words[: _pack(pixels, words)]
+
+
+def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """The whole payload of a compressedDepth RVL message, which is what Rerun takes as an `EncodedDepthImage`."""
+    height, width = depth.shape
+    head = struct.pack("<iffII", 0, 0.0, 0.0, width, height)
+    return np.concatenate([np.frombuffer(head, np.uint8), pack_rvl(depth).view(np.uint8)])
+
+
+@njit(cache=True, nogil=True)
+def _to_millimetres(depth: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            value = depth[row, column] + np.float32(0.5)
+            out[row, column] = np.uint16(value) if 0.0 < value < 65536.0 else np.uint16(0)
+
+
+def to_millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth (H, W) mm to the nearest whole millimetre; 0 stays unread, beyond 65535 mm becomes unread."""
+    out = np.empty(depth.shape, np.uint16)
+    _to_millimetres(np.ascontiguousarray(depth, np.float32), out)
+    return out

@@ -1,0 +1,203 @@
+"""The MCAP file for Foxglove: depth, camera, skeleton, transforms and action states, lengths in metres.
+
+Depth streams in as it comes; everything small is written at the end from the same track the tables are made of.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import foxglove
+import numpy as np
+from foxglove import channels, messages
+from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+from numpy.typing import NDArray
+
+from liex_lab.geometry import SE3, so3
+from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.rows import Rows
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+_SECOND = 10**9
+_ACTION_SCHEMA = {
+    "title": "liex_lab.ActionState",
+    "description": "The action that begins now; an empty word ends the last one.",
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "title": "time",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "action": {"type": "string"},
+        "index": {"type": "integer", "description": "place of the word in the vocabulary, -1 for none"},
+        "frame_index": {"type": "integer"},
+    },
+}
+_BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
+_JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
+
+
+class McapWriter:
+    """Writes `session.mcap`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`."""
+
+    def __init__(self, path: Path, origin: Provenance, *, level: int = 0, chunk_size: int = 128 * 1024) -> None:
+        """level: of compression, 0 for the usual one, 22 for the smallest file; chunk_size: bytes packed at once."""
+        self._origin = origin
+        self._context = foxglove.Context()  # the global one would also receive every other writer's messages
+        options = MCAPWriteOptions(
+            compression=MCAPCompression.Zstd, compression_level=level, chunk_size=chunk_size, compression_threads=0,
+            profile="liex_lab",
+        )  # fmt: skip
+        self._writer = foxglove.open_mcap(path, context=self._context, writer_options=options)
+        self._depth = channels.RawImageChannel("/camera/depth", context=self._context)
+        self._calibration = channels.CameraCalibrationChannel("/camera/calibration", context=self._context)
+        self._transforms = channels.FrameTransformsChannel("/tf", context=self._context)
+        self._scene = channels.SceneUpdateChannel("/skeleton/scene", context=self._context)
+        self._poses = channels.PosesInFrameChannel("/skeleton/joints", context=self._context)
+        self._overlay = channels.ImageAnnotationsChannel("/camera/skeleton", context=self._context)
+        self._log = channels.LogChannel("/log", context=self._context)
+        self._actions = foxglove.Channel(
+            "/actions", schema=_ACTION_SCHEMA, message_encoding="json", context=self._context
+        )
+        self._calibrated_ns: int | None = None
+
+    def add(self, times_ns: Sequence[int], depth: Sequence[NDArray[np.uint16]]) -> None:
+        """Depth (H, W) uint16 mm of consecutive frames."""
+        for time_ns, image in zip(times_ns, depth, strict=True):
+            if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
+                self._log_camera(int(time_ns))
+            height, width = image.shape
+            message = messages.RawImage(
+                timestamp=_stamp(time_ns), frame_id="camera", encoding="16UC1", width=width, height=height,
+                step=2 * width, data=image.astype("<u2", copy=False).tobytes(),
+            )  # fmt: skip
+            self._depth.log(message, log_time=int(time_ns))
+
+    def finish(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]) -> None:
+        """Skeleton, transforms, actions and notes of the whole track; closes the file."""
+        track = rows.track
+        quaternions = so3.quaternion(np.where(track.observed[:, None, None], track.root_rotation, np.eye(3)))
+        for i, time_ns in enumerate(track.times_ns.tolist()):
+            seen = bool(track.observed[i])
+            joints_m = track.joints_mm[i] / 1000.0
+            self._scene.log(self._scene_update(time_ns, joints_m, seen), log_time=time_ns)
+            self._poses.log(_joint_poses(time_ns, joints_m, seen), log_time=time_ns)
+            self._overlay.log(self._annotations(time_ns, track.uv_px[i], seen), log_time=time_ns)
+            if seen:
+                root = _transform(time_ns, "arena", "root", track.root_mm[i], quaternions[i])
+                self._transforms.log(messages.FrameTransforms(transforms=[root]), log_time=time_ns)
+        self._log_actions(rows, bouts, words)
+        if len(track.times_ns):
+            self._log_notes(int(track.times_ns[0]), problems)
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file, whole or not."""
+        self._writer.close()
+
+    def _log_camera(self, time_ns: int) -> None:
+        """Calibration and the camera's place, about once a second, so that a viewer may start anywhere."""
+        camera, place = self._origin.camera, self._origin.T_arena_camera
+        self._calibrated_ns = time_ns
+        k = camera.matrix
+        calibration = messages.CameraCalibration(
+            timestamp=_stamp(time_ns), frame_id="camera", width=camera.width, height=camera.height,
+            K=k.ravel().tolist(), R=np.eye(3).ravel().tolist(), P=np.hstack([k, np.zeros((3, 1))]).ravel().tolist(),
+        )  # fmt: skip
+        self._calibration.log(calibration, log_time=time_ns)
+        transform = _transform(time_ns, "arena", "camera", place.translation, _quaternion(place))
+        self._transforms.log(messages.FrameTransforms(transforms=[transform]), log_time=time_ns)
+
+    def _scene_update(self, time_ns: int, joints_m: Array, seen: bool) -> messages.SceneUpdate:
+        """Bones as lines and joints as spheres under one entity id; the entity goes when the animal is lost."""
+        stamp = _stamp(time_ns)
+        if not seen:
+            gone = messages.SceneEntityDeletion(
+                timestamp=stamp, type=messages.SceneEntityDeletionType.MatchingId, id="skeleton"
+            )
+            return messages.SceneUpdate(deletions=[gone])
+        points = [messages.Point3(x=x, y=y, z=z) for x, y, z in joints_m.tolist()]
+        ends = [points[end] for edge in self._origin.skeleton.edges for end in edge]
+        lines = messages.LinePrimitive(
+            type=messages.LinePrimitiveLineType.LineList, pose=_place(0.0, 0.0, 0.0), thickness=0.002, points=ends,
+            color=_BONE,
+        )  # fmt: skip
+        size = messages.Vector3(x=0.006, y=0.006, z=0.006)
+        spheres = [messages.SpherePrimitive(pose=_place(*xyz), size=size, color=_JOINT) for xyz in joints_m.tolist()]
+        entity = messages.SceneEntity(
+            timestamp=stamp, frame_id="arena", id="skeleton", lifetime=messages.Duration(sec=0, nsec=0),
+            lines=[lines], spheres=spheres,
+        )  # fmt: skip
+        return messages.SceneUpdate(entities=[entity])
+
+    def _annotations(self, time_ns: int, uv: Array, seen: bool) -> messages.ImageAnnotations:
+        """The skeleton over the depth picture."""
+        if not seen:
+            return messages.ImageAnnotations(points=[])
+        at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
+        ends = [at[end] for edge in self._origin.skeleton.edges for end in edge]
+        lines = messages.PointsAnnotation(
+            timestamp=_stamp(time_ns), type=messages.PointsAnnotationType.LineList, points=ends, outline_color=_JOINT,
+            thickness=1.5,
+        )  # fmt: skip
+        return messages.ImageAnnotations(points=[lines])
+
+    def _log_actions(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
+        """One message per change, at the time of the frame where it happens."""
+        changes: dict[int, str] = {}
+        for start_s, stop_s, action in zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True):
+            changes[round(start_s * 1e9)] = str(action)
+            changes.setdefault(round(stop_s * 1e9), "")
+        first = int(rows.track.times_ns[0]) if rows.track.n_frames else 0
+        elapsed = rows.track.times_ns - first
+        for at, action in sorted(changes.items()):
+            row = min(int(np.searchsorted(elapsed, at)), len(elapsed) - 1)
+            sec, nsec = divmod(first + at, _SECOND)
+            state = {
+                "timestamp": {"sec": sec, "nsec": nsec}, "action": action,
+                "index": list(words).index(action) if action else -1, "frame_index": int(rows.frame_index[row]),
+            }  # fmt: skip
+            self._actions.log(json.dumps(state).encode(), log_time=first + at)
+
+    def _log_notes(self, time_ns: int, problems: Sequence[str]) -> None:
+        for problem in problems:
+            note = messages.Log(
+                timestamp=_stamp(time_ns), level=messages.LogLevel.Warning, message=problem, name="liex_lab"
+            )
+            self._log.log(note, log_time=time_ns)
+
+
+def _joint_poses(time_ns: int, joints_m: Array, seen: bool) -> messages.PosesInFrame:
+    poses = [_place(*xyz) for xyz in joints_m.tolist()] if seen else []
+    return messages.PosesInFrame(timestamp=_stamp(time_ns), frame_id="arena", poses=poses)
+
+
+def _place(x: float, y: float, z: float) -> messages.Pose:
+    return messages.Pose(
+        position=messages.Vector3(x=x, y=y, z=z), orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    )
+
+
+def _transform(time_ns: int, parent: str, child: str, translation_mm: Array, wxyz: Array) -> messages.FrameTransform:
+    x, y, z = (translation_mm / 1000.0).tolist()
+    qw, qx, qy, qz = wxyz.tolist()
+    return messages.FrameTransform(
+        timestamp=_stamp(time_ns), parent_frame_id=parent, child_frame_id=child,
+        translation=messages.Vector3(x=x, y=y, z=z), rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )  # fmt: skip
+
+
+def _quaternion(transform: SE3) -> Array:
+    return so3.quaternion(transform.rotation)
+
+
+def _stamp(time_ns: int | np.int64) -> Any:
+    return messages.Timestamp(sec=int(time_ns) // _SECOND, nsec=int(time_ns) % _SECOND)

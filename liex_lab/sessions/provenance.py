@@ -1,0 +1,156 @@
+"""What a session says about its origin: recording, camera, animal, plan, software, and the cost of the run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.camera import Camera
+from liex_lab.errors import SessionError
+from liex_lab.geometry import SE3
+
+if TYPE_CHECKING:
+    from liex_lab.plan import Plan
+    from liex_lab.recordings.arena import Floor
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.recordings.times import Gap
+
+SCHEMA_VERSION = 1
+_PACKAGES = (
+    "liex_lab", "numpy", "scipy", "numba", "scikit-learn", "pandas", "pyarrow", "opencv-python-headless", "rerun-sdk",
+    "mcap", "foxglove-sdk",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What is known about a recording before its first frame is written.
+
+    name: the session's id; individual: the animal's name in it; T_arena_camera and floor_distance_mm: the camera's
+    place above the floor; input_sha256: of the recording's bytes; plan_toml: the plan as resolved; n_frames: expected,
+    None when unknown; gaps: what the camera did not deliver; problems: sentences about the recording; subject: any of
+    subject_id, group, cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin.
+    """
+
+    name: str
+    skeleton: Skeleton
+    camera: Camera
+    T_arena_camera: SE3
+    floor_distance_mm: float
+    input_sha256: str
+    plan_toml: str = ""
+    format: str = ""
+    individual: str = "animal_1"
+    n_frames: int | None = None
+    gaps: Sequence[Gap] = ()
+    problems: Sequence[str] = ()
+    truncated: bool = False
+    subject: dict[str, str] = field(default_factory=dict)
+    session_start_time: str = ""
+    model: dict[str, str] = field(default_factory=dict)
+    animal_size: dict[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def of(recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any) -> Provenance:
+        """The facts of a recording, the floor it was taken above and the plan; `more` are further fields."""
+        told, stated = recording.metadata, plan.session
+        subject = {"subject_id": stated.subject_id or told.get("subject_id"), "group": stated.group}
+        known: dict[str, Any] = {
+            "name": recording.name, "skeleton": skeleton, "camera": recording.camera,
+            "T_arena_camera": floor.T_arena_camera, "floor_distance_mm": floor.distance_mm,
+            "input_sha256": recording.digest(), "plan_toml": plan.to_toml(), "format": recording.format,
+            "individual": stated.individual, "n_frames": len(recording), "gaps": recording.gaps,
+            "problems": list(recording.problems), "truncated": recording.truncated,
+            "subject": {name: str(value) for name, value in subject.items() if value},
+            "session_start_time": stated.session_start_time or told.get("session_start_time") or "",
+        }  # fmt: skip
+        return Provenance(**{**known, **more})
+
+    @property
+    def calibration_hash(self) -> str:
+        """Hash of the camera's numbers and its place in the arena."""
+        return _hash({**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist()})
+
+    @property
+    def recording_id(self) -> str:
+        """The same for the same recording and plan: Rerun merges files whose id is equal."""
+        return f"{self.name}-{_hash([self.input_sha256, self.plan_toml, self.model])}"
+
+    def table_metadata(self) -> dict[str, Any]:
+        """What every parquet file says about itself, besides its columns."""
+        return {
+            "version": package_version("liex_lab"), "schema_version": SCHEMA_VERSION,
+            "calibration_hash": self.calibration_hash, "model_hash": self.model.get("sha256", ""),
+            "axes": "arena: x, y on the floor, z up from it; origin at the foot of the camera's perpendicular; mm",
+            "joints": "on the body's mid-axis",
+        }  # fmt: skip
+
+    def document(self) -> dict[str, Any]:
+        """The part of session.json that is known before the first frame."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "session_id": self.name,
+            "individual": self.individual,
+            "subject": dict(self.subject),
+            "session_start_time": self.session_start_time or None,
+            "versions": versions(),
+            "input": {"name": self.name, "format": self.format, "sha256": self.input_sha256,
+                      "truncated": self.truncated},
+            "plan": plan_table(self.plan_toml),
+            "camera": {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist(),
+                       "floor_distance_mm": float(self.floor_distance_mm), "calibration_hash": self.calibration_hash},
+            "animal": {"name": self.skeleton.name, "joints": list(self.skeleton.names),
+                       "bones": [list(edge) for edge in self.skeleton.edges], "home_length_mm": self.skeleton.length,
+                       **self.animal_size},
+            "model": dict(self.model),
+            "problems": list(self.problems),
+        }  # fmt: skip
+
+
+def plan_table(plan_toml: str) -> dict[str, Any]:
+    """The plan as a table for session.json."""
+    try:
+        return tomllib.loads(plan_toml)
+    except tomllib.TOMLDecodeError as error:
+        raise SessionError(f"the plan to be stored is not TOML ({error}); pass the plan's own TOML text") from None
+
+
+def package_version(name: str) -> str:
+    """The installed version of a package, or 'unknown' when it runs from a plain folder."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    return {"python": platform.python_version(), **{name: package_version(name) for name in _PACKAGES}}
+
+
+def peak_memory_mb() -> float | None:
+    """The most memory this process has held, MB; None where the system does not tell."""
+    status = Path("/proc/self/status")  # getrusage would also count the process that started this one
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024.0
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,189 @@
+"""From a track to the rows of the tables: times, gaps, and one block of columns per table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.geometry import so3
+from liex_lab.sessions.tables import ROWS_PER_GROUP, Block, Words
+from liex_lab.tracking.track import Track
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.times import Gap
+
+Array = NDArray[np.float64]
+
+GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.times)
+_NEAR = 0.1  # of the spine: how near a joint must be to count in its score
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A track, the camera's frame count of its rows, and the names that every row carries."""
+
+    track: Track
+    frame_index: NDArray[np.int64]
+    session_id: str
+    individual: str
+    camera_gaps: Sequence[Gap] = ()
+
+    @property
+    def time_s(self) -> Array:
+        """(n,) seconds since the first frame."""
+        return seconds(self.track.times_ns)
+
+    @property
+    def dt_s(self) -> Array:
+        """(n,) seconds since the previous frame, NaN at the first."""
+        return np.concatenate([[np.nan], np.diff(self.track.times_ns) * 1e-9])[: self.track.n_frames]
+
+    def frames(self) -> Block:
+        """The block of the table `frames`."""
+        track = self.track
+        return {
+            **self._who, **self._when(slice(None), 1),
+            "time_ns": track.times_ns, "gap_before": self.missing_before(),
+            "predicted_error_mm": track.predicted_error_mm, "residual_mm": track.residual_mm,
+            "n_foreground_px": track.n_foreground_px,
+            **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
+            **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
+            "spine_mm": track.spine_mm, "scale": track.scale,
+            "flag": track.flag,
+        }  # fmt: skip
+
+    def poses(self) -> Iterator[Block]:
+        """The table `poses`, some hundred thousand rows at a time."""
+        track = self.track
+        names, n_joints = track.skeleton.names, track.skeleton.n_joints
+        for part in self._parts(n_joints):
+            joints, uv, sd = track.joints_mm[part], track.uv_px[part], track.sd_mm[part]
+            yield {
+                **self._who, **self._when(part, n_joints),
+                "joint": Words(np.tile(np.arange(n_joints), len(joints)), tuple(names)),
+                **{f"{axis}_mm": joints[:, :, k].ravel() for k, axis in enumerate("xyz")},
+                **{f"{axis}_px": uv[:, :, k].ravel() for k, axis in enumerate("uv")},
+                "score": nearness(sd, _NEAR * track.spine_mm[part][:, None]).ravel(),
+                "sd_mm": sd.ravel(),
+            }  # fmt: skip
+
+    def rotations(self) -> Iterator[Block]:
+        """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
+        track = self.track
+        n_rows = track.skeleton.n_joints + 1
+        for part in self._parts(n_rows):
+            root = _log(track.root_rotation[part])[:, None]
+            turn = np.concatenate([root, track.angles_rad[part]], axis=1)
+            spread = np.concatenate([track.sd_root[part][:, None, :3], track.sd_angles_rad[part]], axis=1)
+            shift, sd_shift = np.full(turn.shape, np.nan), np.full(turn.shape, np.nan)
+            shift[:, 0], sd_shift[:, 0] = track.root_mm[part], track.sd_root[part][:, 3:]
+            yield {
+                **self._who, **self._when(part, n_rows),
+                "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
+                **_xyz("w{}_rad", turn), **_xyz("sd_w{}_rad", spread),
+                **_xyz("t{}_mm", shift), **_xyz("sd_t{}_mm", sd_shift),
+            }  # fmt: skip
+
+    def missing_before(self) -> NDArray[np.int64]:
+        """(n,) frames that the camera did not deliver just before each frame."""
+        missing = np.zeros(self.track.n_frames, np.int64)
+        for gap in self.camera_gaps:
+            after = int(np.searchsorted(self.track.times_ns, gap.stop_ns))
+            if after < len(missing):
+                missing[after] += gap.n_frames_missing
+        return missing
+
+    def gaps(self) -> Block:
+        """The table `gaps`: frames never delivered, and stretches of frames without a pose, in order of time."""
+        time, missing = self.time_s, self.missing_before()
+        count = frame_count(self.frame_index)
+        found: list[tuple[float, float, int, int, int, str]] = []
+        for after in np.flatnonzero(missing):
+            before = stop_times(time)[after - 1] if after else time[after]
+            frame = int(self.frame_index[after])
+            found.append((before, time[after], frame, frame, int(missing[after]), "camera_dropped"))
+        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", "no_depth", "tracker_lost"))
+        stops = stop_times(time)
+        for start, stop, reason in stretches(lost):
+            if reason:
+                span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
+                found.append((*span, stop - start, str(reason)))
+        found.sort()
+        names = ("start_s", "stop_s", "start_frame", "stop_frame", "n_frames_missing", "reason")
+        values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
+        kinds = (float, float, np.int64, np.int64, np.int64, str)
+        return {**self._who, **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)}}
+
+    @property
+    def _who(self) -> dict[str, str]:
+        return {"session_id": self.session_id, "individual": self.individual}
+
+    def _when(self, part: slice, repeat: int) -> dict[str, Any]:
+        columns = {"frame_index": self.frame_index, "time_s": self.time_s, "dt_s": self.dt_s}
+        return {name: np.repeat(column[part], repeat) for name, column in columns.items()}
+
+    def _parts(self, rows_per_frame: int) -> Iterator[slice]:
+        step = max(1, ROWS_PER_GROUP // rows_per_frame)
+        for start in range(0, self.track.n_frames, step):
+            yield slice(start, start + step)
+
+
+def _xyz(name: str, values: Array) -> dict[str, Array]:
+    return {name.format(axis): values[:, :, k].ravel() for k, axis in enumerate("xyz")}
+
+
+def _log(rotation: Array) -> Array:
+    """Rotation vectors (n, 3) of rotations (n, 3, 3), NaN where the rotation is."""
+    known = np.isfinite(rotation).all(axis=(1, 2))
+    omega = np.full((len(rotation), 3), np.nan)
+    omega[known] = so3.log(rotation[known])
+    return omega
+
+
+def nearness(sd: Array, radius: Array) -> Array:
+    """Probability that a Gaussian point in space with `sd` along each axis lies within `radius` of its mean."""
+    from scipy.special import erf
+
+    r = radius / np.maximum(sd, 1e-9)
+    return np.asarray(erf(r / np.sqrt(2.0)) - np.sqrt(2.0 / np.pi) * r * np.exp(-0.5 * r * r))
+
+
+def seconds(times_ns: NDArray[np.int64]) -> Array:
+    """(n,) seconds since the first of integer nanoseconds (n,)."""
+    return (times_ns - times_ns[:1]).astype(np.float64) * 1e-9
+
+
+def median_step(time_s: Array) -> float:
+    """The usual time from one frame to the next, s; 0 for a single frame."""
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def gap_follows(time_s: Array) -> NDArray[np.bool_]:
+    """(n,) True where frames are missing after this one, and at the last frame."""
+    step = np.diff(time_s)
+    return np.append(step > GAP_FACTOR * median_step(time_s), True)[: len(time_s)]
+
+
+def stop_times(time_s: Array) -> Array:
+    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median step later."""
+    stops: Array = np.append(time_s[1:], np.nan)[: len(time_s)]
+    alone = gap_follows(time_s)
+    stops[alone] = time_s[alone] + median_step(time_s)
+    return stops
+
+
+def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n + 1,) the camera's count of every row and of the row after the last."""
+    return np.append(frame_index, frame_index[-1:] + 1)
+
+
+def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
+    """Runs of equal labels (n,) as (start, stop, label), stop exclusive."""
+    if len(labels) == 0:
+        return []
+    starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
+    return [(int(a), int(b), labels[a]) for a, b in zip(starts, np.append(starts[1:], len(labels)), strict=True)]

@@ -1,0 +1,228 @@
+"""The Rerun replay: depth, skeleton, scalars and actions on the timelines `frame` and `time`, in a scene of metres.
+
+Depth streams in as it comes; everything small is written at the end from the same track the tables are made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from liex_lab.geometry import so3
+from liex_lab.sessions._rvl import rvl_message
+from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.rows import Rows, frame_count, stop_times, stretches
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+DepthBatch = Sequence[NDArray[np.uint16]]
+
+DEPTH = "arena/camera/image/depth"
+IMAGE = "arena/camera/image"
+OVERLAY = "arena/camera/image/overlay"
+SKELETON = "arena/skeleton"
+ROOT = "arena/root"
+ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
+_BLOCK = 8192  # frames of small things sent in one go
+RAW_UP_TO = 300  # frames; beyond it depth is stored as RVL, which is half the size
+MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
+
+# Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
+PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xDDCC77)
+_FLAG_COLOURS = {"doubtful": 0xCCBB44, "not_found": 0xEE6677, "no_depth": 0xBBBBBB}
+_BONE, _JOINT = [255, 255, 255, 255], [255, 80, 60, 255]
+
+
+class ReplayWriter:
+    """Writes `session.rrd`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`."""
+
+    def __init__(self, path: Path, origin: Provenance, blueprint: Any = None) -> None:
+        self._origin = origin
+        self._encoded = origin.n_frames is None or origin.n_frames > RAW_UP_TO
+        self._first_ns: int | None = None
+        self._stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
+        self._stream.set_log_time_enabled(False)
+        self._stream.save(path)
+        if blueprint is not None:
+            self._stream.send_blueprint(blueprint)
+        self._log_scene()
+
+    def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
+        """Depth (H, W) uint16 mm of consecutive frames."""
+        if self._first_ns is None:
+            self._first_ns = int(times_ns[0])
+            self._log_depth_kind(depth[0])
+        elapsed = np.asarray(times_ns, np.int64) - self._first_ns
+        index = np.asarray(frame_index, np.int64)
+        for start in range(0, len(depth), 8):  # larger calls were slower and hold more memory
+            part = slice(start, start + 8)
+            if self._encoded:
+                blobs = [rvl_message(image) for image in depth[part]]
+                columns = rr.EncodedDepthImage.columns(blob=blobs)
+            else:
+                images = np.stack(depth[part])
+                columns = rr.DepthImage.columns(buffer=images.view(np.uint8).reshape(len(images), -1))
+            self._stream.send_columns(DEPTH, _timeline(index[part], elapsed[part]), [*columns])
+        self._stream.flush()
+
+    def finish(
+        self, rows: Rows, kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
+    ) -> None:
+        """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the ethogram's vocabulary."""
+        index, elapsed = rows.frame_index, rows.track.times_ns - rows.track.times_ns[:1]
+        self._log_skeleton(rows, index, elapsed)
+        self._log_root(rows, index, elapsed)
+        scalars = [("error/predicted", "predicted error (mm)", 0xEE6677, rows.track.predicted_error_mm)]
+        for name, label, colour in (
+            ("speed_mm_s", "speed (mm/s)", 0x4477AA),
+            ("nose_height_mm", "nose height (mm)", 0x228833),
+        ):
+            if name in kinematics:
+                scalars.append((f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float)))
+        for entity, label, colour, values in scalars:
+            self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True)
+            self._stream.send_columns(entity, _timeline(index, elapsed), [*rr.Scalars.columns(scalars=values)])
+        self._log_lanes(rows, bouts, words)
+        for problem in problems:
+            self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
+        self._stream.send_property(
+            "session", rr.AnyValues(session_id=self._origin.name, animal=self._origin.skeleton.name,
+                                    input_sha256=self._origin.input_sha256)
+        )  # fmt: skip
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file, whole or not."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _log_scene(self) -> None:
+        camera, T_arena_camera = self._origin.camera, self._origin.T_arena_camera
+        self._stream.log("arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        pose = rr.Transform3D(translation=T_arena_camera.translation / 1000.0, mat3x3=T_arena_camera.rotation)
+        self._stream.log("arena/camera", pose, static=True)
+        lens = rr.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.05,
+        )
+        self._stream.log(IMAGE, lens, static=True)
+
+    def _log_depth_kind(self, first: NDArray[np.uint16]) -> None:
+        """What holds for every depth image: unit, colours, layout."""
+        look: dict[str, Any] = {
+            "meter": MM_PER_UNIT, "colormap": "viridis", "point_fill_ratio": 0.25,
+            "depth_range": colour_range(first, self._origin.floor_distance_mm),
+        }  # fmt: skip
+        if self._encoded:
+            kind: Any = rr.EncodedDepthImage.from_fields(media_type=rr.components.MediaType.RVL, **look)
+        else:
+            height, width = first.shape
+            layout = rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U16)
+            kind = rr.DepthImage.from_fields(format=layout, **look)
+        self._stream.log(DEPTH, kind, static=True)
+
+    def _log_skeleton(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+        """Joints and bones in the arena, and over the picture; a frame without a pose shows none."""
+        track, skeleton = rows.track, rows.track.skeleton
+        names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
+        bones = rr.ClassDescription(info=rr.AnnotationInfo(id=1, label=skeleton.name, color=_BONE),
+                                    keypoint_annotations=names)  # fmt: skip
+        radii = {SKELETON: (0.003, 0.0015), OVERLAY: (rr.Radius.ui_points(3.5), rr.Radius.ui_points(1.2))}
+        for entity, dot, line in ((SKELETON, rr.Points3D, rr.LineStrips3D), (OVERLAY, rr.Points2D, rr.LineStrips2D)):
+            thick, thin = radii[entity]
+            self._stream.log(entity, rr.AnnotationContext([bones]), static=True)
+            self._stream.log(f"{entity}/joints", dot.from_fields(radii=thick, colors=_JOINT, show_labels=False),
+                             static=True)  # fmt: skip
+            self._stream.log(f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True)
+        for start in range(0, track.n_frames, _BLOCK):
+            part = slice(start, start + _BLOCK)
+            when, seen = _timeline(index[part], elapsed[part]), track.observed[part]
+            self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
+            # the 2D view counts from the corner of the picture, we from a pixel's centre
+            self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
+
+    def _send_points(
+        self, entity: str, when: list[rr.TimeColumn], points: Array, seen: NDArray[np.bool_], dot: Any, line: Any
+    ) -> None:
+        """Points (k, J, 2 or 3) of the k frames that are `seen` out of those of `when`, as dots and as bones."""
+        skeleton, size = self._origin.skeleton, points.shape[-1]
+        edges = np.array(skeleton.edges, np.int64).reshape(-1, 2)
+        dots = dot.columns(
+            positions=points.reshape(-1, size), class_ids=np.ones(points.shape[0] * points.shape[1], np.uint16),
+            keypoint_ids=np.tile(np.arange(skeleton.n_joints, dtype=np.uint16), len(points)),
+        )  # fmt: skip
+        strips = line.columns(strips=points[:, edges].reshape(-1, 2, size).astype(np.float32))
+        n_dots, n_bones = np.where(seen, skeleton.n_joints, 0), np.where(seen, len(edges), 0)
+        self._stream.send_columns(f"{entity}/joints", when, [*dots.partition(n_dots)])
+        self._stream.send_columns(f"{entity}/bones", when, [*strips.partition(n_bones)])
+
+    def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+        """The frame of the body's base; while the animal is lost it stays where it was seen last."""
+        track = rows.track
+        seen = track.observed
+        if not seen.any():
+            return
+        self._stream.log(ROOT, rr.TransformAxes3D(0.02), static=True)
+        xyzw = np.roll(so3.quaternion(track.root_rotation[seen]), -1, axis=-1)
+        columns = rr.Transform3D.columns(translation=track.root_mm[seen] / 1000.0, quaternion=xyzw)
+        self._stream.send_columns(ROOT, _timeline(index[seen], elapsed[seen]), [*columns])
+
+    def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
+        """The lane of the actions, and the lane of frames to distrust."""
+        spans = list(zip(bouts["start_frame"], bouts["stop_frame"], bouts["start_s"], bouts["stop_s"], bouts["action"],
+                         strict=True))  # fmt: skip
+        end = (int(rows.frame_index[-1]) + 1, float(stop_times(rows.time_s)[-1]))
+        self._log_lane(ACTIONS, spans, dict(zip(words, cycle(PALETTE), strict=False)), end)
+        count, time, stop = frame_count(rows.frame_index), rows.time_s, stop_times(rows.time_s)
+        marked = [
+            (int(count[a]), int(count[b]), float(time[a]), float(stop[b - 1]), str(flag))
+            for a, b, flag in stretches(rows.track.flag) if flag
+        ]  # fmt: skip
+        self._log_lane(TRACKING, marked, _FLAG_COLOURS, end)
+
+    def _log_lane(self, entity: str, spans: Sequence[Any], colours: dict[str, int], end: tuple[int, float]) -> None:
+        """One lane of half-open spans (start_frame, stop_frame, start_s, stop_s, word), ordered."""
+        labels = [word.replace("_", " ") for word in colours]
+        kind = rr.StateConfiguration(values=list(colours), labels=labels, colors=_rgba(list(colours.values())))
+        self._stream.log(entity, kind, static=True)
+        changes: list[tuple[int, float, str]] = []
+        for k, (start_frame, stop_frame, start_s, stop_s, word) in enumerate(spans):
+            changes.append((int(start_frame), float(start_s), str(word)))
+            if k + 1 == len(spans) or spans[k + 1][0] > stop_frame or spans[k + 1][2] > stop_s:
+                changes.append((int(stop_frame), float(stop_s), ""))
+        if not changes:
+            changes = [(0, 0.0, ""), (*end, "")]
+        frames, times, words = zip(*changes, strict=True)
+        elapsed = np.rint(np.array(times) * 1e9).astype(np.int64)
+        self._stream.send_columns(entity, _timeline(np.array(frames), elapsed),
+                                  [*rr.StateChange.columns(state=list(words))])  # fmt: skip
+
+
+def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
+    """Depth in mm between which the colours spread: the floor as the first frame shows it, and 80 mm above it."""
+    read = depth[depth > 0]
+    near, far = np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
+    near = max(float(near), floor_distance_mm - 60.0) - 80.0  # a floor tilted by 10 degrees, but not the walls
+    return max(near, 1.0), max(float(far), near + 10.0) + 10.0
+
+
+def _timeline(index: NDArray[np.int64], elapsed_ns: NDArray[np.int64]) -> list[rr.TimeColumn]:
+    return [
+        rr.TimeColumn("frame", sequence=index),
+        rr.TimeColumn("time", duration=elapsed_ns.astype("timedelta64[ns]")),
+    ]
+
+
+def _rgba(colours: Sequence[int]) -> NDArray[np.uint32]:
+    """0xRRGGBB to what Rerun takes as colours without mistaking a list of numbers for channels."""
+    return np.array([colour << 8 | 0xFF for colour in colours], np.uint32)

@@ -1,0 +1,161 @@
+"""A session: the folder of one recording's results, and the only door to it."""
+
+from __future__ import annotations
+
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.camera import Camera
+from liex_lab.errors import SessionError
+from liex_lab.geometry import SE3
+from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
+from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FILES = (
+    "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
+    "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "columns.json", "session.rrd",
+    "session.mcap",
+)  # fmt: skip
+_OPTIONAL = {"kinematics.parquet", "summary.csv"}
+
+
+class Session:
+    """The results of one recording, read from its folder when asked for. Tables are pandas data frames."""
+
+    def __init__(self, path: Path, metadata: dict[str, Any]) -> None:
+        self.path, self.metadata = path, metadata
+
+    @staticmethod
+    def create(
+        path: str | Path,
+        origin: Provenance,
+        *,
+        overwrite: bool = False,
+        blueprint: BlueprintMaker | None = None,
+        report: ReportMaker | None = None,
+    ) -> SessionWriter:
+        """Begin a session at `path`; use the writer in a `with` block and call its `close` at the end.
+
+        blueprint: makes the replay's layout from session.json's content; report: writes report.html into the folder.
+        """
+        return SessionWriter(Path(path), origin, overwrite=overwrite, blueprint=blueprint, report=report)
+
+    @staticmethod
+    def open(path: str | Path) -> Session:
+        """The session in the folder `path`, checked for its version and for missing files."""
+        folder = Path(path)
+        document = folder / "session.json"
+        if not document.is_file():
+            what = "is not a folder" if not folder.is_dir() else "holds no session.json"
+            raise SessionError(f"a session is a folder that `liex run` wrote, but {folder} {what}; check the path")
+        try:
+            metadata = json.loads(document.read_text(encoding="utf-8"))
+            found = int(metadata["schema_version"])
+        except (ValueError, KeyError, TypeError):
+            raise SessionError(
+                f"{document} is damaged and cannot be read; run `liex run` on the recording again"
+            ) from None
+        if found > SCHEMA_VERSION:
+            raise SessionError(
+                f"{folder} was written by a newer liex_lab (session schema {found}, this one reads up to "
+                f"{SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
+            )
+        for name in FILES:
+            if name not in _OPTIONAL and not (folder / name).is_file():
+                raise SessionError(f"the session {folder} lacks {name}; run `liex run` on the recording again")
+        return Session(folder, metadata)
+
+    @property
+    def name(self) -> str:
+        """The session's id."""
+        return str(self.metadata["session_id"])
+
+    @cached_property
+    def frames(self) -> pd.DataFrame:
+        """One row per recorded frame: time, gap, predicted error, flag."""
+        return self.table("frames")
+
+    @cached_property
+    def poses(self) -> pd.DataFrame:
+        """One row per recorded frame and joint: position, pixel, sd."""
+        return self.table("poses")
+
+    @cached_property
+    def rotations(self) -> pd.DataFrame:
+        """One row per recorded frame and joint, and one for the root's rigid transform."""
+        return self.table("rotations")
+
+    @cached_property
+    def kinematics(self) -> pd.DataFrame:
+        """One row per recorded frame: speed, heading, heights."""
+        return self.table("kinematics")
+
+    @cached_property
+    def bouts(self) -> pd.DataFrame:
+        """The ethogram: one row per bout."""
+        return self.table("bouts")
+
+    @cached_property
+    def gaps(self) -> pd.DataFrame:
+        """One row per stretch of frames that are missing or without a pose."""
+        return self.table("gaps")
+
+    @cached_property
+    def flips(self) -> pd.DataFrame:
+        """One row per stretch in which head and tail may have been exchanged."""
+        return self.table("flips")
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """The behaviour summary, one row per animal."""
+        import pandas as pd
+
+        path = self.path / "summary.csv"
+        if not path.is_file():
+            raise SessionError(f"the session {self.path} has no summary.csv; it was written without behaviour measures")
+        return pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
+
+    @cached_property
+    def columns(self) -> pd.DataFrame:
+        """The column dictionary: one row per column of every table."""
+        import pandas as pd
+
+        entries = json.loads((self.path / "columns.json").read_text(encoding="utf-8"))
+        return pd.DataFrame(entries)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The depth camera."""
+        stated = self.metadata["camera"]
+        numbers = {name: stated[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
+        return Camera(**numbers)
+
+    @cached_property
+    def T_arena_camera(self) -> SE3:
+        """Carries points of the camera frame into the arena frame."""
+        return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
+
+    @property
+    def plan(self) -> str:
+        """The plan as resolved, TOML text."""
+        return (self.path / "plan.toml").read_text(encoding="utf-8")
+
+    def table(
+        self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
+    ) -> pd.DataFrame:
+        """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
+        import pandas as pd
+
+        path = self.path / f"{name}.parquet"
+        if not path.is_file():
+            known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
+            raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
+        rows = None if frame_index is None else [("frame_index", "in", frame_index)]
+        return pd.read_parquet(path, columns=columns, filters=rows)

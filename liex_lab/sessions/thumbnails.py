@@ -1,0 +1,73 @@
+"""A few depth pictures kept along the way, cut around the animal, so that the report can show what was fitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.camera import Camera
+from liex_lab.sessions.rows import Rows
+
+FOLDER = "thumbnails"
+_KEPT = 16  # at most this many whole frames are held while a recording of unknown length goes by
+_SHOWN = 4
+_HALF_SPINES = 1.15  # half the side of the picture, in spine lengths
+
+
+class Keepsakes:
+    """Evenly spaced frames of a stream: when too many are held, every second one is let go."""
+
+    def __init__(self) -> None:
+        self._every = 1
+        self._seen = 0
+        self._kept: dict[int, NDArray[np.uint16]] = {}  # row -> depth
+
+    def add(self, depth: NDArray[np.uint16]) -> None:
+        """The depth of the next frame, (H, W) uint16 mm."""
+        if self._seen % self._every == 0:
+            self._kept[self._seen] = depth
+            if len(self._kept) > _KEPT:
+                self._every *= 2
+                self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
+        self._seen += 1
+
+    def save(self, folder: Path, rows: Rows, camera: Camera) -> list[dict[str, Any]]:
+        """Write up to four 16-bit PNG pictures, mm, 0 unread, and say where in the frame each was cut."""
+        import cv2
+
+        observed = rows.track.observed
+        usable = [row for row in sorted(self._kept) if row < len(observed) and observed[row]]
+        if not usable:
+            return []
+        (folder / FOLDER).mkdir()
+        chosen = sorted({usable[k] for k in np.linspace(0, len(usable) - 1, _SHOWN).round().astype(int)})
+        entries = []
+        for row in chosen:
+            left, top, picture = self._cut(row, rows, camera)
+            name = f"{FOLDER}/frame_{int(rows.frame_index[row]):07d}.png"
+            cv2.imwrite(str(folder / name), picture)
+            entries.append({
+                "file": name, "frame_index": int(rows.frame_index[row]), "left_px": left, "top_px": top,
+                "width_px": picture.shape[1], "height_px": picture.shape[0],
+            })  # fmt: skip
+        return entries
+
+    def _cut(self, row: int, rows: Rows, camera: Camera) -> tuple[int, int, NDArray[np.uint16]]:
+        depth, uv = self._kept[row], rows.track.uv_px[row]
+        centre = np.nanmean(uv, axis=0)
+        extent = np.nanmax(np.linalg.norm(uv - centre, axis=1))
+        near = depth[depth > 0]
+        distance = float(np.median(near)) if len(near) else 1000.0
+        half = max(_HALF_SPINES * float(rows.track.spine_mm[row]) * camera.fx / distance, 1.3 * extent, 16.0)
+        half_px = int(np.ceil(half))
+        left, top = int(np.round(centre[0])) - half_px, int(np.round(centre[1])) - half_px
+        padded = np.zeros((2 * half_px, 2 * half_px), np.uint16)  # beyond the picture's edge nothing was read
+        height, width = depth.shape
+        x0, x1 = max(left, 0), min(left + 2 * half_px, width)
+        y0, y1 = max(top, 0), min(top + 2 * half_px, height)
+        if x1 > x0 and y1 > y0:
+            padded[y0 - top : y1 - top, x0 - left : x1 - left] = depth[y0:y1, x0:x1]
+        return left, top, padded

@@ -1,0 +1,128 @@
+"""Stories of a mouse whose speed, heading and heights are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from liex_lab.behaviour.columns import KINEMATICS
+from liex_lab.behaviour.kinematics import BodyPoints, kinematics, neighbours, segments, smallest_turn
+from liex_lab.recordings.times import find_gaps, median_step
+from liex_lab.sessions import tables
+from liex_lab.sessions.rows import Rows
+from tests.sessions.walking_mouse import WalkingMouse, steady
+
+
+def tables_of(mouse: WalkingMouse) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The tables `frames` and `poses` of a mouse."""
+    times = mouse.times_ns
+    rows = Rows(mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times)))
+    poses = pd.concat([tables.to_pandas(tables.POSES, block) for block in rows.poses()], ignore_index=True)
+    return tables.to_pandas(tables.FRAMES, rows.frames()), poses
+
+
+def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
+    moved = kinematics(*tables_of(WalkingMouse(steady(4.0), speed_mm_s=200.0, radius_mm=150.0)))
+    np.testing.assert_allclose(moved["speed_mm_s"], 200.0, rtol=1e-3)
+    np.testing.assert_allclose(moved["yaw_rate_rad_s"], 200.0 / 150.0, rtol=1e-5)
+    np.testing.assert_allclose(moved["vertical_speed_mm_s"], 0.0, atol=1e-6)
+    assert moved["heading_rad"].iloc[0] == pytest.approx(np.pi / 2)
+    assert moved["step_mm"].sum() == pytest.approx(800.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("fps", [10.0, 25.0, 30.0, 60.0, 200.0])
+def test_the_speed_does_not_depend_on_the_frame_rate(fps):
+    moved = kinematics(*tables_of(WalkingMouse(steady(3.0, fps), speed_mm_s=150.0, radius_mm=300.0)))
+    np.testing.assert_allclose(moved["speed_mm_s"], 150.0, rtol=2e-3)
+
+
+def test_a_dropped_frame_and_an_uneven_clock_leave_the_speed_as_it_is():
+    rng = np.random.default_rng(5)
+    times = steady(4.0) + rng.uniform(-0.004, 0.004, 120)
+    times = np.delete(times - times[0], [30, 50, 51, 52, 53, 54, 90])
+    moved = kinematics(*tables_of(WalkingMouse(times, speed_mm_s=180.0, radius_mm=200.0)))
+    np.testing.assert_allclose(moved["speed_mm_s"], 180.0, rtol=1e-3)
+
+
+def test_no_difference_is_taken_across_a_gap():
+    """Between two stretches the animal was carried to another place: nobody walked that far."""
+    mouse = WalkingMouse(np.delete(steady(2.0), slice(30, 40)), speed_mm_s=100.0)
+    frames, poses = tables_of(mouse)
+    poses.loc[poses["frame_index"] >= 30, "x_mm"] += 500.0
+    moved = kinematics(frames, poses)
+    np.testing.assert_allclose(moved["speed_mm_s"], 100.0, rtol=1e-3)
+    assert moved["step_mm"].sum() == pytest.approx(100.0 * 50 / 30, rel=1e-3)
+
+
+def test_a_lost_animal_has_no_speed_and_its_neighbours_have_their_own():
+    moved = kinematics(*tables_of(WalkingMouse(steady(2.0), lost=(10, 11, 25, 27))))
+    assert list(np.flatnonzero(moved["speed_mm_s"].isna())) == [10, 11, 25, 26, 27]  # 26 stands alone
+    np.testing.assert_allclose(moved["speed_mm_s"].dropna(), 200.0, rtol=1e-3)
+    assert len(moved) == 60
+
+
+def test_heights_and_pitch_follow_a_rear():
+    moved = kinematics(*tables_of(WalkingMouse(steady(3.0), rear_s=(1.0, 2.0)))).set_index("frame_index")
+    up, down = moved.loc[45], moved.loc[0]
+    assert up["body_pitch_rad"] == pytest.approx(np.radians(55.0))
+    assert up["nose_over_rump_mm"] == pytest.approx(90.0 * np.sin(np.radians(55.0)))
+    assert down["nose_over_rump_mm"] == pytest.approx(0.0, abs=1e-9)
+    assert up["nose_height_mm"] > up["back_height_mm"] > down["back_height_mm"]
+    np.testing.assert_allclose(moved["speed_mm_s"], 200.0, rtol=1e-3)  # the body's centre goes on as before
+
+
+def test_an_upright_animal_has_no_heading():
+    frames, poses = tables_of(WalkingMouse(steady(0.5)))
+    height = poses["joint"].map({"rump": 0, "loin": 20, "chest": 40, "neck": 60, "nose": 80})
+    rump = poses.groupby("frame_index")[["x_mm", "y_mm"]].transform("first")
+    upright = poses.assign(x_mm=rump["x_mm"], y_mm=rump["y_mm"], z_mm=10.0 + height)
+    moved = kinematics(frames, upright)
+    assert moved["heading_rad"].isna().all()
+    assert moved["speed_mm_s"].notna().all()
+
+
+def test_a_jump_that_no_animal_makes_is_left_empty():
+    frames, poses = tables_of(WalkingMouse(steady(1.0)))
+    poses.loc[poses["frame_index"] >= 15, "x_mm"] += 400.0
+    moved = kinematics(frames, poses)
+    assert list(np.flatnonzero(moved["speed_mm_s"].isna())) == [14, 15]
+
+
+def test_the_turn_is_the_short_way_round():
+    turns = smallest_turn(np.array([3.5, -3.5, 0.1, np.pi]))
+    np.testing.assert_allclose(turns, [3.5 - 2 * np.pi, 2 * np.pi - 3.5, 0.1, np.pi])
+
+
+def test_neighbours_agree_with_the_search_a_reader_would_write():
+    rng = np.random.default_rng(11)
+    time = np.cumsum(rng.choice([0.01, 0.011, 0.012, 0.2], 300, p=[0.4, 0.3, 0.28, 0.02]))
+    observed = rng.random(300) > 0.05
+    before, after = neighbours(time, observed, 0.034)
+    number = segments(time, observed)
+    for i in np.flatnonzero(observed):
+        same = [j for j in range(300) if number[j] == number[i]]
+        earlier = [j for j in same if time[j] <= time[i] - 0.75 * 0.034]
+        later = [j for j in same if time[j] >= time[i] + 0.75 * 0.034]
+        assert before[i] == (max(earlier) if earlier else same[0])
+        assert after[i] == (min(later) if later else same[-1])
+
+
+def test_body_points_are_found_by_name_or_along_the_chain():
+    named = BodyPoints.of(["rump", "loin", "chest", "neck", "nose"])
+    assert (named.rump, named.neck, named.nose, named.back) == ("rump", "neck", "nose", ("loin", "chest", "neck"))
+    chain = BodyPoints.of(["a", "b", "c", "d"])
+    assert (chain.rump, chain.neck, chain.nose) == ("a", "c", "d")
+
+
+def test_the_table_has_the_listed_columns_and_one_row_per_frame():
+    moved = kinematics(*tables_of(WalkingMouse(steady(1.0))))
+    assert list(moved.columns) == [column.name for column in KINEMATICS]
+    assert len(moved) == 30
+
+
+def test_a_single_frame_has_a_row_and_no_speed():
+    moved = kinematics(*tables_of(WalkingMouse(steady(1 / 30))))
+    assert len(moved) == 1
+    assert moved["speed_mm_s"].isna().all()
+    assert moved["nose_height_mm"].iloc[0] == pytest.approx(18.0)

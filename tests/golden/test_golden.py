@@ -1,0 +1,65 @@
+"""Sessions that older versions wrote stay readable: every table, every column, every value."""
+
+from __future__ import annotations
+
+import json
+import tarfile
+
+import numpy as np
+import pytest
+from liex_lab.dashboards.report import render
+
+from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
+from liex_lab.sessions import Session
+from liex_lab.sessions.provenance import SCHEMA_VERSION
+from tests.golden.write import CAMERA, HERE, TABLES, contents
+
+NUMBERS = sorted(int(path.name.removeprefix("session_").removesuffix(".tar.gz")) for path in HERE.glob("*.tar.gz"))
+
+
+@pytest.fixture(scope="module", params=NUMBERS)
+def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Session:
+    folder = tmp_path_factory.mktemp("golden")
+    with tarfile.open(HERE / f"session_{request.param}.tar.gz") as tar:
+        tar.extractall(folder, filter="data")
+    session = Session.open(folder / f"session_{request.param}")
+    assert session.metadata["schema_version"] == request.param
+    return session
+
+
+def test_every_schema_has_its_golden_session() -> None:
+    assert list(range(1, SCHEMA_VERSION + 1)) == NUMBERS
+    assert sum(path.stat().st_size for path in HERE.glob("session_1.*")) < 170_000
+
+
+def test_every_table_is_read_with_its_columns_and_values(golden: Session) -> None:
+    expected = json.loads((HERE / f"session_{golden.metadata['schema_version']}.json").read_text(encoding="utf-8"))
+    found = contents(golden)
+    assert list(expected) == list(TABLES)
+    for name, table in expected.items():
+        assert found[name]["n_rows"] == table["n_rows"], name
+        for column, (kind, n_known, value) in table["columns"].items():
+            now = found[name]["columns"][column]
+            assert now[:2] == [kind, n_known], f"{name}.{column}"
+            assert now[2] == (value if kind == "text" else pytest.approx(value, rel=1e-12, abs=1e-12)), column
+
+
+def test_every_column_is_still_explained(golden: Session) -> None:
+    described = set(zip(golden.columns["table"], golden.columns["name"], strict=True))
+    for name in TABLES:
+        table = golden.summary if name == "summary" else golden.table(name)
+        assert {(name, column) for column in table.columns} <= described
+
+
+def test_camera_place_plan_and_depth_are_read(golden: Session) -> None:
+    assert golden.camera == CAMERA
+    np.testing.assert_allclose(golden.T_arena_camera @ [0.0, 0.0, 700.0], 0.0, atol=1e-9)
+    assert isinstance(Plan.from_toml(golden.plan), Plan), "a plan may gain settings, but lose none"
+    with open_recording(golden.path / "session.mcap") as recording:
+        assert recording.times_ns.tolist() == golden.frames["time_ns"].tolist()
+        assert len(recording.gaps) == 1
+
+
+def test_the_report_of_an_old_session_can_be_made_again(golden: Session) -> None:
+    assert golden.name in render(golden)

@@ -1,0 +1,271 @@
+"""A session is whole or it is not there; what was written can be read back."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liex_lab.errors import SessionError
+from liex_lab.plan import Plan
+from liex_lab.recordings.arena import Floor
+from liex_lab.recordings.recording import Recording
+from liex_lab.sessions import Provenance, Session
+from liex_lab.tracking.track import Track
+from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, part, steady, write
+
+MOUSE = WalkingMouse(steady(1.0))
+START = "2026-08-21T10:00:00+02:00"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Session:
+    subject = {"subject_id": "m01", "group": "control"}
+    return write(tmp_path_factory.mktemp("session") / "circle.liex", MOUSE, subject=subject, problems=["It was dark."])
+
+
+def test_a_session_says_where_it_comes_from(session):
+    about = session.metadata
+    assert about["schema_version"] == 1
+    assert about["versions"]["liex_lab"]
+    assert about["versions"]["rerun-sdk"].startswith("0.41")
+    assert about["plan"] == {"animal": "mouse", "seed": 7}
+    assert session.plan == 'animal = "mouse"\nseed = 7\n'
+    assert about["animal"]["spine_mm"] == SPINE_MM
+    assert about["problems"] == ["It was dark."]
+    assert about["frames"]["n_frames"] == 30
+    assert about["frames"]["observed_s"] == pytest.approx(1.0, abs=1e-6)
+    assert about["timings_s"]["write"] > 0
+    assert 20 < about["peak_memory_mb"] < 5000
+    assert set(about["actions"]) == {"rear", "run", "walk", "pause"}
+    assert about["rules"]["rear_height_mm"] == 40.0
+
+
+def test_a_recording_and_a_plan_tell_where_a_session_comes_from():
+    recording = Recording(
+        name="day1", format="synthetic", camera=MOUSE.camera, times_ns=np.delete(MOUSE.times_ns, [5, 6]),
+        read=lambda row: MOUSE.frame(row).depth, metadata={"subject_id": "m07", "session_start_time": START},
+    )  # fmt: skip
+    plan = Plan().with_settings(["session.group=control"])
+    floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 700.0, MOUSE.camera)
+    origin = Provenance.of(recording, floor, MOUSE.skeleton, plan, model={"name": "mouse"})
+    assert origin.subject == {"subject_id": "m07", "group": "control"}
+    assert origin.session_start_time == START
+    assert [gap.n_frames_missing for gap in origin.gaps] == [2]
+    assert len(origin.input_sha256) == 64
+    assert origin.document()["plan"]["session"]["group"] == "control"
+    np.testing.assert_allclose(origin.T_arena_camera.matrix, MOUSE.T_arena_camera.matrix, atol=1e-12)
+
+
+def test_camera_and_arena_come_back_exactly(session):
+    assert session.camera == MOUSE.camera
+    np.testing.assert_array_equal(session.T_arena_camera.matrix, MOUSE.T_arena_camera.matrix)
+
+
+def test_poses_come_back_and_project_onto_their_pixels(session):
+    track = MOUSE.track()
+    xyz = session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(30, 5, 3)
+    np.testing.assert_array_equal(xyz, track.joints_mm)
+    uv = session.camera.project(session.T_arena_camera.inverse() @ xyz)
+    np.testing.assert_allclose(session.poses[["u_px", "v_px"]].to_numpy().reshape(30, 5, 2), uv, atol=1e-9)
+    assert list(session.poses["joint"].unique()) == list(MOUSE.skeleton.names)
+    assert session.poses["score"].between(0, 1).all()
+
+
+def test_a_part_of_a_long_table_can_be_read_alone(session):
+    part_of_it = session.table("poses", ["frame_index", "joint", "z_mm"], [3, 17])
+    assert list(part_of_it["frame_index"].unique()) == [3, 17]
+    assert part_of_it.shape == (10, 3)
+    with pytest.raises(SessionError, match="no table 'pose'"):
+        session.table("pose")
+
+
+def test_the_session_row_names_the_animal(session):
+    row = session.table("sessions").iloc[0]
+    assert (row["subject_id"], row["group"], row["cage"]) == ("m01", "control", "")
+    assert row["n_frames_observed"] == 30
+    assert row["fps_median"] == pytest.approx(30.0, abs=1e-3)
+
+
+def test_an_exception_leaves_nothing_behind_and_goes_on(tmp_path):
+    with pytest.raises(RuntimeError, match="the tracker broke"):  # noqa: PT012, SIM117
+        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+            frames, track = next(MOUSE.chunks(10))
+            writer.add(frames, track)
+            assert [path.name.startswith("circle.liex.part-") for path in tmp_path.iterdir()] == [True]
+            raise RuntimeError("the tracker broke")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_exception_while_closing_leaves_nothing_behind_either(tmp_path):
+    def broken(*_):
+        raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space left"):  # noqa: PT012, SIM117
+        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+            writer.add(*next(MOUSE.chunks(10)))
+            writer._replay.finish = broken  # type: ignore[method-assign]
+            writer.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_blueprint_that_cannot_be_made_leaves_nothing_behind(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        Session.create(tmp_path / "circle.liex", MOUSE.provenance(), blueprint=lambda _: 1 / 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_that_is_not_closed_is_not_kept(tmp_path):
+    with pytest.raises(SessionError, match="close"):  # noqa: SIM117
+        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+            writer.add(*next(MOUSE.chunks(10)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_without_frames_makes_no_session(tmp_path):
+    with pytest.raises(SessionError, match="no frame"):  # noqa: SIM117
+        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+            writer.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_is_replaced_only_when_asked_and_only_by_a_whole_one(tmp_path):
+    place = tmp_path / "circle.liex"
+    write(place, MOUSE, name="first")
+    with pytest.raises(SessionError, match="exists already"):
+        write(place, MOUSE)
+    with pytest.raises(KeyboardInterrupt):  # noqa: SIM117
+        with Session.create(place, MOUSE.provenance(), overwrite=True):
+            raise KeyboardInterrupt
+    assert Session.open(place).name == "first"
+    assert write(place, MOUSE, name="second", overwrite=True).name == "second"
+    assert list(tmp_path.iterdir()) == [place]
+
+
+def test_a_folder_that_is_not_a_session_is_never_touched(tmp_path):
+    place = tmp_path / "thesis"
+    place.mkdir()
+    (place / "chapter1.txt").write_text("years of work")
+    with pytest.raises(SessionError, match="not a session"):
+        Session.create(place, MOUSE.provenance(), overwrite=True)
+    assert (place / "chapter1.txt").read_text() == "years of work"
+    assert list(tmp_path.iterdir()) == [place]
+
+
+def test_a_broken_report_does_not_take_the_session_with_it(tmp_path):
+    def broken(folder: Path) -> None:
+        assert (folder / "session.json").is_file()
+        raise ValueError("no ink")
+
+    with pytest.raises(ValueError, match="no ink"):
+        write(tmp_path / "circle.liex", MOUSE, report=broken)
+    assert len(Session.open(tmp_path / "circle.liex").frames) == 30
+    assert [path.name for path in tmp_path.iterdir()] == ["circle.liex"]
+
+
+def test_a_track_of_other_frames_is_refused(tmp_path):
+    frames, track = next(MOUSE.chunks(10))
+    with pytest.raises(SessionError, match="one row for every frame"):  # noqa: SIM117
+        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+            writer.add(frames, part(track, 1, 10))
+
+
+def test_a_track_may_come_at_the_end_as_a_whole(tmp_path):
+    whole = MOUSE.track()
+    with Session.create(tmp_path / "late.liex", MOUSE.provenance()) as writer:
+        for frames, _ in MOUSE.chunks(10):
+            writer.add(frames)
+        writer.track = whole
+        session = writer.close()
+    np.testing.assert_array_equal(session.poses["x_mm"], whole.joints_mm[:, :, 0].ravel())
+
+
+def test_a_recording_in_which_nothing_is_found_is_a_session_all_the_same(tmp_path):
+    with Session.create(tmp_path / "empty.liex", MOUSE.provenance()) as writer:
+        for frames, _ in MOUSE.chunks(10):
+            writer.add(frames, Track.empty(MOUSE.skeleton, np.array([f.time_ns for f in frames]), "no_depth"))
+        session = writer.close()
+    assert session.metadata["frames"]["n_observed"] == 0
+    assert list(session.gaps["reason"]) == ["no_depth"]
+    assert session.metadata["thumbnails"] == []
+
+
+def test_a_newer_session_asks_for_an_upgrade(session, tmp_path):
+    (tmp_path / "session.json").write_text(json.dumps({**session.metadata, "schema_version": 2}))
+    with pytest.raises(SessionError, match="upgrade"):
+        Session.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(None, "holds no session.json"), ("{", "damaged"), ("[]", "damaged"), ('{"schema_version": 1}', "lacks plan")],
+)
+def test_what_is_not_a_session_is_refused_with_a_sentence(tmp_path, content, says):
+    if content is not None:
+        (tmp_path / "session.json").write_text(content)
+    with pytest.raises(SessionError, match=says):
+        Session.open(tmp_path)
+    with pytest.raises(SessionError, match="is not a folder"):
+        Session.open(tmp_path / "nowhere")
+
+
+def test_thumbnails_hold_the_depth_around_the_animal(session):
+    import cv2
+
+    shown = session.metadata["thumbnails"]
+    assert len(shown) == 4
+    for entry in shown:
+        picture = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
+        assert picture.dtype == np.uint16
+        assert picture.shape == (entry["height_px"], entry["width_px"])
+        depth = MOUSE.frame(entry["frame_index"]).depth
+        x0, y0 = max(entry["left_px"], 0), max(entry["top_px"], 0)
+        inside = picture[y0 - entry["top_px"] :, x0 - entry["left_px"] :]
+        inside = inside[: depth.shape[0] - y0, : depth.shape[1] - x0]
+        np.testing.assert_array_equal(inside, depth[y0 : y0 + inside.shape[0], x0 : x0 + inside.shape[1]])
+
+
+_WRITE_MANY = """
+import sys
+from pathlib import Path
+import numpy as np
+from liex_lab.camera import PRIMESENSE
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.plan import Plan
+from liex_lab.recordings.arena import Floor
+from liex_lab.recordings.recording import Recording
+from liex_lab.sessions import Provenance, Session
+from tests.sessions.walking_mouse import WalkingMouse, part, steady
+
+def held_mb(what):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(what)).split()[1]) / 1024
+
+n = 420
+mouse = WalkingMouse(steady(n / 30), camera=PRIMESENSE)
+track, base = mouse.track(), mouse.frame(0).depth
+with Session.create(sys.argv[1], mouse.provenance()) as writer:
+    for start in range(0, n, 30):
+        frames = [DepthFrame(i, int(track.times_ns[i]), np.roll(base, 7 * i)) for i in range(start, start + 30)]
+        writer.add(frames, part(track, start, start + 30))
+        if start == 60:
+            early = held_mb("VmHWM")
+    session = writer.close()
+print(held_mb("VmHWM") - early, session.metadata["peak_memory_mb"])
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells a process its own peak memory")
+def test_memory_does_not_grow_with_the_recording(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", _WRITE_MANY, str(tmp_path / "many.liex")], cwd=Path(__file__).parents[2],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    grown, peak = (float(word) for word in done.stdout.split())
+    assert grown < 90.0  # 330 frames more are 405 MB of float32 depth
+    assert peak < 1500.0
