@@ -1,0 +1,1 @@
+"""The jobs: in which order, on which files, with how many workers. Installed as `liex_lab.pipelines`."""

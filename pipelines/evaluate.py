@@ -1,0 +1,214 @@
+"""The jobs behind `liex evaluate`: accuracy on fixed splits, speed, sizes, and agreement with another program."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.errors import LiexError
+from liex_lab.evaluation import POSE_PROTOCOL, PoseErrors, angle_between_axes, count_reversals
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.recordings.synthetic import SyntheticSession
+
+_SPEED_FRAMES = 128
+_SPEED_REPEATS = 5
+
+
+def estimator_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator:
+    """The estimator of a variant: the bundled model, or one that is trained now and kept in the user's cache."""
+    from liex_lab.pipelines.train import cached_model
+
+    from liex_lab.catalog import find_model
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.estimation.model import Model
+
+    if variant == "default":
+        return PoseEstimator(Model.load(find_model(animal)))
+    return PoseEstimator(Model.load(cached_model(animal, variant, progress)))
+
+
+def pose_errors(
+    estimator: PoseEstimator, sessions: Sequence[SyntheticSession], plan: Plan, progress: Progress
+) -> PoseErrors:
+    """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
+    from liex_lab.recordings.foreground import Scene
+
+    model, parts = estimator.model, []
+    quantiles = np.array(model.calibration.quantiles)
+    for k, recording in enumerate(sessions):
+        progress(k, len(sessions), f"measuring {recording.name}")
+        sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
+        scene, frames = Scene.learn(recording, sizes, len(recording), plan.foreground.min_height_mm)
+        estimates = estimator.estimate(frames, scene, estimator.find_size(frames, scene))
+        joints = estimates.chosen.pose.joints(estimator.skeleton)
+        parts.append(
+            PoseErrors.compare(
+                joints, recording.joints_camera, estimator.skeleton.n_joints - 1, estimates.chosen.error_mm, quantiles
+            )
+        )
+    return PoseErrors.join(parts)
+
+
+def evaluate_pose(
+    animal: str = "mouse",
+    split: str = "clean",
+    variant: str = "default",
+    *,
+    n_frames: int | None = None,
+    spine_mm: float | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The figures of one split and variant; `liex evaluate pose`."""
+    from liex_lab.recordings.synthetic import test_split
+
+    sessions = test_split(split, spine_mm=spine_mm)
+    estimator = estimator_of(animal, variant, progress)
+    if n_frames is not None:
+        sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
+    errors = pose_errors(estimator, sessions, Plan.load(animal), progress)
+    how = (
+        f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, each with its own camera, arena, animal; "
+        "the background, the floor, the blob and the animal's size are found by the product, nothing is handed over. "
+    )
+    return {"animal": animal, "split": split, "variant": variant, "n_frames": len(errors.error_mm),
+            **errors.summary(), "protocol": how + POSE_PROTOCOL}  # fmt: skip
+
+
+def evaluate_sizes(
+    animal: str = "mouse",
+    spines_mm: Sequence[float] = (45.0, 65.0, 80.0, 100.0),
+    *,
+    n_frames: int | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Mean joint error in per cent of the spine for animals of several sizes, the size estimated and not given."""
+    rows = {}
+    for spine in spines_mm:
+        result = evaluate_pose(animal, "clean", "default", n_frames=n_frames, spine_mm=spine, progress=progress)
+        rows[f"{spine:g}"] = 100.0 * result["mean_joint_error_mm"] / spine
+    best = min(rows.values())
+    return {"animal": animal, "n_frames": result["n_frames"], "error_percent_of_spine": rows,
+            "ratio_to_best": {name: value / best for name, value in rows.items()},
+            "worst_ratio": max(rows.values()) / best, "protocol": result["protocol"]}  # fmt: skip
+
+
+def _best_seconds(job: Callable[[], Any]) -> float:
+    """Shortest of several runs after one that compiles: the least disturbed by what else the machine does."""
+    job()
+    times = []
+    for _ in range(_SPEED_REPEATS):
+        began = time.perf_counter()
+        job()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
+    """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate speed`."""
+    import numba
+
+    from liex_lab.estimation.scoring import choose
+    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.synthetic import test_split
+
+    recording = next(s for s in test_split("clean") if s.width == 640)
+    plan = Plan.load(animal)
+    default, paper = estimator_of(animal, "default"), estimator_of(animal, "paper", progress)
+    scene, sample = Scene.learn(recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm))
+    size = default.find_size(sample, scene)
+    frames = sample[np.arange(_SPEED_FRAMES) % len(sample)]
+    cores = min(2, numba.config.NUMBA_NUM_THREADS)
+    numba.set_num_threads(cores)
+    rate: dict[str, float] = {}
+    for name, estimator, parallel in (("one", default, False), ("two", default, True), ("paper", paper, True)):
+        progress(len(rate), 3, f"timing {name}")
+        rate[name] = _SPEED_FRAMES / _best_seconds(partial(estimator.estimate, frames, scene, size, parallel))
+    crops = scene.extract(frames, size)
+    looks = scene.looks(crops)
+    rotations, positions, _, scores = default.candidates(crops, looks, size)
+    stages = {
+        "foreground": _best_seconds(lambda: scene.extract(frames, size, False)),
+        "candidates": _best_seconds(lambda: default.candidates(crops, looks, size, False)),
+        "choice": _best_seconds(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
+                                               rotations, positions, scores)),
+    }  # fmt: skip
+    return {
+        "animal": animal,
+        "frames_per_s_1core": rate["one"],
+        f"frames_per_s_{2}cores": rate["two"],
+        "ratio_to_paper": rate["two"] / rate["paper"],
+        "stages_ms": {name: 1000.0 * seconds / _SPEED_FRAMES for name, seconds in stages.items()},
+        "machine": f"{platform.processor() or platform.machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
+        "protocol": f"{_SPEED_FRAMES} rendered {recording.width} x {recording.height} frames in memory, foreground to "
+        f"final pose, best of {_SPEED_REPEATS}; ratio to the paper variant on two cores in the same run; stages on one",
+    }
+
+
+def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:
+    """A session against another program's centroid and long axis in the same recording, a table with one row a frame.
+
+    Columns used: frame, centroid_x_px, centroid_y_px, angle_rad (direction (cos a, -sin a) in (right, down), known
+    modulo pi) and, where present, reliable (rows other than 1 are left out). Distances are pixels times the true size
+    of a pixel on the floor.
+    """
+    import pandas as pd
+
+    from liex_lab.sessions import Session
+
+    opened = Session.open(session)
+    try:
+        table = pd.read_csv(reference)
+    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
+        raise LiexError(f"{reference} should be a table with one row a frame, as CSV, but: {error}") from None
+    needed = {"frame", "centroid_x_px", "centroid_y_px", "angle_rad"}
+    if not needed <= set(table.columns):
+        raise LiexError(f"{reference} should have the columns {', '.join(sorted(needed))}; it lacks some of them")
+    poses, frames = opened.poses, opened.frames
+    names = opened.metadata["animal"]["joints"]
+    u, v = (
+        poses.pivot(index="frame_index", columns="joint", values=name)[names].to_numpy() for name in ("u_px", "v_px")
+    )
+    rows = table["frame"].to_numpy(int)
+    used = (rows >= 0) & (rows < len(u))
+    if "reliable" in table:
+        used &= table["reliable"].to_numpy() == 1
+    table, rows = table[used], rows[used]
+    if not len(rows):
+        raise LiexError(f"{reference} has no reliable row for any frame of {session}; its column frame counts from 0")
+    camera = opened.metadata["camera"]
+    mm_per_px = camera["floor_distance_mm"] / np.sqrt(camera["fx"] * camera["fy"])
+    known = table[["centroid_x_px", "centroid_y_px"]].to_numpy()
+    outline = frames[["centroid_u_px", "centroid_v_px"]].to_numpy()[rows]
+    off = float(np.nanmedian(np.linalg.norm(outline - known, axis=1)))
+    middle = np.stack([u[rows].mean(axis=1), v[rows].mean(axis=1)], axis=1)
+    joints_off = float(np.nanmedian(np.linalg.norm(middle - known, axis=1)))
+    heading = np.arctan2(-(v[:, -1] - v[:, 0]), u[:, -1] - u[:, 0])
+    turn = np.degrees(angle_between_axes(heading[rows], table["angle_rad"].to_numpy()))
+    return {
+        "session": str(session),
+        "n_frames": len(frames),
+        "n_compared": int(len(rows)),
+        "n_lost": int((~np.isfinite(u[:, 0])).sum()),
+        "n_lost_without_flag": int((~np.isfinite(u[:, 0]) & (frames["flag"].to_numpy() == "")).sum()),
+        "spine_mm": opened.metadata["animal"].get("spine_mm"),
+        "centroid_median_px": off,
+        "centroid_median_mm": off * mm_per_px,
+        "joint_mean_median_mm": joints_off * mm_per_px,
+        "heading_median_deg": float(np.nanmedian(turn)),
+        "n_reversals": count_reversals(heading),
+        "surface_median_mm": float(np.nanmedian(frames["residual_mm"])),
+        "protocol": "centroid: of the animal's outline (frames.parquet) against the reference's; joint_mean: the plain "
+        "mean of the joints, which lies ahead of the outline's centre; both in pixels times the floor's mm a pixel. "
+        "heading: base to tip in the image, modulo pi. reversals: heading turns of more than 90 degrees between "
+        "consecutive measured frames. surface: median over frames of the median |rendered body - depth| in the animal",
+    }

@@ -1,0 +1,81 @@
+"""The job that makes the bundled sample recording: a rendered mouse, written as a camera's MCAP file, and its card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.synthetic import SyntheticSession
+
+SEED = 341  # of a walk in which the animal turns, crosses its arena and rears once
+SPINE_MM = 65.0
+N_FRAMES = 154
+LEFT_OUT = (40, 101, 102, 103)  # frames that "the camera did not deliver", so that a sample has gaps as recordings have
+_START_NS = 10**9  # the clock of a camera that was switched on a second ago: no date is claimed
+_CHUNK_BYTES, _LEVEL = 1 << 20, 19  # packed once, downloaded often
+
+
+def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
+    """Write the sample to `path` (.mcap), and its card beside it (.toml); returns the path.
+
+    The same code and the same versions of its packages write the same bytes.
+    """
+    from liex_lab.sessions.mcap import McapWriter
+    from liex_lab.sessions.provenance import Provenance
+
+    mouse, path = virtual_mouse(), Path(path)
+    path.unlink(missing_ok=True)
+    origin = Provenance(
+        name=path.stem, skeleton=mouse.skeleton, camera=mouse.camera, T_arena_camera=mouse.T_arena_camera,
+        floor_distance_mm=mouse.floor.distance_mm, input_sha256="",
+    )  # fmt: skip
+    writer = McapWriter(path, origin, level=_LEVEL, chunk_size=_CHUNK_BYTES)
+    try:
+        for frames in mouse.chunks(16):
+            kept = [frame for frame in frames if frame.index not in LEFT_OUT]
+            depth = [frame.depth.astype(np.uint16) for frame in kept]
+            writer.add([frame.time_ns + _START_NS for frame in kept], depth)
+            progress(frames[-1].index + 1, N_FRAMES, "writing the sample")
+    finally:
+        writer.abandon()
+    path.with_suffix(".toml").write_text(_card(path, mouse), encoding="utf-8")
+    return path
+
+
+def virtual_mouse() -> SyntheticSession:
+    """The animal of the sample, its arena and its camera, with the exact truth of every frame."""
+    from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR
+    from liex_lab.recordings.walking import walking_session
+
+    return walking_session(SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk")
+
+
+def _card(path: Path, mouse: SyntheticSession) -> str:
+    """The sample's card, TOML."""
+    from liex_lab.sessions.provenance import package_version
+
+    facts = {
+        "what": "a virtual mouse that walks, turns and rears in a round arena, seen from above by an imitated "
+        "PrimeSense camera of 320 x 240 pixels; 16-bit depth in mm, the camera's calibration and its place above the "
+        "floor as Foxglove protobuf messages",
+        "origin": "rendered from a seed by liex_lab/recordings/walking.py; no recording of an animal was used",
+        "licence": "BSD-3-Clause, as the rest of liex_lab",
+        "made_by": "liex_lab.pipelines.sample.write_sample",
+        "made_with": f"foxglove-sdk {package_version('foxglove-sdk')}",
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "bytes": path.stat().st_size,
+        "n_frames": N_FRAMES - len(LEFT_OUT),
+        "frames_left_out": list(LEFT_OUT),
+        "rate_hz": round(mouse.rate_hz, 3),
+        "seed": SEED,
+        "spine_mm": SPINE_MM,
+        "floor_distance_mm": round(mouse.floor.distance_mm, 3),
+    }
+    return "".join(f"{key} = {json.dumps(value)}\n" for key, value in facts.items())

@@ -1,0 +1,185 @@
+"""The job `liex train`: rendered images in, a model with its card out, the same bytes whenever it is run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.method import Method
+    from liex_lab.estimation.model import Model
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.windows import TrainingWindows
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How much a model is trained on. degraded_share of the images have up to 2.5 times the noise (METHOD lesson 5).
+
+    sizes: the animals' mean spine in mm and the window in pixels that holds them, for one block of images after the
+    other; 0 is the skeleton's own length. Features do not depend on size, but pixels and noise do.
+    """
+
+    seed: int = 20
+    n_images: int = 40_960
+    n_calibration: int = 6_144
+    degraded_share: float = 0.5
+    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
+
+
+AREA_MM2 = 1070.0  # of a home-sized mouse seen from above; only ranks the blobs of a training window
+
+RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
+
+
+def train_model(
+    animal: str, variant: str, out: str | Path, *, workers: int = 0, progress: Progress = silent
+) -> Path:
+    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path."""
+    import numba
+
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.method import method_of
+
+    if workers:
+        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+    skeleton = Skeleton.load(animal)
+    if skeleton.name != "mouse":
+        raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")
+    model = make_model(skeleton, method_of(variant), RECIPES[variant], progress)
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = model.to_bytes()
+    unfinished = path.with_name(f"{path.name}.part-{os.getpid()}")
+    unfinished.write_bytes(content)
+    card = {**model.card, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    path.with_suffix(".json").write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+    return path
+
+
+def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
+    """Algorithm 2, the learned metric, and its calibration on images that no tree has seen."""
+    from liex_lab.body.skeleton import PRESETS
+    from liex_lab.estimation.calibration import calibrate
+    from liex_lab.estimation.model import Calibration, Model
+    from liex_lab.estimation.training import train_cascade, train_metric
+
+    rng = np.random.default_rng(recipe.seed)
+    data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
+    steps = len(skeleton.solved) * method.rounds + 2
+
+    def tell(share: float, what: str) -> None:
+        progress(round(share * (steps - 2)), steps, f"growing forests: {what}")
+
+    cascade, candidates = train_cascade(data, skeleton, method, rng, tell)
+    progress(steps - 2, steps, "growing forests: the learned metric")
+    metric = train_metric(data, cascade, candidates, rng)
+    table = tomllib.loads((PRESETS / f"{skeleton.name}.toml").read_text(encoding="utf-8"))
+    area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
+    card = {
+        "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
+        "images": "rendered from a seed; no recording of an animal was used",
+    }  # fmt: skip
+    model = Model(cascade, metric, None, table, Calibration(area_mm2=area), card)
+    if recipe.n_calibration:
+        progress(steps - 1, steps, "calibrating the predicted error")
+        unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)
+        model = calibrate(model, unseen, rng)
+    return model
+
+
+def rendered_set(
+    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress
+) -> TrainingSet:
+    """N training images from number `first` on, cut out by the product's own foreground."""
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.recordings.windows import BLOCK, training_blocks
+
+    blocks, begin = -(-n // BLOCK), -(-first // BLOCK)
+    parts: list[TrainingSet] = []
+    for number in range(begin, begin + blocks):
+        progress(number - begin, blocks, "rendering training images")
+        spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
+        (windows,) = training_blocks(
+            recipe.seed, 1, skeleton, first=number, family="augmented", degraded_share=recipe.degraded_share,
+            spine_mm=spine_mm or None, window_px=window_px,
+        )  # fmt: skip
+        parts.append(cut_out(skeleton, method, windows))
+    return TrainingSet.join(parts)
+
+
+def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
+    """Training images of what the foreground found in the windows, with the truth in their view frames."""
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.recordings.foreground import Windows
+
+    size = windows.spine_mm / skeleton.length
+    cut = Windows(windows.depth, windows.background, windows.intrinsics, windows.origin.astype(float), windows.floor)
+    shown = size if method.session_size else np.ones(len(size))
+    parts = [cut_rank(skeleton, method, windows, cut, shown, rank) for rank in (0, 1)]
+    return TrainingSet.join(parts)
+
+
+def cut_rank(
+    skeleton: Skeleton, method: Method, windows: TrainingWindows, cut: Windows, shown: Array, rank: int
+) -> TrainingSet:
+    """Training images of the blobs that come first (rank 0) or second in likeness to the animal's area."""
+    from liex_lab.body.pose import Pose
+    from liex_lab.estimation.cascade import ImageSet, Truth
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.geometry import SE3
+
+    size = windows.spine_mm / skeleton.length
+    crops, looks = cut.extract(shown, AREA_MM2 * size**2, camera_view=method.camera_view, rank=rank)
+    rotation = looks[:, 4:13].reshape(-1, 3, 3)
+    T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
+    pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
+    frames = pose.frames(skeleton)
+    off = np.linalg.norm(crops.moments[:, 3:5] - frames.translation.mean(axis=1)[:, :2], axis=1)
+    animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
+    good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
+    return TrainingSet(
+        ImageSet(crops.heights[good], looks[good], crops.moments[good]),
+        Truth(frames.rotation[good], frames.translation[good], pose.scale[good]),
+        size[good],
+        animal[good],
+    )
+
+
+def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
+    """A model that does not come with the package, trained once and kept in the user's cache folder."""
+    from liex_lab.estimation.method import method_of
+    from liex_lab.sessions.provenance import package_version
+
+    made_from: dict[str, Any] = {"method": method_of(variant).to_dict(), "recipe": vars(RECIPES[variant])}
+    key = hashlib.sha256(json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()).hexdigest()[:12]
+    path = cache_folder() / f"{animal}-{variant}-{key}.npz"
+    return path if path.is_file() else train_model(animal, variant, path, progress=progress)
+
+
+def cache_folder() -> Path:
+    """Where programs of this user keep what can be made again."""
+    if stated := os.environ.get("LIEX_CACHE"):
+        return Path(stated)
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "liex_lab"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "liex_lab"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "liex_lab"

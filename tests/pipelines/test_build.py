@@ -1,0 +1,82 @@
+"""From a plan to objects: the recording as the plan says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from liex_lab.pipelines.build import build_recording
+
+from liex_lab.errors import LiexError
+from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
+from tests.recordings.writers import (
+    cut,
+    depth_frames,
+    write_archive,
+    write_mcap,
+    write_moseq_folder,
+    write_png_folder,
+)
+
+STORED = depth_frames(5)
+LENS = ["camera.fx=61", "camera.fy=62", "camera.cx=31", "camera.cy=24"]
+
+
+def plan(*settings: str) -> Plan:
+    return Plan.load("mouse").with_settings(settings)
+
+
+def without_camera(kind: str, folder: Path) -> Path:
+    """A recording that says nothing about its camera."""
+    if kind == "mcap":
+        return write_mcap(folder / "r.mcap", STORED, camera=None)
+    if kind == "moseq":
+        return write_moseq_folder(folder / "r", STORED)
+    (write_png_folder(folder / "r", STORED) / "camera.toml").unlink()
+    return folder / "r"
+
+
+@pytest.mark.parametrize("kind", ["images", "moseq", "mcap"])
+def test_a_plan_with_all_intrinsics_opens_a_recording_that_has_none(tmp_path: Path, kind: str) -> None:
+    path = without_camera(kind, tmp_path)
+    with pytest.raises(LiexError, match=r"camera\.toml"):
+        build_recording(path, plan(*LENS[:3]))
+    with build_recording(path, plan(*LENS)) as recording:
+        camera = recording.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (61.0, 62.0, 31.0, 24.0)
+        assert (camera.width, camera.height, camera.source) == (64, 48, "plan")
+    with build_recording(path, plan(*LENS, "camera.source=own calibration")) as recording:
+        assert recording.camera.source == "own calibration"
+
+
+def test_a_plan_overrules_a_part_of_what_the_recording_states(tmp_path: Path) -> None:
+    path = write_png_folder(tmp_path / "r", STORED)
+    with build_recording(path, plan("camera.fx=70")) as recording:
+        assert (recording.camera.fx, recording.camera.fy, recording.camera.source) == (70.0, 61.0, "plan")
+    with open_recording(path) as opened, build_recording(opened, plan("camera.fx=70")) as recording:
+        assert recording.camera.fx == 70.0
+
+
+def test_what_is_typical_is_not_complained_of_once_the_plan_states_it(tmp_path: Path) -> None:
+    path = write_moseq_folder(tmp_path / "r", depth_frames(2, 512, 424), metadata={})
+    with build_recording(path, plan()) as recording:
+        assert any("typical Kinect v2" in problem for problem in recording.problems)
+    with build_recording(path, plan(*LENS)) as recording:
+        assert not any("typical" in problem for problem in recording.problems)
+
+
+def test_unpacking_an_archive_is_shown(tmp_path: Path) -> None:
+    archive = write_archive(write_moseq_folder(tmp_path / "r", STORED), tmp_path / "r.tar.gz")
+    told: list[str] = []
+    with build_recording(archive, plan(*LENS), lambda done, total, what: told.append(what)):
+        assert any("unpack" in what for what in told)
+
+
+def test_a_recording_that_is_cut_short_needs_the_plans_consent(tmp_path: Path) -> None:
+    path = write_moseq_folder(tmp_path / "r", STORED)
+    cut(path / "depth.dat", 0.7)
+    with pytest.raises(LiexError, match="accept_truncated=true"):
+        build_recording(path, plan(*LENS))
+    with build_recording(path, plan(*LENS, "recording.accept_truncated=true")) as recording:
+        assert len(recording) == 3

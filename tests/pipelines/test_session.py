@@ -1,0 +1,187 @@
+"""`run_session`: a folder of pictures in, a session out, whose every frame is accounted for and near the truth."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from liex_lab.pipelines import session as job
+
+from liex_lab.api import run_session
+from liex_lab.errors import EstimationError, SessionError
+from liex_lab.plan import Plan
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.recordings.synthetic import FRAME_NS, SyntheticSession
+from liex_lab.recordings.walking import walking_session
+from liex_lab.sessions import Session
+from liex_lab.tracking.track import Track
+from liex_lab.tracking.tracker import FrameTracker
+from tests.recordings.writers import START_NS, write_png_folder
+
+SPINE_MM, N_RENDERED = 65.0, 43
+DROPPED = [15, 16, 31]  # frames that the camera did not deliver
+KEPT = np.delete(np.arange(N_RENDERED), DROPPED)
+BLANK = 28  # row of the recording in which the camera saw nothing at all
+TABLES = ("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips")
+
+
+@pytest.fixture(scope="module")
+def mouse() -> SyntheticSession:
+    return walking_session(9, N_RENDERED, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM)
+
+
+@pytest.fixture(scope="module")
+def pictures(mouse: SyntheticSession) -> np.ndarray:
+    """What the camera delivered (n, H, W) uint16."""
+    depths = mouse.depths(0, N_RENDERED)[KEPT].astype(np.uint16)
+    depths[BLANK] = 0
+    return depths
+
+
+@pytest.fixture(scope="module")
+def times_ns() -> list[int]:
+    return [START_NS + FRAME_NS * int(k) for k in KEPT]
+
+
+@pytest.fixture(scope="module")
+def folder(mouse, pictures, times_ns, tmp_path_factory):
+    return write_png_folder(tmp_path_factory.mktemp("recording") / "walk", pictures, mouse.camera, times_ns)
+
+
+@pytest.fixture(scope="module")
+def session(folder, tmp_path_factory) -> Session:
+    out = tmp_path_factory.mktemp("sessions")
+    path = run_session(folder, Plan.load("mouse"), out)
+    assert path == out / "walk.liex"
+    assert [entry.name for entry in out.iterdir()] == ["walk.liex"]
+    return Session.open(path)
+
+
+def joints_of(session: Session) -> np.ndarray:
+    """(n, J, 3) mm, arena frame."""
+    return session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(len(session.frames), -1, 3)
+
+
+def tables_of(session: Session) -> dict[str, bytes]:
+    return {name: (session.path / f"{name}.parquet").read_bytes() for name in TABLES}
+
+
+def test_every_delivered_frame_is_a_row_of_every_table(session, times_ns):
+    n, n_joints = len(KEPT), 5
+    assert len(session.frames) == len(session.kinematics) == n
+    assert (len(session.poses), len(session.rotations)) == (n * n_joints, n * (n_joints + 1))
+    assert session.frames["frame_index"].tolist() == list(range(n))
+    assert session.frames["time_ns"].tolist() == times_ns
+    np.testing.assert_allclose(session.frames["time_s"], (KEPT - KEPT[0]) * FRAME_NS * 1e-9, atol=1e-9)
+
+
+def test_no_frame_is_lost_without_a_flag(session):
+    lost = np.isnan(joints_of(session)).any(axis=(1, 2))
+    assert np.flatnonzero(lost).tolist() == [BLANK]
+    assert session.frames["flag"][BLANK] == "no_depth"
+    assert not session.frames["flag"][~lost].isin(["no_depth", "not_found"]).any()
+
+
+def test_joints_are_near_the_truth(session, mouse):
+    in_camera = session.T_arena_camera.inverse() @ joints_of(session)
+    error = np.linalg.norm(in_camera - mouse.joints_camera[KEPT], axis=-1).mean(axis=1)
+    assert np.nanmedian(error) < 6.0
+    assert np.nanquantile(error, 0.9) < 12.0
+    inside = np.linalg.norm(joints_of(session) - mouse.joints_arena[KEPT], axis=-1).mean(axis=1)
+    assert np.nanmedian(inside) < 7.0  # the arena frame itself is measured, too
+    forward, true_forward = (joints[:, 4] - joints[:, 0] for joints in (in_camera, mouse.joints_camera[KEPT]))
+    agreement = np.sum(forward * true_forward, axis=1)
+    assert (agreement[np.isfinite(agreement)] > 0).all()
+
+
+def test_the_animals_size_and_the_floor_are_measured(session, mouse):
+    animal = session.metadata["animal"]
+    assert animal["spine_mm"] == pytest.approx(SPINE_MM, rel=0.12)
+    assert np.nanmedian(session.frames["spine_mm"]) == pytest.approx(SPINE_MM, rel=0.12)
+    assert session.metadata["camera"]["floor_distance_mm"] == pytest.approx(mouse.floor.distance_mm, abs=5.0)
+    assert np.nanmedian(session.frames["residual_mm"]) < 5.0
+
+
+def test_gaps_are_kept(session):
+    dropped = session.gaps[session.gaps["reason"] == "camera_dropped"]
+    assert dropped["n_frames_missing"].tolist() == [2, 1]
+    assert dropped["start_frame"].tolist() == [15, 29]
+    np.testing.assert_allclose(dropped["stop_s"], [17 * FRAME_NS * 1e-9, 32 * FRAME_NS * 1e-9], atol=1e-9)
+    blank = session.gaps[session.gaps["reason"] == "no_depth"]
+    assert blank[["start_frame", "stop_frame", "n_frames_missing"]].to_numpy().tolist() == [[BLANK, BLANK + 1, 1]]
+    assert session.frames["gap_before"][[15, 29]].tolist() == [2, 1]
+    assert session.frames["gap_before"].sum() == 3
+
+
+def test_running_again_gives_the_same_tables_byte_for_byte(session, folder, tmp_path):
+    assert tables_of(Session.open(run_session(folder, Plan.load("mouse"), tmp_path))) == tables_of(session)
+
+
+@pytest.mark.parametrize("chunk", [7])
+def test_tables_do_not_depend_on_how_many_frames_are_in_memory(session, folder, tmp_path, monkeypatch, chunk):
+    monkeypatch.setattr(job, "CHUNK", chunk)
+    assert tables_of(Session.open(run_session(folder, Plan.load("mouse"), tmp_path))) == tables_of(session)
+
+
+def test_the_same_frames_give_the_same_poses_from_a_recording_that_is_open_already(
+    session, mouse, pictures, times_ns, tmp_path
+):
+    opened = Recording(
+        name="walk", format="images", camera=mouse.camera, times_ns=np.array(times_ns),
+        read=lambda k: pictures[k].astype(np.float32),
+    )  # fmt: skip
+    again = Session.open(run_session(opened, out=tmp_path))
+    for name in TABLES:
+        pd.testing.assert_frame_equal(again.table(name), session.table(name))
+
+
+def test_a_size_that_the_plan_states_is_taken_as_it_is(folder, tmp_path):
+    plan = Plan.load("mouse").with_settings([f"animal.spine_mm={SPINE_MM}"])
+    animal = Session.open(run_session(folder, plan, tmp_path)).metadata["animal"]
+    assert animal["spine_mm"] == SPINE_MM
+    assert "plan" in animal["origin"]
+
+
+def test_an_accident_midway_leaves_no_folder(folder, tmp_path, monkeypatch):
+    follow, calls = FrameTracker.follow, []
+
+    def once(self: FrameTracker, frames: list[DepthFrame]) -> Track:
+        calls.append(len(frames))
+        if len(calls) == 2:
+            raise RuntimeError("the power went out")
+        return follow(self, frames)
+
+    monkeypatch.setattr(FrameTracker, "follow", once)
+    with pytest.raises(RuntimeError, match="the power went out"):
+        run_session(folder, Plan.load("mouse"), tmp_path / "out")
+    assert calls == [32, 8]
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_an_accident_midway_leaves_an_older_session_as_it_was(session, folder, tmp_path, monkeypatch):
+    path = shutil.copytree(session.path, tmp_path / "walk.liex")
+    monkeypatch.setattr(FrameTracker, "follow", lambda self, frames: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_session(folder, Plan.load("mouse"), tmp_path, overwrite=True)
+    assert tables_of(Session.open(path)) == tables_of(session)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["walk.liex"]
+
+
+def test_an_older_session_is_replaced_only_on_demand_and_that_is_said_at_once(session, folder, monkeypatch):
+    monkeypatch.setattr(job, "build_tracker", lambda *_: pytest.fail("minutes of work before the refusal"))
+    with pytest.raises(SessionError, match="overwrite"):
+        run_session(folder, Plan.load("mouse"), session.path.parent)
+
+
+def test_a_recording_without_an_animal_is_refused_and_leaves_nothing(mouse, tmp_path):
+    rng = np.random.default_rng(1)
+    bare = mouse.floor.depth(mouse.width, mouse.height) + rng.normal(0, 1, (12, mouse.height, mouse.width))
+    folder = write_png_folder(tmp_path / "bare", bare.astype(np.uint16), mouse.camera)
+    with pytest.raises(EstimationError, match="no animal was found") as error:
+        run_session(folder, Plan.load("mouse"), tmp_path / "out")
+    assert "\n" not in str(error.value)
+    assert not list((tmp_path / "out").glob("*"))

@@ -1,0 +1,229 @@
+"""The command line: quick to ask, one sentence and exit code 1 for what the user can put right, JSON that is JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import liex_lab
+from liex_lab import cli
+from liex_lab.errors import RecordingError
+from liex_lab.plan import Plan
+
+VERBS = ["demo", "run", "doctor", "train", "evaluate", "show", "info"]
+MEASURES = ["pose", "speed", "sizes", "reference"]
+
+
+def liex(
+    *arguments: str, code: str = "from liex_lab.cli import main; main()", timeout_s: float = 60.0
+) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s)
+
+
+def job(monkeypatch: pytest.MonkeyPatch, module: str, **functions: Any) -> None:
+    """Put functions in the place of a job, which the command line imports when it is asked for."""
+    stand_in = ModuleType(f"liex_lab.pipelines.{module}")
+    for name, function in functions.items():
+        setattr(stand_in, name, function)
+    monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
+
+
+def test_help_is_quick() -> None:
+    """Half a second is promised; the limit here leaves room for a machine that is busy with other tests."""
+    liex("--help")  # the first call writes the byte code
+    walls = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        assert liex("--help").returncode == 0
+        walls.append(time.perf_counter() - begin)
+    assert min(walls) < 1.0, f"liex --help took {min(walls):.2f} s"
+
+
+@pytest.mark.parametrize("words", [[], *([verb] for verb in VERBS), *(["evaluate", name] for name in MEASURES)])
+def test_every_verb_explains_itself(words: list[str]) -> None:
+    result = CliRunner().invoke(cli.app, [*words, "--help"])
+    assert result.exit_code == 0, result.output
+    expected = VERBS if not words else MEASURES if words == ["evaluate"] else ["--help"]
+    assert all(word in result.output for word in expected)
+
+
+def test_it_says_which_version_it_is() -> None:
+    assert CliRunner().invoke(cli.app, ["--version"]).output == f"liex_lab {liex_lab.__version__}\n"
+
+
+def test_python_m_is_the_same_command() -> None:
+    ran = subprocess.run([sys.executable, "-m", "liex_lab", "--version"], capture_output=True, text=True)
+    assert ran.stdout == f"liex_lab {liex_lab.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "nothing.mcap", "--plan", "moose"], "did you mean 'mouse'"),
+        (["run", "nothing.mcap", "--set", "camera.fxx=3"], "nearest one is camera.fx"),
+        (["info", "--plan", "moose"], "did you mean 'mouse'"),
+        (["show", "nothing.liex"], "nothing.liex"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_exit_code_1(arguments: list[str], says: str) -> None:
+    ran = liex(*arguments)
+    assert ran.returncode == 1
+    assert ran.stdout == ""
+    assert says in ran.stderr
+    assert len(ran.stderr.strip().splitlines()) == 1, "one line, without a traceback"
+
+
+def test_a_call_that_is_wrong_is_exit_code_2() -> None:
+    assert liex("run").returncode == 2
+    assert liex("fly").returncode == 2
+
+
+BREAK = "import liex_lab.plan, liex_lab.cli as c\ndef broken(*a): {}\nliex_lab.plan.Plan.load = broken\nc.main()"
+
+
+def test_a_fault_of_ours_says_so_and_shows_where() -> None:
+    ran = liex("info", "--plan", "mouse", code=BREAK.format("raise ZeroDivisionError('oh')"))
+    assert ran.returncode == cli.FAULT
+    assert "ZeroDivisionError: oh" in ran.stderr
+    assert "a fault of liex_lab" in ran.stderr.splitlines()[-1]
+
+
+def test_a_full_disk_is_a_sentence() -> None:
+    ran = liex("info", "--plan", "mouse", code=BREAK.format("raise OSError(28, 'No space left on device', 'a.mcap')"))
+    assert ran.returncode == 1
+    assert "a.mcap: No space left" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals differ")
+def test_interrupting_leaves_without_a_traceback() -> None:
+    wait = BREAK.format("print('begun', flush=True); import time; time.sleep(30)")
+    command = [sys.executable, "-c", wait, "info", "--plan", "mouse"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        assert running.stdout.readline() == "begun\n"
+        running.send_signal(signal.SIGINT)
+        assert running.wait(20) == 130
+        assert "Traceback" not in running.stderr.read()
+
+
+def test_run_hands_the_plan_with_its_settings_to_the_job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: dict[str, Any] = {}
+
+    def run_session(recording: Path, plan: Plan, out: Path, *, overwrite: bool, progress: Any) -> Path:
+        progress(1, 2, "working")
+        progress(2, 2, "working")
+        progress(0, None, "closing")
+        seen.update(recording=recording, plan=plan, out=out, overwrite=overwrite)
+        session = out / "m01.liex"
+        session.mkdir()
+        (session / "report.html").touch()
+        return session
+
+    monkeypatch.setattr("liex_lab.api.run_session", run_session)
+    words = ["run", "m01.mcap", "--set", "animal.spine_mm=65", "--set", "seed=4", "--out", str(tmp_path), "--overwrite"]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.exit_code == 0, result.output
+    assert seen["plan"] == Plan.load("mouse").with_settings(["animal.spine_mm=65", "seed=4"])
+    assert (seen["recording"], seen["out"], seen["overwrite"]) == (Path("m01.mcap"), tmp_path, True)
+    assert f"session: {tmp_path / 'm01.liex'}" in result.output
+    assert f"report:  {tmp_path / 'm01.liex' / 'report.html'}" in result.output
+
+
+def test_demo_ends_with_the_path_of_a_session(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("liex_lab.api.run_demo", lambda out, progress: out / "sample.liex")
+    result = CliRunner().invoke(cli.app, ["demo", "--out", str(tmp_path)])
+    assert f"session: {tmp_path / 'sample.liex'}" in result.output
+
+
+def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -> None:
+    findings = {
+        "format": "mcap",
+        "n_frames": np.int64(3),
+        "fx": np.float32(365),
+        "floor_mm": math.nan,
+        "problems": ["a"],
+    }
+    job(monkeypatch, "doctor", examine=lambda path, **options: findings, print_report=lambda findings: print("fine"))
+    result = CliRunner().invoke(cli.app, ["doctor", "m01.mcap", "--json"])
+    expected = {"format": "mcap", "n_frames": 3, "fx": 365.0, "floor_mm": None, "problems": ["a"]}
+    assert json.loads(result.output) == expected
+    assert CliRunner().invoke(cli.app, ["doctor", "m01.mcap"]).output == "fine\n"
+
+
+def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[Any] = []
+
+    def evaluate_pose(animal: str, split: str, variant: str, **options: Any) -> dict[str, Any]:
+        options.pop("progress")(1, 1, "frames")
+        seen.extend([animal, split, variant, options])
+        return {
+            "animal": animal,
+            "mean_joint_error_mm": 2.5,
+            "protocol": "mean over joints [mm]",
+            "curve": np.arange(2),
+        }
+
+    job(monkeypatch, "evaluate", evaluate_pose=evaluate_pose)
+    file = tmp_path / "numbers" / "pose.json"
+    words = ["--animal", "mouse", "--split", "hard", "--variant", "paper", "--frames", "50", "--spine-mm", "65"]
+    result = CliRunner().invoke(cli.app, ["evaluate", "pose", *words, "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    assert seen == ["mouse", "hard", "paper", {"n_frames": 50, "spine_mm": 65.0}]
+    assert json.loads(file.read_text())["curve"] == [0, 1]
+    assert "mean over joints [mm]" in result.output, "brackets are text, not markup"
+
+
+def test_the_other_measures_reach_their_jobs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    job(
+        monkeypatch,
+        "evaluate",
+        evaluate_speed=lambda animal, progress: {"animal": animal, "stages_ms": {"foreground": 0.1}},
+        evaluate_sizes=lambda animal, n_frames, progress: {"n_frames": n_frames},
+        evaluate_reference=lambda session, reference: {"session": str(session), "reference": str(reference)},
+    )
+    speed, sizes, reference = (tmp_path / f"{name}.json" for name in MEASURES[1:])
+    runner = CliRunner()
+    runner.invoke(cli.app, ["evaluate", "speed", "--json", str(speed)])
+    runner.invoke(cli.app, ["evaluate", "sizes", "--json", str(sizes)])
+    runner.invoke(cli.app, ["evaluate", "reference", "m.liex", "--reference", "r.csv", "--json", str(reference)])
+    assert json.loads(speed.read_text()) == {"animal": "mouse", "stages_ms": {"foreground": 0.1}}
+    assert json.loads(sizes.read_text()) == {"n_frames": None}
+    assert json.loads(reference.read_text()) == {"session": "m.liex", "reference": "r.csv"}
+
+
+def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch) -> None:
+    job(monkeypatch, "train", train_model=lambda animal, variant, out, workers, progress: (out, variant, workers))
+    result = CliRunner().invoke(cli.app, ["train", "mouse", "--variant", "paper", "--workers", "2"])
+    assert result.output == f"model: {(Path('mouse.npz'), 'paper', 2)}\n"
+
+
+def test_errors_of_a_job_come_through(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def examine(path: Path, **options: Any) -> dict[str, Any]:
+        raise RecordingError(f"{path} holds colour [uint8], not depth")
+
+    job(monkeypatch, "doctor", examine=examine, print_report=print)
+    monkeypatch.setattr(sys, "argv", ["liex", "doctor", "colour.png"])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code == 1
+    assert capsys.readouterr().err == "liex: colour.png holds colour [uint8], not depth\n"
+
+
+def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:
+    told = CliRunner().invoke(cli.app, ["info"]).output
+    assert all(word in told for word in ("numba", "rerun-sdk", "plans", "mouse", "models"))
+    assert CliRunner().invoke(cli.app, ["info", "--plan", "mouse"]).output == Plan.load("mouse").to_toml()

@@ -1,0 +1,46 @@
+"""ruff and mypy hold for the whole repository, and every function but a numba kernel states its types."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY
+
+
+def run_module(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", *arguments], cwd=REPOSITORY, capture_output=True, text=True)
+
+
+def test_ruff_finds_nothing() -> None:
+    ran = run_module("ruff", "check", ".")
+    assert ran.returncode == 0, ran.stdout
+
+
+@pytest.mark.slow
+def test_mypy_finds_nothing() -> None:
+    ran = run_module("mypy")
+    assert ran.returncode == 0, ran.stdout
+
+
+def functions_without_types(path: Path) -> list[str]:
+    """Those that do not state what they return, but for kernels: numba finds their types itself."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    compiled = [ast.unparse(node) for node in nodes if isinstance(node, ast.Call) and "njit" in ast.unparse(node.func)]
+    untyped = []
+    for node in nodes:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.returns is None:
+            decorators = " ".join(ast.unparse(decorator) for decorator in node.decorator_list)
+            is_kernel = "njit" in decorators or any(call.endswith(f"({node.name})") for call in compiled)
+            untyped += [] if is_kernel else [f"{path}:{node.lineno} {node.name}"]
+    return untyped
+
+
+@pytest.mark.parametrize("folder", ["liex_lab", "pipelines", "dashboards"])
+def test_every_function_states_its_types(folder: str) -> None:
+    untyped = [line for path in sorted((REPOSITORY / folder).rglob("*.py")) for line in functions_without_types(path)]
+    assert not untyped, "\n".join(untyped)
