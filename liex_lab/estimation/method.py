@@ -41,6 +41,8 @@ class Method:
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
+    survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
+    pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card."""
@@ -52,6 +54,8 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
+        if plain.get("pruner"):
+            plain["pruner"] = GrowthPlan(**plain["pruner"])
         return Method(**plain)
 
 
@@ -66,6 +70,7 @@ METHODS = {
         keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
         metric_shrinkage=0.15, mean_shift_mm=0.0,
         top_k=10, top_tau=1.0, top_radius_mm=15.0,
+        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
     ),
     "paper": Method(
         variant="paper", rounds=3, n_candidates=40, training_candidates=6,
