@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings import synthetic, walking, windows
+from liex_lab.recordings.habits import MouseHabits
 from liex_lab.recordings.synthetic import SyntheticSession
 from liex_lab.recordings.windows import TrainingWindows
 
@@ -16,8 +17,11 @@ from liex_lab.recordings.windows import TrainingWindows
 class World(Protocol):
     """Where an animal's training and test data come from. Everything is drawn from seeds, in any order."""
 
-    skeleton: Skeleton
-    splits: tuple[str, ...]
+    @property
+    def skeleton(self) -> Skeleton: ...  # noqa: D102
+
+    @property
+    def splits(self) -> tuple[str, ...]: ...  # noqa: D102
 
     def training_blocks(
         self,
@@ -51,7 +55,7 @@ class MouseWorld:
 
     def training_blocks(self, seed: int, n_blocks: int, **settings: Any) -> Iterator[TrainingWindows]:
         """Blocks of training images."""
-        return windows.training_blocks(seed, n_blocks, self.skeleton, **settings)
+        return windows.training_blocks(seed, n_blocks, MouseHabits(self.skeleton), **settings)
 
     def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
         """The recordings of a split."""
@@ -59,7 +63,7 @@ class MouseWorld:
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
         """A mouse that walks, turns, rears and curls up."""
-        return walking.walking_session(seed, n_frames, skeleton=self.skeleton, **settings)
+        return walking.walking_session(seed, n_frames, habits=MouseHabits(self.skeleton), **settings)
 
 
 def world_of(skeleton: Skeleton) -> World:
