@@ -19,7 +19,8 @@ from liex_lab.geometry import SE3, so3
 Array = NDArray[np.float64]
 Tell = Callable[[float, str], None]  # share done, what is being done
 
-_ERROR_CAP_MM = 30.0  # a pose worse than this, at the reference length, is simply wrong; how wrong is not worth learning
+# at the reference length: a pose worse than this is simply wrong; how wrong is not worth learning
+_ERROR_CAP_MM = 30.0
 _FEW_JOINTS = 3
 _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape, draw_shapes, draw_tail_bends
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Body
 from liex_lab.recordings.postures import KINDS, SHARES, SIZE_RANGE, sample_postures
 from liex_lab.recordings.sensors import SENSORS, Sensor
 from liex_lab.recordings.stage import ARENA, Setting
@@ -55,10 +56,10 @@ class Habits(Protocol):
     @property
     def frame_ns(self) -> int: ...  # noqa: D102
 
-    def shapes(self, rng: np.random.Generator, family: str, n: int) -> BodyShape:
+    def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
         """N bodies of a family, see `body.shape.FAMILIES`."""
 
-    def postures(self, rng: np.random.Generator, size: Array, shape: BodyShape, camera_mm: Array) -> Postures:
+    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
         """A posture for each of n animals of the given sizes (n,) over home and shapes (n), anywhere on or above the
         floor, under cameras camera_mm (n,) above it.
         """
@@ -83,8 +84,9 @@ class MouseHabits:
         """N mice."""
         return draw_shapes(rng, self.skeleton, family, n)
 
-    def postures(self, rng: np.random.Generator, size: Array, shape: BodyShape, camera_mm: Array) -> Postures:
+    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
         """Mice that go about, curl up, rear, hunch and reach."""
+        assert isinstance(shape, BodyShape)
         kinds = rng.choice(len(KINDS), len(size), p=SHARES)
         pose, girth = sample_postures(rng, self.skeleton, len(size), size, shape, kinds)
         return Postures(pose, girth, kinds)

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
+from liex_lab.body.surface import Body, Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _stage
@@ -51,7 +50,7 @@ class Cast:
     spine_mm: float
     pose: Pose
     girth: Array
-    shape: BodyShape
+    shape: Body
     bends: Array | None
     things: Array
     shown: NDArray[np.bool_]
@@ -123,8 +122,8 @@ class SyntheticSession(Recording):
     ) -> SyntheticSession:
         """A session of independent postures and places: one camera, arena and animal, all drawn from the seed.
 
-        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws 0.9 to 1.1 of the skeleton's own. thing_share: of frames with another
-        object in view. See `Sensor.draw` for noise and erosion_px, `draw_shapes` for family.
+        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws it. thing_share: of frames with
+        another object in view. See `Sensor.draw` for noise and erosion_px, `draw_shapes` for family.
         """
         rng = np.random.default_rng(seed)
         habits = MouseHabits() if habits is None else habits
@@ -142,7 +141,7 @@ class SyntheticSession(Recording):
 
 
 def assemble(
-    rng: np.random.Generator, stage: Stage, sensor: Sensor, habits: Habits, spine_mm: float, shape: BodyShape,
+    rng: np.random.Generator, stage: Stage, sensor: Sensor, habits: Habits, spine_mm: float, shape: Body,
     pose: Pose, girth: Array, noise: float, erosion_px: int, thing_share: float, scatter: bool,
 ) -> Cast:  # fmt: skip
     """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things beside it."""
@@ -177,7 +176,8 @@ def _beside(
             outline = mesh[::3, :2] + shift
             gap = np.linalg.norm(outline[:, None] - own, axis=-1).min()
             # a hand reaches over the wall; anything else stands within
-            free = bool(gap > 8.0 * habits.setting.scale and (mesh[:, 2].max() > 0.6 * spine_mm or stage.room(shift) > 0))
+            within = mesh[:, 2].max() > 0.6 * spine_mm or stage.room(shift) > 0
+            free = bool(gap > 8.0 * habits.setting.scale and within)
             if free and not _covers(stage, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
                 things[i, :, :2] += shift
                 break

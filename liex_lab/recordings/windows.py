@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
-from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
+from liex_lab.body.surface import Body, Surface
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _stage
 from liex_lab.recordings._sensors import EROSION, NOISE, NORMAL
@@ -36,9 +34,10 @@ _THING_SHARE, _WALL_SHARE = 0.10, 0.35
 class TrainingWindows:
     """n windows of S x S pixels around an animal, and the truth behind each.
 
-    depth, background (n, S, S) uint16 in steps of unit_mm, 0 = unread: the picture, and the still scene as a recording
-    would have taught it. origin (n, 2) int32: the full picture's pixel (u, v) of window pixel (0, 0); intrinsics (n, 4): fx, fy,
-    cx, cy of the full picture. floor, floor_true (n, 3): 1 / z = a u + b v + c in its pixels, as estimated and exact.
+    depth, background (n, S, S) uint16, steps of unit_mm, 0 = unread: the picture, and the still scene as a recording
+    would have taught it. origin (n, 2) int32: the full picture's pixel (u, v) of window pixel (0, 0); intrinsics (n,
+    4): fx, fy, cx, cy of the full picture. floor, floor_true (n, 3): 1 / z = a u + b v + c in its pixels, as estimated
+    and exact.
     T_arena_camera (n), exact. root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones;
     joints_mm (n, J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
     whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture.
@@ -101,7 +100,7 @@ class _Looks:
     T_arena_camera: SE3
     parameters: Array
     size: Array
-    shape: BodyShape
+    shape: Body
     rough: Array
     floor_error: Array
 
@@ -146,9 +145,10 @@ def training_blocks(
 ) -> Iterator[TrainingWindows]:
     """Blocks of `BLOCK` training images from block `first` on, bit for bit the same for a seed, whatever the threads.
 
-    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see `Sensor.draw`; a share `degraded_share` of the mini-sessions has 1 to
-    2.5 times the noise and half of those an outline eroded by a pixel. spine_mm: the animals' mean size, None the
-    skeleton's own; window_px must hold the animal with a margin: 144 does up to mice of 70 mm.
+    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see `Sensor.draw`; a share
+    `degraded_share` of the mini-sessions has 1 to 2.5 times the noise and half of those an outline eroded by a pixel.
+    spine_mm: the animals' mean size, None the skeleton's own; window_px must hold the animal with a margin: 144 does up
+    to mice of 70 mm.
     """
     habits = MouseHabits() if habits is None else habits
     surface = Surface.of(habits.skeleton)
@@ -276,7 +276,8 @@ def _draw_neighbours(
     toward = np.stack([np.cos(way), np.sin(way)], axis=-1)
     reach = np.einsum("nvk,nk->nv", trunk[..., :2], toward).max(axis=1)
     middle = trunk[..., :2].mean(axis=1)
-    clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1]) + scale * rng.uniform(5.0, 40.0, n)
+    clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1])
+    clear = clear + scale * rng.uniform(5.0, 40.0, n)
     lift = rng.uniform(0.0, 1.0, n) * np.maximum(trunk[..., 2].max(axis=1) - radii[:, 2], 0.0) if floats else 0.0
     centre = np.concatenate([middle + clear[:, None] * toward, (radii[:, 2] + lift)[:, None]], axis=-1)
     power = np.where(rng.random(n) < 0.5, 2.0, 10.0)
