@@ -157,7 +157,7 @@ def train_pruner(
 
     The base has not moved since its own rounds, so the cascade's final candidates are its examples, too.
     """
-    plan, method = cascade.method.pruner, cascade.method
+    plan = cascade.method.pruner
     if plan is None:
         return None
     error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
