@@ -78,10 +78,17 @@ class OniWriter:
         self._codec, self._unit_mm, self._exact = codec, unit_mm, exact
         self._entries: list[tuple[int, int]] = []  # time in µs and position of every frame
         self._file: IO[bytes] = path.open("wb")
+        try:
+            self._begin(camera)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _begin(self, camera: Camera) -> None:
         self._file.write(records.FILE_HEADER.pack(records.FILE_MAGIC, *records.VERSION, _UNKNOWN_TIME, _NODE))
         self._node_at = self._file.tell()
         self._write(records.NODE, self._node_fields(_UNKNOWN_COUNT, _UNKNOWN_TIME, 0))
-        for kind, name, value in _properties(camera, _PIXEL_FORMATS[unit_mm]):
+        for kind, name, value in _properties(camera, _PIXEL_FORMATS[self._unit_mm]):
             self._write(kind, records.text(name) + struct.pack("<I", len(value)) + value)
         self._write(records.NODE_READY)
         self._write(records.DATA_BEGIN, struct.pack("<IQ", _UNKNOWN_COUNT, _UNKNOWN_TIME))
@@ -118,9 +125,10 @@ class OniWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if kind is None:
-            self.close()
-        else:
+        try:
+            if kind is None:
+                self.close()
+        finally:
             self._file.close()
 
     def _write(self, kind: int, fields: bytes = b"", payload: bytes = b"", undoes: int = 0, node: int = _NODE) -> None:
