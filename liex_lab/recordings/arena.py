@@ -68,6 +68,11 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     """
     from sklearn.linear_model import LinearRegression, RANSACRegressor
 
+    if camera.distortion is not None:
+        raise EstimationError(
+            "a floor is found in pictures of a straight lens, but this camera's distortion was not undone; pass the "
+            "recording through liex_lab.recordings.rectify.rectified"
+        )
     rows, columns = np.nonzero(background > 0)
     if len(rows) < 500:
         raise EstimationError(
