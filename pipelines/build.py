@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.recordings.foreground import Scene
     from liex_lab.recordings.recording import Recording
+    from liex_lab.recordings.walls import Arena
+    from liex_lab.recordings.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
     from liex_lab.water import Water
@@ -89,6 +92,7 @@ def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     from liex_lab.recordings.foreground import Scene
     from liex_lab.tracking.tracker import FrameTracker
 
+    build_zones(plan)  # a slip in their file is told before any work is done
     estimator = build_estimator(plan)
     animal, foreground = plan.animal, plan.foreground
     scene, sample = Scene.learn(
@@ -105,6 +109,7 @@ def build_provenance(
     from liex_lab.sessions import Provenance
 
     recording.digest(progress)  # kept by the recording; the longest wait here, so it is the one that is shown
+    arena, zones = build_arena(tracker.scene, plan)
     origin = {"plan": "stated in the plan", "recording": "estimated over the recording"}[tracker.size_origin]
     return Provenance.of(
         recording,
@@ -113,7 +118,26 @@ def build_provenance(
         plan,
         model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
         animal_size={"spine_mm": round(tracker.spine_mm, 3), "origin": origin, "girth": round(tracker.body.girth, 3)},
+        arena=arena,
+        zones=zones,
     )
+
+
+def build_arena(scene: Scene, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+    """The shape of the arena, and the plan's zones in it."""
+    from liex_lab.recordings.arena import Floor
+    from liex_lab.recordings.walls import find_arena
+
+    floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
+    arena = find_arena(scene.background, floor, scene.grid)
+    return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
+
+
+def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
+    """The zones of the plan, as they were drawn."""
+    from liex_lab.recordings.zones import read_zones
+
+    return read_zones(plan.arena.zones) if plan.arena.zones else ()
 
 
 def build_rules(plan: Plan) -> MouseRules:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from liex_lab.camera import Camera
 from liex_lab.recordings.arena import Floor
-from liex_lab.recordings.background import floor_patch
 
 Array = NDArray[np.float64]
 
@@ -80,6 +79,9 @@ class Arena:
         return known.get(self.kind, lambda: self.kind)()
 
 
+UNKNOWN = Arena(OPEN)
+
+
 def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) -> Arena:
     """The shape of the floor's outline in an empty scene (H, W) mm."""
     points, pixels, share = _outline(background, floor, camera)
@@ -104,6 +106,8 @@ def _outline(background: NDArray[np.float32], floor: Floor, camera: Camera) -> t
     A point's place is that of the reading there, for the foot of a wall stands on the wall's own line at any height.
     """
     import cv2
+
+    from liex_lab.recordings.background import floor_patch
 
     height, width = background.shape
     patch = floor_patch(background, floor.depth(width, height))
