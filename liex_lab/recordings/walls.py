@@ -21,6 +21,7 @@ _FIT_SHARE, _FIT_MM = 0.025, 4.0  # an outline this near to a shape, of its size
 _BAND_MM = 60.0  # beyond the outline, in which a wall is looked for
 _WALL_MM = 20.0  # and how high it has to be there, or how deep a drop
 _SIDE_SHARE = 0.3  # of each side of a rectangle must be in view
+_N_CIRCLES = 150  # tried
 _MAX_POINTS = 720  # of the outline
 
 
@@ -142,15 +143,27 @@ def _share_in_view(hull: Array, width: int, height: int) -> float:
 
 
 def fit_circle(points: Array) -> tuple[Array, float, float]:
-    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of them may be astray."""
-    some = points
-    for _ in range(6):
+    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of them may be astray.
+
+    First, out of circles through three points each, the one with the least median distance; then least squares.
+    """
+    a, b, c = np.moveaxis(points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0)
+    p, q = b - a, c - a
+    twice = 2.0 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    usable = np.abs(twice) > 1e-9
+    p, q, a, twice = p[usable], q[usable], a[usable], twice[usable]
+    pp, qq = (p * p).sum(axis=1), (q * q).sum(axis=1)
+    off = np.stack([q[:, 1] * pp - p[:, 1] * qq, p[:, 0] * qq - q[:, 0] * pp], axis=1) / twice[:, None]
+    distance = np.linalg.norm(points[:, None] - (a + off), axis=2) - np.linalg.norm(off, axis=1)
+    best = np.abs(distance).T[np.median(np.abs(distance), axis=0).argmin()]
+    some = points[best <= 3.0 * np.median(best) + 1e-6]
+    for _ in range(3):
         design = np.concatenate([2.0 * some, np.ones((len(some), 1))], axis=1)
         x, y, c = np.linalg.lstsq(design, (some**2).sum(axis=1), rcond=None)[0]
         centre, radius = np.array([x, y]), float(np.sqrt(max(c + x * x + y * y, 1e-9)))
-        off = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
-        some = points[off <= max(3.0 * float(np.median(off)), 1e-6)]
-    return centre, radius, float(np.median(off))
+        best = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        some = points[best <= 3.0 * np.median(best) + 1e-6]
+    return centre, radius, float(np.median(best))
 
 
 def fit_rectangle(points: Array) -> tuple[Array, Array, float, float]:

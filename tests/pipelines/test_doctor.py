@@ -126,6 +126,8 @@ def test_jitter_and_missing_frames_are_told_apart(tmp_path: Path) -> None:
     findings = examined(write_png_folder(tmp_path / "r", frames(20), CAMERA, times.tolist()))
     assert (findings["n_gaps"], findings["n_missing"]) == (1, 3)
     assert findings["jitter_ms"] == pytest.approx(np.sqrt(2) * 6 / np.sqrt(12), rel=0.4)
+
+
 def test_a_primesense_recording_says_where_its_intrinsics_come_from(tmp_path: Path) -> None:
     findings = examined(write_oni_file(tmp_path / "r.oni", frames(), CAMERA))
     assert (findings["format"], findings["n_frames"], findings["problems"]) == ("oni", 12, [])
