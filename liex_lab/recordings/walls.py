@@ -56,6 +56,15 @@ class Arena:
         beyond = np.linalg.norm(np.maximum(-inside, 0.0), axis=-1)
         return np.asarray(np.where(beyond > 0, -beyond, inside.min(axis=-1)))
 
+    def outline_mm(self) -> Array:
+        """Corners (n, 2) mm of its outline, for drawing; (0, 2) for an unknown shape."""
+        if self.centre_mm is None:
+            return np.empty((0, 2))
+        if self.radius_mm is not None:
+            return np.array(self.centre_mm) + self.radius_mm * circle_points(96)
+        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * np.array(self.half_mm)
+        return np.asarray(np.array(self.centre_mm) + corners @ _turn(self.yaw_rad or 0.0).T)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json, rounded to what can be known; what is unknown is left out."""
         numbers = {
@@ -227,6 +236,12 @@ def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels:
         return "unknown"
     highest, lowest = np.nanmax(height[:, known], axis=0), np.nanmin(height[:, known], axis=0)
     return "wall" if np.median(highest) > _WALL_MM else "drop" if np.median(lowest) < -_WALL_MM else "unknown"
+
+
+def circle_points(n: int) -> Array:
+    """Points (n, 2) of the unit circle."""
+    angle = 2.0 * np.pi * np.arange(n) / n
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _turn(yaw: float) -> Array:
