@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from liex_lab.pipelines.build import build_zones
 from numpy.typing import NDArray
 
-from liex_lab.errors import EstimationError
+from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class SceneLook:
 
     def at_scene(self) -> None:
         """Floor, noise, arena, water; and then the animal."""
-        from liex_lab.recordings.arena import find_floor
+        from liex_lab.recordings.arena import Floor, find_floor
         from liex_lab.recordings.background import floor_patch, floor_region, learn_background
         from liex_lab.recordings.walls import find_arena
 
@@ -63,7 +64,15 @@ class SceneLook:
         read = [frame[region] > 0 for frame in self.sample if frame.any()]
         unread = 1.0 - float(np.mean(read))
         self.facts |= {"noise_mm": noise, "floor_unread_share": unread}
-        self.facts["arena"] = find_arena(background, floor, grid).to_dict()
+        arena = find_arena(background, floor, grid)
+        self.facts["arena"] = arena.to_dict()
+        try:
+            for zone in build_zones(self.plan):
+                zone.placed(
+                    self.seen.camera, Floor.from_plane(floor.normal, floor.distance_mm, self.seen.camera), arena
+                )
+        except PlanError as error:
+            self.problems.append(str(error))
         if unread > _MUCH_UNREAD:
             self.problems.append(
                 f"{unread:.0%} of the pixels on the floor are unread, more than {_MUCH_UNREAD:.0%}; check the camera's "

@@ -119,6 +119,13 @@ def test_an_empty_arena_is_told(tmp_path: Path) -> None:
     assert any("no animal was found" in problem for problem in findings["problems"])
 
 
+def test_a_slip_in_the_zones_is_told(tmp_path: Path) -> None:
+    (tmp_path / "zones.toml").write_text('[[zones]]\nname = "a"\ncircle = { centre = [0, 0], radius = -1 }')
+    path = plates(tmp_path / "r", walk(60.0))
+    assert "a positive number, got -1" in problems(path, f"arena.zones={tmp_path / 'zones.toml'}")
+    assert "there is no file" in problems(path, "arena.zones=none.toml")
+
+
 def test_jitter_and_missing_frames_are_told_apart(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     times = np.array(even_times(20)) + rng.integers(-3_000_000, 3_000_000, 20)
