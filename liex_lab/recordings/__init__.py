@@ -18,8 +18,9 @@ _READS = (
     "or an MCAP file with Foxglove depth pictures"
 )
 _ARCHIVES = (".tar.gz", ".tgz", ".tar")
-_PICTURES = (".png", ".tif", ".tiff")
-_VIDEOS = ("depth.avi", "depth.mkv")
+_PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
+_VIDEOS = (".avi", ".mkv")
+_MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; export its depth maps as TIFF from "
     "RxLive and give their folder"
@@ -30,9 +31,9 @@ _EIGHT_BIT = (
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
-    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".avi", ".mov", ".webm"), _EIGHT_BIT),
+    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT),
     **dict.fromkeys(
-        (".oni", ".bag", ".db3", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET
+        (".oni", ".bag", ".db3", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET
     ),
 }
 
@@ -86,7 +87,7 @@ def _open(path: Path, camera: Lens | None, fps: float | None, topic: str | None,
         from liex_lab.recordings.images import open_images
 
         return open_images(path, camera, fps, progress)
-    if name.endswith((*_ARCHIVES, ".dat")):
+    if name.endswith((*_ARCHIVES, *_VIDEOS, ".dat")):
         from liex_lab.recordings.moseq import open_moseq
 
         return open_moseq(path, camera, fps, progress)
@@ -104,14 +105,10 @@ def _open_folder(
     inside = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     if not inside:
         raise RecordingError(f"{folder} is an empty folder; give {_READS}")
-    if "depth.dat" in inside:
+    if any(name in inside for name in _MOSEQ):
         from liex_lab.recordings.moseq import open_moseq
 
         return open_moseq(folder, camera, fps, progress)
-    if video := next((name for name in _VIDEOS if name in inside), None):
-        from liex_lab.recordings.moseq import video_error
-
-        raise video_error(folder, video)
     if "session.json" in inside:
         raise RecordingError(
             f"{folder} is a session, the result of a run; look at it with `liex show`, or give a recording"
@@ -120,7 +117,7 @@ def _open_folder(
         from liex_lab.recordings.images import open_images
 
         return open_images(folder, camera, fps, progress)
-    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap"))]
+    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, *_VIDEOS, ".mcap"))]
     if len(files) == 1:
         return _open(folder / files[0], camera, fps, topic, progress)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]

@@ -23,7 +23,7 @@ from liex_lab.recordings._png import decode_png, png_size
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting
 from liex_lab.recordings.frame import Depth, depth_mm
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.times import increasing, start_of_clock
+from liex_lab.recordings.times import settle, start_of_clock
 
 _RAW, _COMPRESSED, _CALIBRATION = "foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CameraCalibration"
 _IMAGES: dict[str, Any] = {_RAW: RawImage, _COMPRESSED: CompressedImage}
@@ -96,14 +96,14 @@ def _open(path: Path, index: McapIndex, camera: Lens | None, topic: str | None, 
     # A writer may flush its topics out of turn; the order of logging is the file's own order.
     order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
     chosen.places = [chosen.places[i] for i in order]
-    times, moved = increasing(_stamps(chosen, order, problems))
-    problems += [moved] if moved else []
-    start = start_of_clock(int(times[0]))
+    settled = settle(_stamps(chosen, order, problems))
+    problems += [settled.problem] if settled.problem else []
+    start = start_of_clock(int(settled.times_ns[0]))
     metadata = ({"session_start_time": start} if start else {}) | camera_file.metadata
     return Recording(
-        name=path.resolve().stem, format="mcap", camera=the_camera, times_ns=times,
+        name=path.resolve().stem, format="mcap", camera=the_camera, times_ns=settled.times_ns,
         read=McapFrames(index, chosen, camera_file, problems).read, sources=[path], problems=problems,
-        truncated=not index.whole, metadata=metadata, close=index.close,
+        truncated=not index.whole, metadata=metadata, close=index.close, faults=settled.faults,
     )  # fmt: skip
 
 
