@@ -7,6 +7,7 @@ from pathlib import Path
 from liex_lab.camera import Lens
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.progress import Progress, silent
+from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.times import Gap
@@ -14,16 +15,22 @@ from liex_lab.recordings.times import Gap
 __all__ = ["DepthFrame", "Gap", "Recording", "open_recording"]
 
 _READS = (
-    "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz) "
-    "or an MCAP file with Foxglove depth pictures"
+    "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix camera with a "
+    "raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or .tar.gz) or an MCAP file with "
+    "Foxglove depth pictures"
 )
 _ARCHIVES = (".tar.gz", ".tgz", ".tar")
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
+_CLOUD = (
+    "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says what its numbers "
+    'mean, with a line such as profile = "raytrix-points-mm", and give the folder'
+)
 _VIDEOS = (".avi", ".mkv")
 _MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
 _RAYTRIX = (
-    "is in Raytrix's own format, which only the maker's licensed software reads; export its depth maps as TIFF from "
-    "RxLive and give their folder"
+    "is in Raytrix's own format, which only the maker's licensed software reads; compute metric depth in RxLive, save "
+    "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, write a raytrix.toml "
+    'with the line profile = "raytrix-f32-negative-mm" into it, and give that folder'
 )
 _EIGHT_BIT = (
     "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give the depth itself"
@@ -31,10 +38,9 @@ _EIGHT_BIT = (
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
+    **dict.fromkeys((".ply", ".xyz"), _CLOUD),
     **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT),
-    **dict.fromkeys(
-        (".oni", ".bag", ".db3", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET
-    ),
+    **dict.fromkeys((".oni", ".bag", ".db3", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
 
 
@@ -83,6 +89,10 @@ def _open(path: Path, camera: Lens | None, fps: float | None, topic: str | None,
         raise RecordingError(f"there is no file or folder {path}; check the spelling")
     if path.is_dir():
         return _open_folder(path, camera, fps, topic, progress)
+    from liex_lab.recordings import nyu
+
+    if nyu.looks_like_nyu(path.parent, [path.name]):
+        return nyu.open_nyu(path, camera, fps, progress)
     if name.endswith(_PICTURES):
         from liex_lab.recordings.images import open_images
 
@@ -109,6 +119,14 @@ def _open_folder(
         from liex_lab.recordings.moseq import open_moseq
 
         return open_moseq(folder, camera, fps, progress)
+    from liex_lab.recordings import nyu, raytrix
+
+    if raytrix.PROFILE_FILE in inside:
+        return raytrix.open_raytrix(folder, camera, fps, progress)
+    if raytrix.looks_like_raytrix(inside) and CAMERA_FILE not in inside:
+        raise raytrix.no_profile_error(folder)
+    if nyu.looks_like_nyu(folder, inside):
+        return nyu.open_nyu(folder, camera, fps, progress)
     if "session.json" in inside:
         raise RecordingError(
             f"{folder} is a session, the result of a run; look at it with `liex show`, or give a recording"

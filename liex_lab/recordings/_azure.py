@@ -50,7 +50,9 @@ def read_calibration(data: bytes) -> FactoryLens | None:
     """The depth camera in the JSON that recorders attach to their files; None where it does not tell one."""
     try:
         cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
-        depth = next(c for c in cameras if c.get("Location") == _DEPTH_CAMERA[0] or c.get("Purpose") == _DEPTH_CAMERA[1])
+        depth = next(
+            c for c in cameras if c.get("Location") == _DEPTH_CAMERA[0] or c.get("Purpose") == _DEPTH_CAMERA[1]
+        )
         values = [float(value) for value in depth["Intrinsics"]["ModelParameters"]]
     except (ValueError, KeyError, TypeError, AttributeError, StopIteration, RecursionError):
         return None

@@ -26,7 +26,16 @@ _PASSED_OVER = (
     0x1A45DFA3, 0x114D9B74, 0x1C53BB6B, 0x1043A770, 0xEC, 0xBF,  # file head, seek head, cues, chapters, void, CRC
     0xA7, 0xAB, 0x5854, 0x9B, 0xFB, 0xFA, 0xA4, 0x75A1, 0x75A2, 0x8E,  # within clusters and block groups
 )  # fmt: skip
-_NUMBER, _UID, _TYPE, _NAME, _CODEC, _PRIVATE, _VIDEO, _ENCODINGS = 0xD7, 0x73C5, 0x83, 0x536E, 0x86, 0x63A2, 0xE0, 0x6D80
+_NUMBER, _UID, _TYPE, _NAME, _CODEC, _PRIVATE, _VIDEO, _ENCODINGS = (
+    0xD7,
+    0x73C5,
+    0x83,
+    0x536E,
+    0x86,
+    0x63A2,
+    0xE0,
+    0x6D80,
+)
 _WIDTH, _HEIGHT, _COLOUR_SPACE = 0xB0, 0xBA, 0x2EB524
 _HEADER_BYTES = 1 << 22
 _LACING = 0x06  # flags of a block that holds several pictures, which no recorder of depth makes

@@ -56,7 +56,7 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
 
 def _header(head: bytes) -> _Header | None:
     match = _HEADER.match(head)
-    return _Header(*(int(part) for part in match.groups()), match.end()) if match else None
+    return _Header(int(match[1]), int(match[2]), int(match[3]), match.end()) if match else None
 
 
 def _look(path: Path) -> Look:

@@ -1,4 +1,4 @@
-"""Pictures of one size in order, stored values only: what a stack of any kind promises, and one made of single files."""
+"""Pictures of one size in order, as stored: what a stack of any kind promises, and one made of single files."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -101,19 +101,23 @@ def assemble(
     decode: Callable[[Stored], Depth],
     camera: Lens | None,
     fps: float | None,
+    beside: Sequence[Path] = (),
 ) -> Recording:
-    """The recording of a stack of pictures with its camera and times. decode: stored values -> depth mm."""
+    """The recording of a stack of pictures with its camera and times.
+
+    decode: stored values -> depth (H, W) mm; beside: further files that say how to read the pictures.
+    """
     folder = path if path.is_dir() else path.parent
     the_camera = camera_file.camera(stack.width, stack.height, camera)
     problems = [*camera_file.problems, *stack.problems, *_say_cut(stack)]
     settled, start = _times(folder, files, camera_file, fps, len(stack), problems)
     metadata = ({"session_start_time": start} if start else {}) | camera_file.metadata
     _refuse_negative(stack, decode, camera_file)
-    beside = [folder / CAMERA_FILE, camera_file.path, folder / camera_file.timestamps]
+    told_in = [folder / CAMERA_FILE, folder / camera_file.timestamps, *beside]
     return Recording(
         name=path.resolve().stem if path.is_file() else path.resolve().name, format=format, camera=the_camera,
         times_ns=settled.times_ns, read=Pictures(stack, decode, problems).read,
-        sources=[*files, *(file for file in dict.fromkeys(beside) if file.is_file())], problems=problems,
+        sources=[*files, *(file for file in told_in if file.is_file())], problems=problems,
         truncated=stack.truncated, n_whole=sum(stack.whole[: len(settled.times_ns)]), metadata=metadata,
         close=stack.close, faults=settled.faults,
     )  # fmt: skip

@@ -231,7 +231,9 @@ class _Session:
         if kind == beside.AZURE and mode is not None:
             self._say_typical(f"Azure Kinect in the mode {mode.name}")
             return azure_camera(mode, None)
-        whose = f"the camera {self.metadata.camera_name!r}" if self.metadata.camera_name else "a camera that is not known"
+        whose = (
+            f"the camera {self.metadata.camera_name!r}" if self.metadata.camera_name else "a camera that is not known"
+        )
         raise RecordingError(
             f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a camera.toml beside it with "
             "[camera], fx = ..., fy = ..., cx = ... and cy = ... in pixels"
@@ -273,7 +275,9 @@ class _Session:
                 )
             return own.times_ns
         origin = "as stated" if hz else "which is the usual rate; state fps if yours differs"
-        self.problems.append(f"there are no time stamps, so a constant {hz or _NOMINAL_HZ:g} frames/s was assumed, {origin}")
+        self.problems.append(
+            f"there are no time stamps, so a constant {hz or _NOMINAL_HZ:g} frames/s was assumed, {origin}"
+        )
         return from_rate(n, hz or _NOMINAL_HZ)
 
     def _continue(self, stamps: Times, n: int) -> Times:

@@ -41,9 +41,14 @@ class NyuJoints:
     xyz: NDArray[np.float64]
 
 
-def looks_like_nyu(names: list[str]) -> bool:
-    """Whether a folder's files are those of the NYU data set."""
-    return any(_NAME.fullmatch(name) for name in names)
+def looks_like_nyu(folder: Path, names: list[str]) -> bool:
+    """Whether a folder's files are those of the NYU data set: so named, and in colour."""
+    first = next((name for name in names if _NAME.fullmatch(name)), None)
+    if first is None:
+        return False
+    with (folder / first).open("rb") as file:
+        head = file.read(26)
+    return head[24:26] == b"\x08\x02"
 
 
 def open_nyu(
@@ -67,7 +72,9 @@ def _pictures(folder: Path, view: int) -> list[Path]:
     files = [path for path, match in named.items() if match and int(match[1]) == view]
     real = [path for path in files if path.name.startswith("depth")] or files
     if not real:
-        raise RecordingError(f"{folder} holds no pictures depth_{view}_0000001.png of the NYU data set; give another folder")
+        raise RecordingError(
+            f"{folder} holds no pictures depth_{view}_0000001.png of the NYU data set; give another folder"
+        )
     return sorted(real, key=lambda path: natural_key(path.name))
 
 

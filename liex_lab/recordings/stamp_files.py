@@ -56,7 +56,7 @@ def read_csv_times(path: Path, column: str | int | None = None, unit: str | None
     ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(name)
     if ns_per_unit is None:
         raise RecordingError(
-            f"the unit of the column {name!r} in {path} is not known; write time_unit = \"s\", \"ms\", \"us\" or "
+            f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", "us" or '
             '"ns" beside time_column in camera.toml'
         )
     return _parse(path, rows[at + 1 :], header.index(name), ns_per_unit)
@@ -89,7 +89,7 @@ def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
 
 def _date_ns(parts: tuple[str, ...]) -> int | None:
     try:
-        moment = datetime(*(int(part) for part in parts[:6]), tzinfo=UTC)  # type: ignore[arg-type]
+        moment = datetime.strptime("".join(parts[:6]), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
     except ValueError:
         return None
     return int(moment.timestamp()) * 10**9 + int(parts[6].ljust(9, "0"))

@@ -112,8 +112,8 @@ def settle(times_ns: Times) -> Settled:
         first = int(jumps[0])
         back_s = float(times_ns[first - 1] - times_ns[first]) / 1e9
         sentences.append(
-            f"the clock jumps back in {len(jumps)} places, the first by {back_s:.3f} s at frame {first}; time was taken "
-            "to go on there as after one missing frame"
+            f"the clock jumps back in {len(jumps)} places, the first by {back_s:.3f} s at frame {first}; time was "
+            "taken to go on there as after one missing frame"
         )
     if moved.any():
         largest_ms = float(np.abs(times - joined).max()) / 1e6
