@@ -65,8 +65,8 @@ class Profile(BaseModel):
         if self.evidence.lower().startswith(_CONFIRMED):
             return None
         return (
-            f"depth is read through the profile {self.name!r}, which rests on this: {self.evidence}; record a step of "
-            f'known height, and write evidence = "confirmed with a ruler" into {PROFILE_FILE} once it measures right'
+            f"depth is read through the profile {self.name!r}, which is not confirmed ({self.evidence}); record a step "
+            f'of known height, and write evidence = "confirmed with a ruler" into {PROFILE_FILE} once it measures right'
         )
 
     @property

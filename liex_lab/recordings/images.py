@@ -199,7 +199,7 @@ def _times(
         hz = rate(fps, "the call") or camera_file.fps
         if hz is None:
             raise _no_times(folder, camera_file)
-        problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed as stated")
+        problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
         times, moment = from_rate(n, hz), False
     settled = settle(times[:n])
     problems += [settled.problem] if settled.problem else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,7 +17,7 @@ from liex_lab.camera import Camera
 from liex_lab.errors import RecordingError
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.times import Gap, find_faults, find_gaps, median_step
+from liex_lab.recordings.times import FAULTS, JUMPED, Gap, find_faults, find_gaps, median_step
 
 Times = NDArray[np.int64]
 
@@ -101,12 +102,18 @@ class Recording:
     @property
     def gaps(self) -> list[Gap]:
         """Where the camera left out frames: steps of more than 1.5 median steps."""
-        return find_gaps(self.times_ns, self._step_ns)
+        found = find_gaps(self.times_ns, self._step_ns)
+        return [replace(gap, reason=JUMPED) if self._jumped(gap) else gap for gap in found]
+
+    def _jumped(self, gap: Gap) -> bool:
+        return FAULTS[self._faults[gap.start_frame]] == JUMPED
 
     @property
     def faults(self) -> list[Gap]:
-        """The frames whose stamps were repeated, out of order, or of a clock that jumped, and so had to be moved."""
-        return find_faults(self.times_ns, self._step_ns, self._faults)
+        """The frames whose stamps had to be moved: repeated, out of order, or wild; clock jumps are among the gaps."""
+        joined = {gap.start_frame for gap in self.gaps if self._jumped(gap)}
+        found = find_faults(self.times_ns, self._step_ns, self._faults)
+        return [fault for fault in found if fault.start_frame not in joined]
 
     def __len__(self) -> int:
         return len(self.times_ns)

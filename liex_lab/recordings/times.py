@@ -35,8 +35,9 @@ class Gap:
     reason: str = "camera_dropped"
 
 
-FAULTS = ("", "stamp_repeated", "stamp_out_of_order", "clock_jumped")  # what `Settled.faults` counts
-_REPEATED, _OUT_OF_ORDER, _JUMPED = 1, 2, 3
+JUMPED = "clock_jumped"
+FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `Settled.faults` counts
+_REPEATED, _OUT_OF_ORDER, _JUMPED = 1, 2, 3  # their places in it
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
             start_ns=int(times_ns[i]) + step_ns,
             stop_ns=int(times_ns[i + 1]),
             n_frames_missing=round(int(dt[i]) / step_ns) - 1,
-            reason="clock_jumped" if dt[i] > CLOCK_JUMP_NS else "camera_dropped",
+            reason=JUMPED if dt[i] > CLOCK_JUMP_NS else "camera_dropped",
         )
         for i in np.flatnonzero(dt > GAP_FACTOR * step_ns)
     ]

@@ -36,9 +36,10 @@ class Provenance:
     """What is known about a recording before its first frame is written.
 
     name: the session's id; individual: the animal's name in it; T_arena_camera and floor_distance_mm: the camera's
-    place above the floor; input_sha256: of the recording's bytes; plan_toml: the plan as resolved; n_frames: expected,
-    None when unknown; gaps: what the camera did not deliver; problems: sentences about the recording; subject: any of
-    subject_id, group, cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin.
+    place above the floor; input_sha256: of the recording's bytes; profile: how its stored numbers were read, where a
+    profile says so; plan_toml: the plan as resolved; n_frames: expected, None when unknown; gaps: what the camera did
+    not deliver, and stamps that were moved; problems: sentences about the recording; subject: any of subject_id, group,
+    cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Provenance:
     input_sha256: str
     plan_toml: str = ""
     format: str = ""
+    profile: dict[str, Any] = field(default_factory=dict)
     individual: str = "animal_1"
     n_frames: int | None = None
     gaps: Sequence[Gap] = ()
@@ -68,7 +70,7 @@ class Provenance:
             "name": recording.name, "skeleton": skeleton, "camera": recording.camera,
             "T_arena_camera": floor.T_arena_camera, "floor_distance_mm": floor.distance_mm,
             "input_sha256": recording.digest(), "plan_toml": plan.to_toml(), "format": recording.format,
-            "individual": stated.individual, "n_frames": len(recording), "gaps": recording.gaps,
+            "profile": dict(told.get("profile", {})), "individual": stated.individual, "n_frames": len(recording), "gaps": [*recording.gaps, *recording.faults],
             "problems": list(recording.problems), "truncated": recording.truncated,
             "subject": {name: str(value) for name, value in subject.items() if value},
             "session_start_time": stated.session_start_time or told.get("session_start_time") or "",
@@ -104,7 +106,7 @@ class Provenance:
             "session_start_time": self.session_start_time or None,
             "versions": versions(),
             "input": {"name": self.name, "format": self.format, "sha256": self.input_sha256,
-                      "truncated": self.truncated},
+                      "truncated": self.truncated, **({"profile": self.profile} if self.profile else {})},
             "plan": plan_table(self.plan_toml),
             "camera": {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist(),
                        "floor_distance_mm": float(self.floor_distance_mm), "calibration_hash": self.calibration_hash},
