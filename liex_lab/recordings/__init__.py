@@ -123,7 +123,7 @@ def _open_folder(
 
     if raytrix.PROFILE_FILE in inside:
         return raytrix.open_raytrix(folder, camera, fps, progress)
-    if raytrix.looks_like_raytrix(inside) and CAMERA_FILE not in inside:
+    if raytrix.looks_like_raytrix(folder, inside) and CAMERA_FILE not in inside:
         raise raytrix.no_profile_error(folder)
     if nyu.looks_like_nyu(folder, inside):
         return nyu.open_nyu(folder, camera, fps, progress)

@@ -149,4 +149,5 @@ def _read_ply(path: Path) -> Points | None:
     if len(raw) < header.n * row.itemsize:
         return None
     vertices = np.frombuffer(raw, row)
-    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    with np.errstate(invalid="ignore"):  # damage may hold any bits, also those of a NaN that signals
+        return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)

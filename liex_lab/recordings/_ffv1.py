@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import av
@@ -59,27 +60,26 @@ class Ffv1:
     def __init__(self, width: int, height: int, private: bytes) -> None:
         self._size, self._private = (width, height), private
         self._table = crc_table()
-        self._summed: bool | None = None  # whether this stream has check sums; the first picture tells
-        self._codec = self._new()
+        self._summed = False  # whether this stream has check sums; its pictures tell
+        self._codec = self.fresh()
 
-    def _new(self) -> Any:
+    def fresh(self) -> Any:
+        """A decoder that has seen no picture."""
         codec: Any = av.CodecContext.create("ffv1", "r")
         codec.width, codec.height = self._size
         codec.extradata = self._private or None
-        codec.thread_count = 1  # frames stay in step with packets, and other work has the other cores
         return codec
 
     def decode(self, data: bytes) -> NDArray[np.uint16] | None:
         """Stored values (H, W); None where the picture is damaged. The next one must then be a key picture."""
         agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
-        if self._summed is None:
-            self._summed = bool(agree)
+        self._summed = self._summed or agree  # chance agrees once in four thousand million times
         if self._summed and not agree:
             return None
         try:
             frames = self._codec.decode(av.Packet(data))
         except av.FFmpegError:
-            self._codec = self._new()
+            self._codec = self.fresh()
             return None
         if len(frames) != 1:
             return None
@@ -88,16 +88,17 @@ class Ffv1:
         picture: NDArray[Any] = frames[0].to_ndarray()
         return picture.astype(np.uint16, copy=False)
 
-    def require_depth(self, data: bytes, where: str) -> None:
-        """Refuse a stream whose first picture, `data`, decodes to something else than 16-bit grey."""
-        codec = self._new()
+
+def require_depth(stream: Ffv1, keys: Iterable[bytes], where: str) -> None:
+    """Refuse a stream none of whose key pictures `keys` decodes, or which decode to something else than 16-bit grey."""
+    for data in keys:
         try:
-            frames = codec.decode(av.Packet(data))
-        except av.FFmpegError as error:
-            raise RecordingError(
-                f"the first picture of {where} cannot be decoded ({error.strerror}); copy it again"
-            ) from None
+            frames = stream.fresh().decode(av.Packet(data))
+        except av.FFmpegError:
+            continue
         for frame in frames:
-            if not frame.format.name.startswith("gray1"):
-                found = f"{frame.format.components[0].bits}-bit {frame.format.name}"
-                raise not_depth_error(where, found, frame.width, frame.height)
+            if frame.format.name.startswith("gray1"):
+                return
+            found = f"{frame.format.components[0].bits}-bit {frame.format.name}"
+            raise not_depth_error(where, found, frame.width, frame.height)
+    raise RecordingError(f"none of the first pictures of {where} can be decoded; copy it again")

@@ -26,6 +26,7 @@ _DTYPES = {"big": np.dtype(">u2"), "little": np.dtype("<u2")}
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,5})\s")
 _HEAD_BYTES = 1024  # comments included
+_N_ASKED = 5  # pictures, spread over the recording, that tell the byte order
 
 
 class _Header(NamedTuple):
@@ -38,18 +39,19 @@ class _Header(NamedTuple):
 def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = None) -> FileStack:
     """Look at the header and the length of every file.
 
-    byte_order: "big", as the format's definition has it, or "little"; None: big, unless the pixels of the first whole
-    picture are plainly the other way round, which is told.
+    byte_order: "big", as the format's definition has it, or "little"; None: big, unless most pictures are plainly the
+    other way round, which is told.
     """
     stack = open_files(files, "PGM", _look, partial(_decode, dtype=_DTYPES[byte_order or "big"]), progress)
     if byte_order is not None:
         return stack
-    first = files[stack.whole.index(True)]
-    if _plausible_order(first) == "big":
+    whole = [path for path, good in zip(files, stack.whole, strict=True) if good]
+    asked = whole[:: max(1, len(whole) // _N_ASKED)][:_N_ASKED]
+    if 2 * sum(_is_little(path) for path in asked) <= len(asked):
         return stack
     told = (
-        f"the pixels of {first.name} make sense with the low byte first only, although PGM has the high byte first, so "
-        'they were read so; state byte_order = "little" or "big" under [camera] in camera.toml'
+        f"the pixels of {whole[0].name} make sense with the low byte first only, although PGM has the high byte first, "
+        'so they were read so; state byte_order = "little" or "big" under [camera] in camera.toml'
     )
     return replace(stack, decode=partial(_decode, dtype=_DTYPES["little"]), problems=[told])
 
@@ -87,13 +89,14 @@ def _decode(path: Path, dtype: np.dtype[np.uint16]) -> NDArray[np.uint16] | None
     return np.frombuffer(raw, dtype).reshape(header.height, header.width).astype(np.uint16)
 
 
-def _plausible_order(path: Path) -> str:
-    """The byte order in which neighbouring pixels are alike: depth is smooth, and its low byte is not."""
+def _is_little(path: Path) -> bool:
+    """Whether neighbouring pixels are alike with the low byte first only: depth is smooth, and its low byte is not."""
     rough = {}
     for name, dtype in _DTYPES.items():
         picture = _decode(path, dtype)
-        assert picture is not None
+        if picture is None:
+            return False
         read = picture.astype(np.int64)
         both = (read[:, 1:] > 0) & (read[:, :-1] > 0)
         rough[name] = float(np.abs(np.diff(read, axis=1))[both].mean()) if both.any() else 0.0
-    return "little" if 2.0 * rough["little"] < rough["big"] else "big"
+    return 2.0 * rough["little"] < rough["big"]

@@ -75,9 +75,14 @@ class Profile(BaseModel):
         numbers = (self.lens_f_mm, self.lens_to_grid_mm, self.grid_to_sensor_mm)
         return None if None in numbers else numbers  # type: ignore[return-value]
 
+    def facts(self) -> dict[str, Any]:
+        """The profile in JSON's own types, for session.json."""
+        return {**self.model_dump(mode="json", exclude_none=True), "invalid": [str(value) for value in self.invalid]}
+
     def read(self, stored: NDArray[Any]) -> NDArray[np.float64]:
         """Signed mm (H, W) of stored values, NaN where they are invalid, before `valid_mm` is looked at."""
-        values = stored.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # damage may hold any bits, also those of a NaN that signals
+            values = stored.astype(np.float64)
         for value in self.invalid:
             values[stored == value] = np.nan
         values[~np.isfinite(values)] = np.nan

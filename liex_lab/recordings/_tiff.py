@@ -147,7 +147,10 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
             ends = _list_ends(tif)
             return (_imagej_stack(tif, listed[0], size_bytes) if len(listed) == 1 else listed), size, ends
     except RecordingError:
-        raise
+        if not any(page.whole for page in listed):
+            raise
+        # damage inside a directory, or a picture of another kind behind the depth: the stack ends before it
+        return listed, size, False
     except Exception:  # the directory of a cut file is garbage, and comes out as almost any exception
         return listed, size, False
 

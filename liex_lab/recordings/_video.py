@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,10 @@ from liex_lab.progress import Progress
 from liex_lab.recordings._pictures import too_large
 from liex_lab.recordings._track import FFV1, RAW, DepthTrack
 
-SUFFIXES = (".avi", ".mkv")
+if TYPE_CHECKING:
+    from liex_lab.recordings._ffv1 import Ffv1
+
+_N_ASKED = 3  # key pictures, one of which must be depth: the first may be damaged
 
 
 class DepthVideo:
@@ -27,15 +31,24 @@ class DepthVideo:
         self.track, self.width, self.height = track, track.width, track.height
         self.problems: list[str] = []
         self._path, self._file, self._lock = path, path.open("rb", buffering=0), Lock()
-        self._ffv1, self._keys, self._next = None, np.zeros(0, np.int64), -1
+        self._ffv1: Ffv1 | None = None
+        self._keys, self._next = np.zeros(0, np.int64), -1
         if track.codec == FFV1:
-            from liex_lab.recordings._ffv1 import Ffv1, is_key
+            try:
+                self._begin_ffv1()
+            except BaseException:
+                self._file.close()
+                raise
 
-            self._ffv1 = Ffv1(track.width, track.height, track.private)
-            heads = (self._bytes(k, 2) for k in range(len(self)))
-            self._keys = np.array([k for k, head in enumerate(heads) if is_key(head)], np.int64)
-            if len(self._keys):
-                self._ffv1.require_depth(self._bytes(int(self._keys[0])), str(path))
+    def _begin_ffv1(self) -> None:
+        """Find the key pictures, and refuse a stream whose pictures are no depth."""
+        from liex_lab.recordings._ffv1 import Ffv1, is_key, require_depth
+
+        track = self.track
+        heads = (self._bytes(k, 2) for k in range(len(self)))
+        self._keys = np.array([k for k, head in enumerate(heads) if is_key(head)], np.int64)
+        self._ffv1 = Ffv1(track.width, track.height, track.private)
+        require_depth(self._ffv1, (self._bytes(int(k)) for k in self._keys[:_N_ASKED]), str(self._path))
 
     def __len__(self) -> int:
         return len(self.track.offsets)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -84,43 +84,91 @@ def open_images(
 ) -> Recording:
     """A folder of pictures, or one picture or stack, as a recording."""
     folder = path if path.is_dir() else path.parent
-    camera_file = CameraFile.read(folder / CAMERA_FILE)
-    kind, files = list_pictures(path, camera_file.pattern) if path.is_dir() else (_kind(path), [path])
+    told = CameraFile.read(folder / CAMERA_FILE)
+    kind, files = list_pictures(path, told.pattern) if path.is_dir() else (_kind(path), [path])
     if kind == "PCLZF":
-        camera_file = _with_xml(camera_file, files[0])
-    stack = open_stack(kind, files, camera_file, progress)
-    return assemble(path, "images", files, stack, camera_file, camera_file.decode, camera, fps)
+        told = _with_xml(told, files[0])
+    stack = open_stack(kind, files, told, progress)
+    return Folder(path, files, told, stack, told.decode).recording("images", camera, fps)
 
 
-def assemble(
-    path: Path,
-    format: str,
-    files: list[Path],
-    stack: Stack,
-    camera_file: CameraFile,
-    decode: Callable[[Stored], Depth],
-    camera: Lens | None,
-    fps: float | None,
-    beside: Sequence[Path] = (),
-) -> Recording:
-    """The recording of a stack of pictures with its camera and times.
+@dataclass(frozen=True)
+class Folder:
+    """Pictures and all that is needed to make a recording of them.
 
-    decode: stored values -> depth (H, W) mm; beside: further files that say how to read the pictures.
+    path: what was asked for, a folder or one file; told: what its camera.toml says; decode: stored values -> depth
+    (H, W) float32 mm; beside: further files that say how to read the pictures.
     """
-    folder = path if path.is_dir() else path.parent
-    the_camera = camera_file.camera(stack.width, stack.height, camera)
-    problems = [*camera_file.problems, *stack.problems, *_say_cut(stack)]
-    settled, start = _times(folder, files, camera_file, fps, len(stack), problems)
-    metadata = ({"session_start_time": start} if start else {}) | camera_file.metadata
-    _refuse_negative(stack, decode, camera_file)
-    told_in = [folder / CAMERA_FILE, folder / camera_file.timestamps, *beside]
-    return Recording(
-        name=path.resolve().stem if path.is_file() else path.resolve().name, format=format, camera=the_camera,
-        times_ns=settled.times_ns, read=Pictures(stack, decode, problems).read,
-        sources=[*files, *(file for file in told_in if file.is_file())], problems=problems,
-        truncated=stack.truncated, n_whole=sum(stack.whole[: len(settled.times_ns)]), metadata=metadata,
-        close=stack.close, faults=settled.faults,
-    )  # fmt: skip
+
+    path: Path
+    files: list[Path]
+    told: CameraFile
+    stack: Stack
+    decode: Callable[[Stored], Depth]
+    beside: Sequence[Path] = ()
+
+    def recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
+        """The recording, with its camera and times; the stack is closed where that fails."""
+        try:
+            return self._recording(format, camera, fps)
+        except BaseException:
+            self.stack.close()
+            raise
+
+    def _recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
+        path, stack, told = self.path, self.stack, self.told
+        the_camera = told.camera(stack.width, stack.height, camera)
+        problems = [*told.problems, *stack.problems, *_say_cut(stack)]
+        settled, start = self._times(fps, problems)
+        _refuse_negative(stack, self.decode, told)
+        stated_in = [self.folder / CAMERA_FILE, self.folder / told.timestamps, *self.beside]
+        return Recording(
+            name=path.resolve().stem if path.is_file() else path.resolve().name, format=format, camera=the_camera,
+            times_ns=settled.times_ns, read=Pictures(stack, self.decode, problems).read,
+            sources=[*self.files, *(file for file in stated_in if file.is_file())], problems=problems,
+            truncated=stack.truncated, n_whole=sum(stack.whole[: len(settled.times_ns)]),
+            metadata=({"session_start_time": start} if start else {}) | told.metadata,
+            close=stack.close, faults=settled.faults,
+        )  # fmt: skip
+
+    @property
+    def folder(self) -> Path:
+        """Where the pictures lie."""
+        return self.path if self.path.is_dir() else self.path.parent
+
+    def _times(self, fps: float | None, problems: list[str]) -> tuple[Settled, str | None]:
+        """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they tell it.
+
+        From the stamp file, or else from the names of the pictures, or else from a stated rate.
+        """
+        path, n = self.folder / self.told.timestamps, len(self.stack)
+        if path.is_file():
+            times = read_csv_times(path, self.told.time_column, self.told.time_unit)
+            n, counts = match_counts(n, times, self.folder.name, path.name)
+            if not n:
+                raise RecordingError(
+                    f"{path} holds no time stamp; write one per picture, or remove it and state fps in camera.toml"
+                )
+            problems += [counts] if counts else []
+            moment = True
+        elif len(self.files) == n and (named := name_times([file.name for file in self.files])) is not None:
+            times, moment = named
+        else:
+            hz = rate(fps, "the call") or self.told.fps
+            if hz is None:
+                raise self._no_times()
+            problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
+            times, moment = from_rate(n, hz), False
+        settled = settle(times[:n])
+        problems += [settled.problem] if settled.problem else []
+        return settled, start_of_clock(int(settled.times_ns[0])) if moment else None
+
+    def _no_times(self) -> RecordingError:
+        return RecordingError(
+            f"the times of the pictures in {self.folder} are not known; write {self.told.timestamps} with a line "
+            "time_ns (or time_s) and then one time per picture, or state a constant rate with fps = 30.0 under "
+            "[camera] in camera.toml" + ("" if self.told.path.is_file() else f" ({WHAT_TO_WRITE})")
+        )
 
 
 def _kind(path: Path) -> str:
@@ -174,44 +222,6 @@ def _say_cut(stack: Stack) -> list[str]:
         f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as wholly unread, the first is "
         f"frame {cut[0]} ({stack.label(cut[0])})"
     ]
-
-
-def _times(
-    folder: Path, files: list[Path], camera_file: CameraFile, fps: float | None, n: int, problems: list[str]
-) -> tuple[Settled, str | None]:
-    """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they tell it.
-
-    From the stamp file, or else from the names of the pictures, or else from a stated rate.
-    """
-    path = folder / camera_file.timestamps
-    if path.is_file():
-        times = read_csv_times(path, camera_file.time_column, camera_file.time_unit)
-        n, counts = match_counts(n, times, folder.name, path.name)
-        if not n:
-            raise RecordingError(
-                f"{path} holds no time stamp; write one per picture, or remove it and state fps in camera.toml"
-            )
-        problems += [counts] if counts else []
-        moment = True
-    elif len(files) == n and (named := name_times([file.name for file in files])) is not None:
-        times, moment = named
-    else:
-        hz = rate(fps, "the call") or camera_file.fps
-        if hz is None:
-            raise _no_times(folder, camera_file)
-        problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
-        times, moment = from_rate(n, hz), False
-    settled = settle(times[:n])
-    problems += [settled.problem] if settled.problem else []
-    return settled, start_of_clock(int(settled.times_ns[0])) if moment else None
-
-
-def _no_times(folder: Path, camera_file: CameraFile) -> RecordingError:
-    return RecordingError(
-        f"the times of the pictures in {folder} are not known; write {camera_file.timestamps} with a line time_ns (or "
-        "time_s) and then one time per picture, or state a constant rate with fps = 30.0 under [camera] in "
-        "camera.toml" + ("" if camera_file.path.is_file() else f" ({WHAT_TO_WRITE})")
-    )
 
 
 def _refuse_negative(stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile) -> None:

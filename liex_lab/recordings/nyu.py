@@ -16,7 +16,7 @@ from liex_lab.progress import Progress, silent
 from liex_lab.recordings._png import open_pngs
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.encodings import COLOUR
-from liex_lab.recordings.images import assemble, natural_key
+from liex_lab.recordings.images import Folder, natural_key
 from liex_lab.recordings.recording import Recording
 
 NYU_CAMERA = Camera(588.036865, 587.075073, 320.0, 240.0, 640, 480, source="NYU hand pose data set")
@@ -25,6 +25,7 @@ VIEW = 1  # of the three cameras, the one that everybody measures on
 N_JOINTS = 36
 
 _NAME = re.compile(r"(?:depth|synthdepth)_([123])_(\d{7})\.png")
+_N_ASKED = 8  # pictures: one may be damaged
 _NOMINAL_HZ = 30.0  # the data set holds no times; its cameras ran at this rate
 
 
@@ -43,12 +44,11 @@ class NyuJoints:
 
 def looks_like_nyu(folder: Path, names: list[str]) -> bool:
     """Whether a folder's files are those of the NYU data set: so named, and in colour."""
-    first = next((name for name in names if _NAME.fullmatch(name)), None)
-    if first is None:
-        return False
-    with (folder / first).open("rb") as file:
-        head = file.read(26)
-    return head[24:26] == b"\x08\x02"
+    for name in [name for name in names if _NAME.fullmatch(name)][:_N_ASKED]:
+        with (folder / name).open("rb") as file:
+            if file.read(26)[24:] == b"\x08\x02":
+                return True
+    return False
 
 
 def open_nyu(
@@ -64,7 +64,7 @@ def open_nyu(
         intrinsics=told.intrinsics or {name: getattr(NYU_CAMERA, name) for name in ("fx", "fy", "cx", "cy")},
         source=told.source if told.intrinsics else NYU_CAMERA.source,
     )  # fmt: skip
-    return assemble(path, "nyu", files, stack, told, told.decode, camera, fps)
+    return Folder(path, files, told, stack, told.decode).recording("nyu", camera, fps)
 
 
 def _pictures(folder: Path, view: int) -> list[Path]:

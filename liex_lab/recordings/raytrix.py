@@ -19,11 +19,12 @@ from liex_lab.recordings._raytrix_profile import PROFILE_FILE, Profile, read_pro
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.encodings import Stored
 from liex_lab.recordings.frame import Depth
-from liex_lab.recordings.images import assemble, list_pictures, natural_key, open_stack
+from liex_lab.recordings.images import Folder, list_pictures, natural_key, open_stack
 from liex_lab.recordings.recording import Recording
 
 _CALIBRATION_BYTES = 1 << 20
-_LOOKS_LIKE = ("*depthmap*", "*depth3d*", "*totalfocus*", "*calibration.xml")  # names that RxLive proposes
+_LOOKS_LIKE = ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")  # as exports are named
+_CALIBRATION = "RayCalibData"
 
 
 def open_raytrix(
@@ -45,17 +46,27 @@ def open_raytrix(
         kind, files = list_pictures(folder, profile.pattern)
         stack = open_stack(kind, files, told, progress)
         told = _with_lens(told, profile, stack, path)
-        _check(stack, profile, path)
         decode = profile.decode
-    recording = assemble(folder, "raytrix", files, stack, told, decode, camera, fps, beside=(path,))
-    recording.metadata["profile"] = profile.model_dump(mode="json", exclude_none=True)
+        try:
+            _check(stack, profile, path)
+        except BaseException:
+            stack.close()
+            raise
+    recording = Folder(folder, files, told, stack, decode, (path,)).recording("raytrix", camera, fps)
+    recording.metadata["profile"] = profile.facts()
     return recording
 
 
-def looks_like_raytrix(names: list[str]) -> bool:
-    """Whether a folder's files are named as RxLive names its exports, or are point clouds."""
-    named = any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE)
-    return named or any(Path(name).suffix.lower() in (".ply", ".xyz") for name in names)
+def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
+    """Whether a folder's files are named like exports, are point clouds, or hold the vendor's calibration."""
+    if any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE):
+        return True
+    for name in names:
+        if name.lower().endswith(".xml"):
+            with (folder / name).open("rb") as file:
+                if f"<{_CALIBRATION}".encode() in file.read(1024):
+                    return True
+    return False
 
 
 def no_profile_error(folder: Path) -> RecordingError:
@@ -166,7 +177,7 @@ def read_ray_calibration(path: Path) -> RayCalibration:
         text = file.read(_CALIBRATION_BYTES)
     try:
         root = ET.fromstring(text)
-        if root.tag != "RayCalibData":
+        if root.tag != _CALIBRATION:
             raise ValueError(f"its root is <{root.tag}>")
         ranges = tuple(
             (float(found.findtext("min", "")), float(found.findtext("max", "")))
@@ -174,7 +185,7 @@ def read_ray_calibration(path: Path) -> RayCalibration:
         )
         diameter, rotation, tcp = (float(root.findtext(name, "")) for name in ("diameter", "rotation", "tcp"))
     except (ET.ParseError, ValueError) as error:
-        raise RecordingError(f"{path} should be a Raytrix calibration (RayCalibData), but: {error}") from None
+        raise RecordingError(f"{path} should be a Raytrix calibration ({_CALIBRATION}), but: {error}") from None
     return RayCalibration(diameter, rotation, tcp, ranges)
 
 

@@ -73,7 +73,7 @@ def others(suffix: str) -> Survivors:
 
 
 def before(ends: Callable[[Path], Sequence[int]], suffix: str) -> Survivors:
-    """Pictures one after the other in one file: those that end before the damage come out; `ends` says where each does."""
+    """Pictures one after the other in one file: those that end before the damage come out. ends: where each does."""
 
     def survivors(path: Path, at: int) -> Sequence[int] | None:
         if not path.name.endswith(suffix):
@@ -112,7 +112,7 @@ def _tiff_ends(path: Path) -> list[int]:
         for page in tif.pages:
             last = max(
                 last, page.offset + 400, *(o + c for o, c in zip(page.dataoffsets, page.databytecounts, strict=True))
-            )  # type: ignore[union-attr]
+            )
             ends.append(last)
     return ends
 
