@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from liex_lab.camera import Camera
 from liex_lab.progress import Progress
-from liex_lab.recordings._pictures import FileStack, Look, Size, none_whole_error, open_files, something_else
+from liex_lab.recordings._pictures import DAMAGED, FileStack, Look, Size, open_files, something_else
 
 Points = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def _look(path: Path, size: Size) -> Look:
         return something_else(path, "PLY")
     header = _ply_header(head)
     there = header is not None and path.stat().st_size - header.start >= header.n * header.row_bytes
-    return Look(size) if there else Look(None, none_whole_error([path], "PLY"))
+    return Look(size) if there else DAMAGED
 
 
 def _numbers(line: str) -> list[str]:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from liex_lab.progress import Progress
 from liex_lab.recordings._pictures import (
+    DAMAGED,
     FileStack,
     Look,
-    none_whole_error,
     not_depth_error,
     open_files,
     something_else,
@@ -51,15 +51,15 @@ def _look(path: Path) -> Look:
     if not head.startswith(_MAGIC[: len(head)]):
         return something_else(path, "PCLZF")
     if len(head) < _HEADER.size:
-        return Look(None, none_whole_error([path], "PCLZF"))
+        return DAMAGED
     header = _Header(*_HEADER.unpack(head))
     size = (header.width, header.height)
-    kind = header.kind.rstrip(b"\0").decode("ascii", "replace")
+    kind = header.kind.rstrip(b" \0").decode("ascii", "replace")
     if kind in ("rgb24", "yuv422", "bayer8"):
         raise not_depth_error(str(path), f"8-bit {kind}", *size)
     fits = kind == _DEPTH and not too_large(size) and 0 < header.unpacked == 2 * size[0] * size[1]
     there = path.stat().st_size >= _HEADER.size + header.packed
-    return Look(size) if fits and there else Look(None, none_whole_error([path], "PCLZF"))
+    return Look(size) if fits and there else DAMAGED
 
 
 def _decode(path: Path) -> NDArray[np.uint16] | None:

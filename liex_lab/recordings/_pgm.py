@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from liex_lab.progress import Progress
 from liex_lab.recordings._pictures import (
+    DAMAGED,
     FileStack,
     Look,
-    none_whole_error,
     not_depth_error,
     open_files,
     something_else,
@@ -67,14 +67,14 @@ def _look(path: Path) -> Look:
     header = _header(head)
     if header is None:
         cut = b"P5".startswith(head[:2]) and len(head) < _HEAD_BYTES
-        return Look(None, none_whole_error([path], "PGM")) if cut else something_else(path, "PGM")
+        return DAMAGED if cut else something_else(path, "PGM")
     if header.largest < 256:
         raise not_depth_error(str(path), "8-bit grey", header.width, header.height)
     n_pixels = header.width * header.height
     spare = path.stat().st_size - header.n_bytes - 2 * n_pixels
     # a line's end or a comment behind the pixels is no matter; more, or less, and the header does not say the truth
     fits = n_pixels > 0 and not too_large(header[:2]) and 0 <= spare < 2 * header.width
-    return Look(header[:2]) if fits else Look(None, none_whole_error([path], "PGM"))
+    return Look(header[:2]) if fits else DAMAGED
 
 
 def _decode(path: Path, dtype: np.dtype[np.uint16]) -> NDArray[np.uint16] | None:

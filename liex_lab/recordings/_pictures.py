@@ -53,10 +53,13 @@ class Stack(Protocol):
 
 
 class Look(NamedTuple):
-    """What a file says before its picture is decoded. size: None where it is cut or damaged; why: a sentence then."""
+    """What a file says before its picture is decoded. size: None where it is cut or damaged; why: what else it is."""
 
     size: Size | None
     why: RecordingError | None = None
+
+
+DAMAGED = Look(None)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.progress import Progress
 from liex_lab.recordings._pictures import (
+    DAMAGED,
     FileStack,
     Look,
-    none_whole_error,
     not_depth_error,
     open_files,
     something_else,
@@ -66,7 +66,7 @@ def _look(path: Path, colour: bool) -> Look:
         # a header that is whole still says whether this was depth at all
         if not damaged:
             png_size(head, str(path), colour)
-        return Look(None, none_whole_error([path], "PNG"))
+        return DAMAGED
     return Look(png_size(head, str(path), colour))
 
 

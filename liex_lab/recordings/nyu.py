@@ -85,10 +85,10 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
 
     path = folder / JOINT_FILE if folder.is_dir() else folder
     wanted = ["joint_uvd", "joint_xyz", "joint_names"]
+    if not path.is_file():
+        raise RecordingError(f"there is no {JOINT_FILE} in {folder}; copy it there from the data set")
     try:
         found: dict[str, Any] = loadmat(path, variable_names=wanted)
-    except FileNotFoundError:
-        raise RecordingError(f"there is no {JOINT_FILE} in {folder}; copy it there from the data set") from None
     except (MatReadError, NotImplementedError, ValueError, TypeError, OSError, EOFError, MemoryError) as error:
         raise RecordingError(f"{path} should be the NYU data set's MATLAB file, but: {error}; copy it again") from None
     missing = [name for name in wanted if name not in found]

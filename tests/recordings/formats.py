@@ -189,7 +189,8 @@ FORMATS = (
     Format("azure-mkv", lambda f, s: write_video_session(f, s, "depth.mkv"), before(_mkv_ends, ".mkv")),
     Format("mcap-foxglove", lambda f, s: write_mcap(f / "recording.mcap", s), before(_mcap_ends, ".mcap")),
     Format(
-        "raytrix-float", lambda f, s: write_raytrix(f, -s.astype(np.float32), "raytrix-f32-negative-mm", ".tif", write_tiff),
+        "raytrix-float",
+        lambda f, s: write_raytrix(f, -s.astype(np.float32), "raytrix-f32-negative-mm", ".tif", write_tiff),
         lambda path, at: None, streams=False,
     ),
     Format(

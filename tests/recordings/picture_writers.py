@@ -41,7 +41,8 @@ def write_pclzf(path: Path, frame: NDArray[Any], kind: bytes = b"depth16") -> No
     data = np.ascontiguousarray(frame).tobytes()
     packed = pack_lzf(data)
     height, width = frame.shape[:2]
-    path.write_bytes(struct.pack("<5sII16sII", b"PCLZF", width, height, kind, len(packed), len(data)) + packed)
+    head = struct.pack("<5sII16sII", b"PCLZF", width, height, kind.ljust(16), len(packed), len(data))
+    path.write_bytes(head + packed)
 
 
 def pack_lzf(data: bytes) -> bytes:

@@ -156,7 +156,7 @@ def test_a_stamp_file_of_another_program_is_read_as_stated(
     tmp_path: Path, header: str, row: str, how: dict[str, object]
 ) -> None:
     folder = write_folder(tmp_path / "r", STORED, ".pgm", write_pgm)
-    write_camera(folder, timestamps="stamps.txt", **how)
+    write_camera(folder, SMALL, timestamps="stamps.txt", **how)
     times = [10**18 + k * 33_333_000 for k in range(4)]
     rows = [
         row.format(k=k, s=f"{t // 10**9}.{t % 10**9:09d}", ms=f"{t // 10**6}.{t % 10**6:06d}", us=t // 1000)
@@ -181,7 +181,7 @@ def test_a_stamp_file_of_another_program_is_read_as_stated(
 def test_a_column_of_times_that_is_not_there_is_told(tmp_path: Path, how: dict[str, object], says: str) -> None:
     folder = write_folder(tmp_path / "r", STORED, ".pgm", write_pgm)
     (folder / "timestamps.csv").write_text("frame,stamp\n0,1.5\n1,2.5\n")
-    write_camera(folder, **how)
+    write_camera(folder, SMALL, **how)
     assert says in refusal(folder)
 
 
