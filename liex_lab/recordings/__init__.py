@@ -14,11 +14,12 @@ from liex_lab.recordings.times import Gap
 __all__ = ["DepthFrame", "Gap", "Recording", "open_recording"]
 
 _READS = (
-    "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz) "
-    "or an MCAP file with Foxglove depth pictures"
+    "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz), "
+    "an MCAP file or a ROS bag (.bag, .db3)"
 )
 _ARCHIVES = (".tar.gz", ".tgz", ".tar")
 _PICTURES = (".png", ".tif", ".tiff")
+_BAGS = (".bag", ".db3")
 _VIDEOS = ("depth.avi", "depth.mkv")
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; export its depth maps as TIFF from "
@@ -31,9 +32,7 @@ _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG picture
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".avi", ".mov", ".webm"), _EIGHT_BIT),
-    **dict.fromkeys(
-        (".oni", ".bag", ".db3", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET
-    ),
+    **dict.fromkeys((".oni", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
 
 
@@ -50,8 +49,9 @@ def open_recording(
 
     path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual mouse (see `open_synthetic`); camera:
     comes before whatever the files state, a `Lens` for pictures of any size; fps: used only where the files hold no
-    time stamps; topic: of an MCAP file with several depth topics; strict: refuse a recording that is cut short, instead
-    of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an index made.
+    time stamps; topic: of an MCAP file or a ROS bag with several depth topics; strict: refuse a recording that is cut
+    short, instead of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an
+    index made.
     """
     path = Path(path)
     try:
@@ -94,6 +94,10 @@ def _open(path: Path, camera: Lens | None, fps: float | None, topic: str | None,
         from liex_lab.recordings.mcap import open_mcap
 
         return open_mcap(path, camera, fps, progress, topic)
+    if name.endswith(_BAGS):
+        from liex_lab.recordings.rosbag import open_bag
+
+        return open_bag(path, camera, fps, progress, topic)
     why = _NOT_READ.get(path.suffix.lower())
     raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")
 
@@ -120,7 +124,7 @@ def _open_folder(
         from liex_lab.recordings.images import open_images
 
         return open_images(folder, camera, fps, progress)
-    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap"))]
+    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap", *_BAGS))]
     if len(files) == 1:
         return _open(folder / files[0], camera, fps, topic, progress)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]

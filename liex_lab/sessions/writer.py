@@ -92,7 +92,7 @@ class SessionWriter:
 
     def add(self, frames: Sequence[DepthFrame], track_part: Track | None = None) -> None:
         """Consecutive frames and, unless `close` gets the whole track, their part of it."""
-        from liex_lab.sessions._rvl import to_millimetres
+        from liex_lab.recordings.rvl import to_millimetres
 
         if not frames:
             return

@@ -32,7 +32,7 @@ STORED = depth_frames(4)
         ("colour.JPG", "16-bit depth was expected"),
         ("colour.mp4", "16-bit depth was expected"),
         ("xtion.oni", "not read yet"),
-        ("session.bag", "not read yet"),
+        ("session.bag", "something else"),
         ("notes.txt", "a folder of 16-bit PNG or TIFF"),
         ("noextension", "a folder of 16-bit PNG or TIFF"),
         ("empty.png", "cut short"),

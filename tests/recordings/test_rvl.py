@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from liex_lab.sessions._rvl import pack_rvl, rvl_message, to_millimetres
+from liex_lab.recordings.rvl import pack_rvl, rvl_message, to_millimetres
 from tests.oracles.rvl import unpack_rvl
 
 
