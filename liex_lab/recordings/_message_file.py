@@ -9,6 +9,7 @@ from __future__ import annotations
 import bz2
 import zlib
 from abc import ABC, abstractmethod
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -76,11 +77,18 @@ class MessageFile(ABC):
         self.channels: list[Channel] = []
         self.notes: dict[str, str] = {}
         self.chunks: list[Chunk] = []
+        self.starts: list[int] = []  # where the records of chunks begin, as the file's own index says, in order
         self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
 
     @abstractmethod
     def walk(self, wanted: Callable[[Channel], bool], progress: Progress) -> Iterator[Envelope]:
         """Every whole message of the wanted channels, in file order."""
+
+    def resume(self, at: int) -> int:
+        """Where to go on behind a record at `at` that is damaged: at the next chunk that is known, or the end."""
+        self.whole = False
+        n = bisect_right(self.starts, at)
+        return self.starts[n] if n < len(self.starts) else self.size
 
     def read(self, place: Place) -> memoryview:
         """The data of one message."""

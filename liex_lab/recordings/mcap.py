@@ -26,6 +26,7 @@ MAGIC = b"\x89MCAP0\r\n"
 NOTES = "liex_lab"  # the name of the metadata record in files of our own making
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQI")  # its record: opcode, length, where the summary and its offsets begin, CRC
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, unpacked size, its CRC, length of the packing's name
 _FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _LARGEST_FACT = 1 << 24  # bytes of one of them
@@ -59,20 +60,44 @@ class McapFile(MessageFile):
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
         """Every whole message of the wanted channels, in file order."""
+        self._learn_ending()
         at, footer = len(MAGIC), False
         while at + _RECORD.size <= self.size and not footer:
-            self.file.seek(at)
-            opcode, length = _RECORD.unpack(self.file.read(_RECORD.size))
-            start, at = at + _RECORD.size, at + _RECORD.size + length
-            if opcode == Opcode.CHUNK:
-                yield from self._walk_chunk(start, length, wanted)
-            elif at > self.size or opcode == 0:  # no record has the opcode 0: these are zeros
-                break
-            elif opcode == Opcode.MESSAGE or (opcode in _FACTS and length <= _LARGEST_FACT):
-                yield from self._take(opcode, memoryview(self.file.read(length)), Place(-1, start, length), wanted)
-            footer = opcode == Opcode.FOOTER
+            opcode, start, end = self._record(at)
+            if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
+                end = self.resume(at)  # a size that cannot be; and no record has the opcode 0: these are zeros
+            elif opcode == Opcode.CHUNK:
+                yield from self._walk_chunk(start, end - start, wanted)
+            elif opcode == Opcode.MESSAGE or (opcode in _FACTS and end - start <= _LARGEST_FACT):
+                data = memoryview(self.file.read(end - start))
+                yield from self._take(opcode, data, Place(-1, start, end - start), wanted)
+            at, footer = end, opcode == Opcode.FOOTER
             progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
+
+    def _record(self, at: int) -> tuple[int, int, int]:
+        """What kind of record begins at `at`, and where its content begins and ends."""
+        self.file.seek(at)
+        opcode, length = _RECORD.unpack(self.file.read(_RECORD.size))
+        return opcode, at + _RECORD.size, at + _RECORD.size + length
+
+    def _learn_ending(self) -> None:
+        """The schemas, channels and places of chunks that a finished file repeats: where the first ones are damaged,
+        they are all that tells what the messages are.
+        """
+        try:
+            self.file.seek(max(0, self.size - _FOOTER.size - len(MAGIC)))
+            opcode, _, at, _, _ = _FOOTER.unpack(self.file.read(_FOOTER.size))
+            while opcode == Opcode.FOOTER and 0 < at < self.size - _FOOTER.size - len(MAGIC):
+                kind, start, end = self._record(at)
+                if kind == Opcode.CHUNK_INDEX:
+                    self.starts.append(struct.unpack("<QQQ", self.file.read(24))[2])
+                elif kind in _FACTS and end - start <= _LARGEST_FACT:
+                    self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
+                at = end
+        except _DAMAGE:
+            pass  # the walk says what it finds
+        self.starts.sort()
 
     def _walk_chunk(self, start: int, length: int, wanted: Wanted) -> Iterator[Envelope]:
         number = len(self.chunks)

@@ -26,7 +26,7 @@ _VERSION = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
-_MESSAGE, _HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
+_MESSAGE, _HEADER, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _LARGEST_HEADER = 1 << 24  # bytes; a connection's holds the definition of its messages
 _DAMAGE = (KeyError, ValueError, OverflowError, struct.error)
 
@@ -62,44 +62,67 @@ class BagFile(MessageFile):
         """Every whole message of the wanted channels, in file order."""
         at, indexed = len(_VERSION), False
         while at + _U32.size <= self.size:
-            self.file.seek(at)
-            (n_header,) = _U32.unpack(self.file.read(_U32.size))
-            begin = at + 2 * _U32.size + n_header
-            if n_header > _LARGEST_HEADER or begin > self.size:
-                break
-            block = self.file.read(n_header + _U32.size)
-            (n_data,) = _U32.unpack_from(block, n_header)
-            at = begin + n_data
             try:
-                header = _fields(memoryview(block)[:n_header])
+                header, begin, end = self._record(at)
                 opcode = header["op"][0]
-                if opcode == _HEADER:
-                    indexed = self._open_header(header)
-                elif opcode == _CHUNK:
-                    yield from self._walk_chunk(header, begin, n_data, wanted)
-                elif at <= self.size and opcode in (_CONNECTION, _MESSAGE):
-                    data = memoryview(self.file.read(n_data))
-                    yield from self._take(opcode, header, data, Place(-1, begin, n_data), wanted)
-            except (*_DAMAGE, DamagedChunk, IndexError):
-                self.whole = False
-                if at == begin:
-                    break  # zeros, or as good as zeros
+                if opcode == _CHUNK and (end <= self.size or not self.starts):
+                    yield from self._walk_chunk(header, begin, end, wanted)
+                elif end > self.size:
+                    raise ValueError("a record reaches past the end of the file")
+                elif opcode == _HEADER:
+                    indexed = self._learn_ending(header)
+                elif opcode in (_CONNECTION, _MESSAGE):
+                    self.file.seek(begin)
+                    data = memoryview(self.file.read(end - begin))
+                    yield from self._take(opcode, header, data, Place(-1, begin, end - begin), wanted)
+                at = end
+            except DamagedChunk:
+                self.whole, at = False, end
+            except (*_DAMAGE, IndexError):
+                at = self.resume(at)
             progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
         # A recording that broke off has no index yet, and every other one ends with it.
         self.whole = self.whole and at == self.size and indexed
 
-    def _open_header(self, header: dict[str, bytes]) -> bool:
-        """What the file's first record says: whether there is an index."""
+    def _record(self, at: int) -> tuple[dict[str, bytes], int, int]:
+        """The header of the record that begins at `at`, and where its data begin and end."""
+        self.file.seek(at)
+        (n_header,) = _U32.unpack(self.file.read(_U32.size))
+        begin = at + 2 * _U32.size + n_header
+        if n_header > _LARGEST_HEADER or begin > self.size:
+            raise ValueError("a header is too long")
+        block = self.file.read(n_header + _U32.size)
+        (n_data,) = _U32.unpack_from(block, n_header)
+        return _fields(memoryview(block)[:n_header]), begin, begin + n_data
+
+    def _learn_ending(self, header: dict[str, bytes]) -> bool:
+        """The connections and places of chunks that the index at the end repeats; False where there is no index."""
         if header.get("encryptor"):
             raise RecordingError(f"{self.path} is an encrypted bag, which cannot be read; give it without encryption")
-        return struct.unpack("<Q", header["index_pos"]) != (0,)
+        (at,) = struct.unpack("<Q", header["index_pos"])
+        indexed = at > 0
+        try:
+            while 0 < at < self.size:
+                facts, begin, end = self._record(at)
+                if facts["op"][0] == _CHUNK_INFO:
+                    self.starts += struct.unpack("<Q", facts["chunk_pos"])
+                elif facts["op"][0] == _CONNECTION:
+                    self.file.seek(begin)
+                    self._connect(facts, memoryview(self.file.read(end - begin)))
+                else:
+                    break
+                at = end
+        except (*_DAMAGE, IndexError):
+            pass  # the walk says what it finds
+        self.starts.sort()
+        return indexed
 
-    def _walk_chunk(self, header: dict[str, bytes], begin: int, n_data: int, wanted: Wanted) -> Iterator[Envelope]:
-        cut = begin + n_data > self.size
+    def _walk_chunk(self, header: dict[str, bytes], begin: int, end: int, wanted: Wanted) -> Iterator[Envelope]:
+        cut = end > self.size
         (size,) = _U32.unpack(header["size"])
         packing = header["compression"].decode()
         number = len(self.chunks)
-        self.chunks.append(Chunk(begin, min(n_data, self.size - begin), packing, size, 0, cut))
+        self.chunks.append(Chunk(begin, min(end, self.size) - begin, packing, size, 0, cut))
         data = self.unpack(number)
         at = 0
         while at + _U32.size <= len(data):
@@ -120,18 +143,21 @@ class BagFile(MessageFile):
     ) -> Iterator[Envelope]:
         """A connection, which is noted, or a message, which is handed out."""
         if opcode == _CONNECTION:
-            (number,) = _U32.unpack(header["conn"])
-            facts = _fields(data)
-            topic = "/" + "/".join(part for part in header["topic"].decode().split("/") if part)
-            channel = Channel(topic, facts["type"].decode(), "ros1")
-            if self._by_id.setdefault(number, channel) == channel and channel not in self.channels:
-                self.channels.append(channel)
+            self._connect(header, data)
         elif opcode == _MESSAGE:
             (number,) = _U32.unpack(header["conn"])
             seconds, nanoseconds = _TIME.unpack(header["time"])
             channel = self._by_id[number]
             if wanted(channel):
                 yield Envelope(channel, seconds * 10**9 + nanoseconds, place, data)
+
+    def _connect(self, header: dict[str, bytes], data: memoryview) -> None:
+        """Note what is on a topic."""
+        (number,) = _U32.unpack(header["conn"])
+        topic = "/" + "/".join(part for part in header["topic"].decode().split("/") if part)
+        channel = Channel(topic, _fields(data)["type"].decode(), "ros1")
+        if self._by_id.setdefault(number, channel) == channel and channel not in self.channels:
+            self.channels.append(channel)
 
 
 def _fields(header: memoryview) -> dict[str, bytes]:

@@ -68,12 +68,12 @@ def depth_message(ros: int, frame: NDArray[Any], time_ns: int, frame_id: str, ho
     if "cloud" in how.kind:
         return _cloud(ros, frame, header, how)
     if how.kind in ("16UC1", "mono16", "32FC1"):
-        order = ">" if how.big_endian else "<"
-        rows = np.ascontiguousarray(frame.astype(frame.dtype.newbyteorder(order))).view(np.uint8)
-        data = np.pad(rows.reshape(len(frame), -1), ((0, 0), (0, how.padding)), constant_values=0xAB)
+        ordered = np.ascontiguousarray(frame.astype(frame.dtype.newbyteorder(">" if how.big_endian else "<")))
+        rows = ordered.view(np.uint8).reshape(len(frame), -1)
+        padded = np.pad(rows, ((0, 0), (0, how.padding)), constant_values=0xAB)
         height, width = frame.shape
         return types["sensor_msgs/msg/Image"](
-            header, height, width, how.kind, int(how.big_endian), data.shape[1], data.ravel()
+            header, height, width, how.kind, int(how.big_endian), padded.shape[1], padded.ravel()
         )
     packing, data = _packed(frame, how.kind)
     return types["sensor_msgs/msg/CompressedImage"](header, packing, np.frombuffer(data, np.uint8))
@@ -112,6 +112,7 @@ def _cloud(ros: int, frame: NDArray[Any], header: Any, how: How) -> Any:
     packed = np.zeros((height, width), layout)
     for k, name in enumerate("xyz"):
         packed[name] = points[..., k]
+    assert layout.fields is not None
     fields = [
         types["sensor_msgs/msg/PointField"](name, int(layout.fields[name][1]), 6 if name == "rgb" else 7, 1)
         for name in ("x", "y", "z", "rgb")
