@@ -15,7 +15,7 @@ __all__ = ["DepthFrame", "Gap", "Recording", "open_recording"]
 
 _READS = (
     "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz), "
-    "an MCAP file or a ROS bag (.bag, .db3)"
+    "a PrimeSense recording (.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
 _ARCHIVES = (".tar.gz", ".tgz", ".tar")
 _PICTURES = (".png", ".tif", ".tiff")
@@ -32,7 +32,7 @@ _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG picture
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".avi", ".mov", ".webm"), _EIGHT_BIT),
-    **dict.fromkeys((".oni", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
+    **dict.fromkeys((".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
 
 
@@ -98,6 +98,10 @@ def _open(path: Path, camera: Lens | None, fps: float | None, topic: str | None,
         from liex_lab.recordings.rosbag import open_bag
 
         return open_bag(path, camera, fps, progress, topic)
+    if name.endswith(".oni"):
+        from liex_lab.recordings.primesense import open_oni
+
+        return open_oni(path, camera, fps, progress)
     why = _NOT_READ.get(path.suffix.lower())
     raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")
 
@@ -124,7 +128,7 @@ def _open_folder(
         from liex_lab.recordings.images import open_images
 
         return open_images(folder, camera, fps, progress)
-    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap", *_BAGS))]
+    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap", ".oni", *_BAGS))]
     if len(files) == 1:
         return _open(folder / files[0], camera, fps, topic, progress)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]
