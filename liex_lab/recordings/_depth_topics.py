@@ -135,7 +135,7 @@ def _open(file: MessageFile, kind: str, camera: Lens | None, topic: str | None, 
     problems: list[str] = list(camera_file.problems)
     if not file.whole:
         problems.append(f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read from it")
-    the_camera = _camera(path, chosen, found.calibrations, camera_file, camera, problems)
+    the_camera = _camera(path, chosen, found.calibrations, camera_file, camera, file.notes, problems)
     # A writer may flush its topics out of turn; the order of logging is the file's own order.
     order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
     times, moved = increasing(_stamps(chosen, order, problems))
@@ -248,6 +248,7 @@ def _camera(
     calibrations: dict[str, Calibration],
     camera_file: CameraFile,
     stated: Lens | None,
+    notes: dict[str, str],
     problems: list[str],
 ) -> Camera:
     """Stated by the caller, or else calibrated in the file, or else in a camera.toml beside it."""
@@ -258,7 +259,8 @@ def _camera(
         k = (*message.p[0:3], *message.p[4:7]) if rectified else message.k[:6]
         if any(message.d) and not rectified:
             problems.append(f"{printable(where)} states a lens distortion, which is not undone")
-        source = f"{'CameraInfo' if topic.channel.encoding in ('ros1', 'cdr') else 'CameraCalibration'} on {where}"
+        kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
+        source = notes.get("camera_source", f"{kind} on {where}")  # a converted file keeps where the numbers came from
         size = _size(topic, (message.width, message.height))
         camera = Camera(
             fx=k[0], fy=k[4], cx=k[2], cy=k[5], width=message.width or size[0], height=message.height or size[1],

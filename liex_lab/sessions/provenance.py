@@ -5,12 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.body.skeleton import Skeleton
@@ -135,21 +133,6 @@ def package_version(name: str) -> str:
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
     return {"python": platform.python_version(), **{name: package_version(name) for name in _PACKAGES}}
-
-
-def peak_memory_mb() -> float | None:
-    """The most memory this process has held, MB; None where the system does not tell."""
-    status = Path("/proc/self/status")  # getrusage would also count the process that started this one
-    if status.is_file():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024.0
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _hash(value: Any) -> str:

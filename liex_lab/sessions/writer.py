@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
-from liex_lab.sessions.provenance import Provenance, package_version, peak_memory_mb
+from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rows import Rows, median_step, stop_times
 from liex_lab.sessions.tables import Column
 from liex_lab.sessions.thumbnails import Keepsakes
