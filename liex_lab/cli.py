@@ -121,13 +121,16 @@ def convert(
     step_mm: Annotated[
         float | None, typer.Option("--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP.")
     ] = None,
+    ros: Annotated[bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under this name.")] = False,
 ) -> None:
     """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG pictures."""
     from liex_lab.pipelines.convert import convert as job
 
     with progress_bar() as progress:
-        done = job(recording, to, fps=fps, topic=topic, step_mm=step_mm, overwrite=overwrite, progress=progress)
+        done = job(
+            recording, to, fps=fps, topic=topic, step_mm=step_mm, ros=ros, overwrite=overwrite, progress=progress
+        )
     typer.echo(f"recording: {done.path} ({done.n_frames} frames)")
     for sentence in (*done.problems, *done.notes):
         typer.echo(f"note: {sentence}")

@@ -18,13 +18,7 @@ from liex_lab.progress import Progress, silent
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.steps import whole_steps
-from liex_lab.recordings.writing import (
-    STAMPS,
-    McapDepthWriter,
-    OniRecordingWriter,
-    PictureFolderWriter,
-    RecordingWriter,
-)
+from liex_lab.recordings.writing import STAMPS, OniRecordingWriter, PictureFolderWriter, RecordingWriter
 
 _STEPS_MM = {".oni": (1.0, 0.1), "": (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)}  # what each format can state
 _N_PROBED = 8
@@ -53,30 +47,30 @@ def convert(
     fps: float | None = None,
     topic: str | None = None,
     step_mm: float | None = None,
+    ros: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Converted:
     """Write a recording as `to`: NAME.mcap, NAME.oni, or else a folder of PNG pictures.
 
     MCAP keeps every depth; 16-bit pictures keep whole steps of a size that is found, or, where `step_mm` is stated,
-    the nearest steps. `camera`, `fps` and `topic` are those of `open_recording`. The target has its name only when it
-    is whole. Raises RecordingError where something is in its place or the depth does not fit.
+    the nearest steps. ros: ROS 2's messages in the MCAP file instead of Foxglove's. `camera`, `fps` and `topic` are
+    those of `open_recording`. The target has its name only when it is whole. Raises RecordingError where something is
+    in its place or the depth does not fit.
     """
     target = Path(to)
     _check_target(target, overwrite)
     if isinstance(recording, Recording):
-        return _convert(recording, target, step_mm, overwrite, progress)
+        return _convert(recording, target, step_mm, ros, progress)
     if target.exists() and Path(recording).exists() and target.samefile(recording):
         raise RecordingError(f"{target} is the recording itself; write under another name")
     with open_recording(recording, camera=camera, fps=fps, topic=topic, progress=progress) as opened:
-        return _convert(opened, target, step_mm, overwrite, progress)
+        return _convert(opened, target, step_mm, ros, progress)
 
 
-def _convert(
-    recording: Recording, target: Path, step_mm: float | None, overwrite: bool, progress: Progress
-) -> Converted:
+def _convert(recording: Recording, target: Path, step_mm: float | None, ros: bool, progress: Progress) -> Converted:
     with _in_place(target) as part:
-        writer = _writer(recording, target, part, step_mm)
+        writer = _writer(recording, target, part, step_mm, ros)
         with writer:
             for frame in recording:
                 writer.add(frame)
@@ -84,13 +78,17 @@ def _convert(
     return Converted(target, len(recording), writer.notes, list(recording.problems))
 
 
-def _writer(recording: Recording, target: Path, part: Path, step_mm: float | None) -> RecordingWriter:
+def _writer(recording: Recording, target: Path, part: Path, step_mm: float | None, ros: bool) -> RecordingWriter:
     kind, camera = _kind(target), recording.camera
+    if ros and kind != ".mcap":
+        raise RecordingError(f"ROS's messages are written into an .mcap file, not into {target.name}; leave out --ros")
     if kind == ".mcap":
+        from liex_lab.recordings.mcap_writer import McapDepthWriter
+
         if step_mm is not None:
             raise RecordingError("an .mcap file keeps depth as it is, so that --step-mm says nothing; leave it out")
         metadata = {"source": recording.name, "source_format": recording.format} | recording.metadata
-        return McapDepthWriter(part, camera, metadata=metadata)
+        return McapDepthWriter(part, camera, messages="ros" if ros else "foxglove", metadata=metadata)
     step = _step(recording, kind, target) if step_mm is None else step_mm
     if kind == ".oni":
         if step not in _STEPS_MM[kind]:
@@ -159,6 +157,10 @@ def _in_place(target: Path) -> Iterator[Path]:
         if target.is_dir():
             _remove(target)
         part.replace(target)
+    except OSError as error:
+        raise RecordingError(
+            f"the recording cannot be written as {target} ({error.strerror or error}); make room, or name another place"
+        ) from None
     finally:
         _remove(part)
 

@@ -20,7 +20,8 @@ from liex_lab.camera import Camera
 from liex_lab.errors import LiexError
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.writing import McapDepthWriter, OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.mcap_writer import McapDepthWriter
+from liex_lab.recordings.writing import OniRecordingWriter, PictureFolderWriter, RecordingWriter
 
 _N_FRAMES = 150
 _N_REPEATS = 5

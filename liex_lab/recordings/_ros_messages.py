@@ -70,10 +70,6 @@ class _Fields:
     def header(self) -> tuple[int, str]:
         """The stamp, ns, and the frame's name of a std_msgs/Header."""
         self.whole()  # a number that counts up
-        return self.stamp()
-
-    def stamp(self) -> tuple[int, str]:
-        """The stamp and the frame's name."""
         return self.whole() * 10**9 + self.whole(), self.text()
 
 
@@ -89,7 +85,7 @@ class _CdrFields(_Fields):
         self.order = "<" if data[1] else ">"
 
     def header(self) -> tuple[int, str]:
-        return self.stamp()
+        return self.whole("i") * 10**9 + self.whole(), self.text()  # seconds have a sign here
 
 
 def _image(fields: _Fields) -> RawPicture:

@@ -1,4 +1,4 @@
-"""Recordings written frame by frame: as MCAP, as a folder of PNG pictures, as .oni.
+"""Recordings written frame by frame: what every writer promises; folders of PNG pictures, and .oni.
 
 A writer is left with its `with` block: what belongs at the end is written where the block ended well. `notes` then says
 what a reader of the file should know.
@@ -10,7 +10,7 @@ import json
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,10 @@ from liex_lab.camera import Camera
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.steps import LARGEST_STEP, metres, nearest_steps, whole_steps
+from liex_lab.recordings.steps import LARGEST_STEP, nearest_steps, whole_steps
 
 STAMPS = "timestamps.csv"
-DEPTH_TOPIC, CALIBRATION_TOPIC = "/camera/depth", "/camera/calibration"
 _FACTS = ("subject_id", "session_start_time")  # of the metadata, those that a camera.toml can state
-_FRAME_ID = "camera"
-_SECOND = 10**9
-_CHUNK_BYTES = 128 * 1024  # a picture closes its chunk, so that one frame is unpacked to read one frame
 
 
 class RecordingWriter(ABC):
@@ -78,7 +74,7 @@ class PictureFolderWriter(RecordingWriter):
     def add(self, frame: DepthFrame) -> None:
         """Write a picture; a stamp is kept until the end."""
         steps = steps_of(frame, self._step_mm, self._exact)
-        (self.path / f"frame_{len(self._times):06d}.png").write_bytes(_png(steps))
+        (self.path / f"frame_{len(self._times):06d}.png").write_bytes(png_of(steps))
         self._times.append(frame.time_ns)
 
     def finish(self) -> None:
@@ -95,89 +91,6 @@ class PictureFolderWriter(RecordingWriter):
 
     def release(self) -> None:
         """Nothing is held open."""
-
-
-class McapDepthWriter(RecordingWriter):
-    """Foxglove's RawImage (or CompressedImage, as PNG) and CameraCalibration in zstd chunks, stamped in nanoseconds.
-
-    Whole millimetres are 16UC1. From the first frame on that is something else, depth is 32FC1 in metres. `mcap`'s own
-    writer: Foxglove's goes on without a word when the disk is full.
-    """
-
-    def __init__(
-        self, path: Path, camera: Camera, *, packing: Literal["raw", "png"] = "raw",
-        metadata: dict[str, Any] | None = None,
-    ) -> None:  # fmt: skip
-        from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-        from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-        from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-        from mcap.writer import Writer
-
-        from liex_lab.recordings.mcap import NOTES
-
-        super().__init__(path, camera)
-        self._packing, self._float, self._n_off = packing, False, 0
-        self._calibrated_ns: int | None = None
-        self._make: dict[str, Any] = {"raw": RawImage, "png": CompressedImage, "lens": CameraCalibration}
-        self._file = path.open("wb")
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-        self._writer.start("liex_lab", "liex_lab")
-        facts = {key: str(value) for key, value in (metadata or {}).items()}
-        self._writer.add_metadata(NOTES, facts | {"camera_source": camera.source})
-        self._lens = self._channel(CALIBRATION_TOPIC, CameraCalibration)
-        self._depth = self._channel(DEPTH_TOPIC, self._make[packing])
-
-    def _channel(self, topic: str, message: Any) -> int:
-        schema = self._writer.register_schema(message.DESCRIPTOR.full_name, "protobuf", _definition(message))
-        return self._writer.register_channel(topic, "protobuf", schema)
-
-    def add(self, frame: DepthFrame) -> None:
-        """Write a picture, and about once a second the calibration, so that a viewer may start anywhere."""
-        if self._calibrated_ns is None or frame.time_ns - self._calibrated_ns >= _SECOND:
-            self._calibrated_ns = frame.time_ns
-            self._log(self._lens, self._calibration(), frame.time_ns)
-        self._log(self._depth, self._picture(frame), frame.time_ns)
-
-    def _log(self, channel: int, message: Any, time_ns: int) -> None:
-        message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _SECOND)
-        message.frame_id = _FRAME_ID
-        logged_ns = max(0, time_ns)  # the time of logging has no sign; the stamp is what counts
-        self._writer.add_message(channel, logged_ns, message.SerializeToString(), logged_ns)
-
-    def _picture(self, frame: DepthFrame) -> Any:
-        depth = frame.depth
-        if self._packing == "png":
-            return self._make["png"](format="png", data=_png(steps_of(frame, 1.0, True)))
-        steps = None if self._float else whole_steps(depth, 1.0)
-        height, width = depth.shape
-        if steps is not None:
-            data, encoding = steps.astype("<u2", copy=False).tobytes(), "16UC1"
-        else:
-            self._float = True
-            scaled, n_off = metres(depth)
-            self._n_off += n_off
-            data, encoding = scaled.astype("<f4", copy=False).tobytes(), "32FC1"
-        return self._make["raw"](width=width, height=height, encoding=encoding, step=len(data) // height, data=data)
-
-    def _calibration(self) -> Any:
-        k = self.camera.matrix
-        p = np.hstack([k, np.zeros((3, 1))])
-        return self._make["lens"](
-            width=self.camera.width, height=self.camera.height, K=k.ravel().tolist(), R=np.eye(3).ravel().tolist(),
-            P=p.ravel().tolist(),
-        )  # fmt: skip
-
-    def finish(self) -> None:
-        """Write the index."""
-        self._writer.finish()
-        if self._float:
-            self.notes.append("depth is not in whole millimetres and was written as 32-bit metres")
-        if self._n_off:
-            self.notes.append(f"{self._n_off} depths differ in the last of their 24 bits, which metres do not hold")
-
-    def release(self) -> None:
-        """Close the file."""
-        self._file.close()
 
 
 class OniRecordingWriter(RecordingWriter):
@@ -232,28 +145,10 @@ def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint1
     )
 
 
-def _png(steps: NDArray[np.uint16]) -> bytes:
+def png_of(steps: NDArray[np.uint16]) -> bytes:
+    """A picture (H, W) as 16-bit PNG."""
     import cv2
 
     good, packed = cv2.imencode(".png", steps)
     assert good
     return bytes(packed.tobytes())
-
-
-def _definition(message: Any) -> bytes:
-    """The protobuf definition of a message, with those that it is made of, as an MCAP schema wants it."""
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-
-    files: dict[str, Any] = {}
-
-    def gather(file: Any) -> None:
-        for needed in file.dependencies:
-            if needed.name not in files:
-                gather(needed)
-        files[file.name] = file
-
-    gather(message.DESCRIPTOR.file)
-    whole = FileDescriptorSet()
-    for file in files.values():
-        file.CopyToProto(whole.file.add())
-    return bytes(whole.SerializeToString())

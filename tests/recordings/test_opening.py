@@ -31,7 +31,7 @@ STORED = depth_frames(4)
         ("fish.rays", "export its depth maps as TIFF"),
         ("colour.JPG", "16-bit depth was expected"),
         ("colour.mp4", "16-bit depth was expected"),
-        ("xtion.oni", "not read yet"),
+        ("xtion.oni", "xtion.oni"),
         ("session.bag", "something else"),
         ("notes.txt", "a folder of 16-bit PNG or TIFF"),
         ("noextension", "a folder of 16-bit PNG or TIFF"),
