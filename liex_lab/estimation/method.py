@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.forests.grow import GrowthPlan
 
@@ -41,6 +42,8 @@ class Method:
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
+    survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
+    pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card."""
@@ -52,6 +55,8 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
+        if plain.get("pruner"):
+            plain["pruner"] = GrowthPlan(**plain["pruner"])
         return Method(**plain)
 
 
@@ -59,13 +64,14 @@ _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
     "default": Method(
-        variant="default", rounds=5, n_candidates=10, training_candidates=8,
+        variant="default", rounds=5, n_candidates=16, training_candidates=8,
         regressors=GrowthPlan(12, 18, 22, 100, 0.3, 0.15, 0.3, 0.63),
         metric=GrowthPlan(80, 9, 50, 100, 0.45, 0.1, 0.3, 0.5),
         reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
         keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
         metric_shrinkage=0.15, mean_shift_mm=0.0,
         top_k=10, top_tau=1.0, top_radius_mm=15.0,
+        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
     ),
     "paper": Method(
         variant="paper", rounds=3, n_candidates=40, training_candidates=6,
@@ -78,8 +84,32 @@ METHODS = {
 }  # fmt: skip
 
 
-def method_of(variant: str) -> Method:
-    """The method of a variant's name."""
+# what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
+_OWN: dict[tuple[str, str], dict[str, Any]] = {
+    ("fish", "paper"): {
+        "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
+    },
+    ("hand", "paper"): {
+        "n_candidates": 20, "reach_mm": 50.0, "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
+    },
+}  # fmt: skip
+_LENGTHS = (
+    "reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm", "joint_lever_mm",
+    "scale_lever_mm",
+)  # fmt: skip
+
+
+def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
+    """The method of a variant's name for an animal; None is the mouse.
+
+    Lengths are the mouse's over its home length times the animal's, unless the animal has its own; where the animal is
+    looked at along the optical axis, every variant does so.
+    """
     if variant not in METHODS:
         raise PlanError(f"there is no variant '{variant}'; known are {', '.join(METHODS)}")
-    return METHODS[variant]
+    method = METHODS[variant]
+    if skeleton is None:
+        return method
+    scaled = {name: getattr(method, name) * skeleton.relative_size for name in _LENGTHS}
+    scaled["camera_view"] = method.camera_view or skeleton.view.frame == VIEWS[1]
+    return replace(method, **(scaled | _OWN.get((skeleton.name, variant), {})))

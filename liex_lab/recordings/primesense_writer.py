@@ -29,7 +29,7 @@ _NODE = 1
 _LARGEST = {"16zT": 0xFFFF, "16zP": 0x7FFF, "NONE": 0xFFFF}  # stored value
 _PIXEL_FORMATS = {1.0: 100, 0.1: 101}  # mm in a stored step: OpenNI's number for it
 _UNKNOWN_COUNT, _UNKNOWN_TIME = 0xFFFFFFFF, 2**64 - 1  # what stands in a file until it is closed
-_NOMINAL_FPS = 30
+_NOMINAL_FPS = 30.0
 _MOST_IN_SEEK_TABLE = 288_000  # OpenNI2 cannot open a file with a longer table, but one without a table
 
 
@@ -58,7 +58,8 @@ def write_oni(
     if unit_mm not in _PIXEL_FORMATS:
         raise ValueError(f"a step of an .oni file is 1 mm or 0.1 mm, got {unit_mm}")
     start_us = min(0, _microseconds(int(recording.times_ns[0])))  # the format has no time before zero
-    with _in_place(path) as part, OniWriter(part, recording.camera, codec=codec, unit_mm=unit_mm, exact=exact) as out:
+    rate_hz = float(np.nan_to_num(recording.rate_hz, nan=_NOMINAL_FPS))
+    with _in_place(path) as part, OniWriter(part, recording.camera, codec, unit_mm, rate_hz, exact=exact) as out:
         for frame in recording:
             out.add(_microseconds(frame.time_ns) - start_us, frame.depth)
             progress(frame.index + 1, len(recording), f"writing {path.name}")
@@ -73,15 +74,30 @@ class OniWriter:
     """One depth node, written as it comes; leaving its `with` block closes the file properly."""
 
     def __init__(
-        self, path: Path, camera: Camera, *, codec: Codec = "16zT", unit_mm: float = 1.0, exact: bool = True
+        self,
+        path: Path,
+        camera: Camera,
+        codec: Codec = "16zT",
+        unit_mm: float = 1.0,
+        rate_hz: float = _NOMINAL_FPS,
+        *,
+        exact: bool = True,
     ) -> None:
+        """rate_hz: what the file says of itself; every frame has its own time. The others are those of `write_oni`."""
         self._codec, self._unit_mm, self._exact = codec, unit_mm, exact
         self._entries: list[tuple[int, int]] = []  # time in µs and position of every frame
         self._file: IO[bytes] = path.open("wb")
+        try:
+            self._begin(camera, rate_hz)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _begin(self, camera: Camera, rate_hz: float) -> None:
         self._file.write(records.FILE_HEADER.pack(records.FILE_MAGIC, *records.VERSION, _UNKNOWN_TIME, _NODE))
         self._node_at = self._file.tell()
         self._write(records.NODE, self._node_fields(_UNKNOWN_COUNT, _UNKNOWN_TIME, 0))
-        for kind, name, value in _properties(camera, _PIXEL_FORMATS[unit_mm]):
+        for kind, name, value in _properties(camera, _PIXEL_FORMATS[self._unit_mm], rate_hz):
             self._write(kind, records.text(name) + struct.pack("<I", len(value)) + value)
         self._write(records.NODE_READY)
         self._write(records.DATA_BEGIN, struct.pack("<IQ", _UNKNOWN_COUNT, _UNKNOWN_TIME))
@@ -118,9 +134,10 @@ class OniWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if kind is None:
-            self.close()
-        else:
+        try:
+            if kind is None:
+                self.close()
+        finally:
             self.abandon()
 
     def abandon(self) -> None:
@@ -155,9 +172,9 @@ class OniWriter:
         return steps.astype("<u2")
 
 
-def _properties(camera: Camera, pixel_format: int) -> list[tuple[int, str, bytes]]:
+def _properties(camera: Camera, pixel_format: int, rate_hz: float) -> list[tuple[int, str, bytes]]:
     """Kind, name and value of what a node says of itself; OpenNI2's player wants all but the last, in this form."""
-    mode = struct.pack("<III", camera.width, camera.height, _NOMINAL_FPS)
+    mode = struct.pack("<III", camera.width, camera.height, round(min(max(rate_hz, 1.0), 1000.0)))
     view = [2 * math.atan(n / 2 / f) for n, f in ((camera.width, camera.fx), (camera.height, camera.fy))]
     integers = {
         "oniRequiredFrameSize": 2 * camera.width * camera.height, "xnIsGenerating": 1, "xnDeviceMaxDepth": 0xFFFF,

@@ -12,6 +12,7 @@ from liex_lab.camera import PRIMESENSE
 from liex_lab.errors import LiexError
 from liex_lab.progress import silent
 
+
 def test_what_is_promised_is_measured() -> None:
     assert set(job._FORMATS) == {"mcap_zstd_raw", "mcap_zstd_png", "png_folder", "moseq_dat", "oni_16zt"}
     camera, pictures = job._rendered(silent)

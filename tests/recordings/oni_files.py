@@ -6,7 +6,7 @@ Independent of the product's writer, so that neither can hide the other's mistak
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,14 @@ class OniBuilder:
         return at
 
     def node(
-        self, number: int, name: str, kind: int, codec: str, n_frames: int = OPEN_FILE, record: int = 0x0D, table: int = 0
+        self,
+        number: int,
+        name: str,
+        kind: int,
+        codec: str,
+        n_frames: int = OPEN_FILE,
+        record: int = 0x0D,
+        table: int = 0,
     ) -> int:
         """Add a node, in the form of version 1.0.0.4 (record 0x02), 1.0.0.5 (0x0C) or of today; where it begins."""
         fields = text(name) + struct.pack("<i4s", kind, codec.encode())
@@ -74,10 +81,17 @@ class OniBuilder:
         for name, value in values.items():
             self.record(0x06, node, text(name) + struct.pack("<I", len(value)) + value)
 
-    def depth_properties(self, node: int, width: int, height: int, fov: tuple[float, float] | None = (1.0, 0.8)) -> None:
+    def depth_properties(
+        self,
+        node: int,
+        width: int,
+        height: int,
+        fov: tuple[float, float] | None = (1.0, 0.8),
+        crop: bytes = bytes(12),
+    ) -> None:
         """What OpenNI2's player wants of a depth node."""
         shape = mode(width, height)
-        self.properties(node, xnMapOutputMode=shape, xnSupportedMapOutputModes=shape, xnCropping=bytes(12))
+        self.properties(node, xnMapOutputMode=shape, xnSupportedMapOutputModes=shape, xnCropping=crop)
         if fov:
             self.properties(node, xnFOV=struct.pack("<dd", *fov))
         self.integers(
@@ -97,11 +111,10 @@ class OniBuilder:
         known.append((time_us, at))
         return at
 
-    def seek_table(self, node: int, configurations: Iterable[int] | None = None) -> int:
+    def seek_table(self, node: int) -> int:
         """Add the table of a node's frames; where it begins."""
         entry, known = "<QII" if self.old else "<QIQ", self.frames.get(node, [])
-        of = list(configurations or [3] * len(known))
-        rows = [struct.pack(entry, 0, 0, 0), *(struct.pack(entry, t, c, at) for (t, at), c in zip(known, of, strict=True))]
+        rows = [struct.pack(entry, 0, 0, 0), *(struct.pack(entry, time_us, 3, at) for time_us, at in known)]
         return self.record(0x0E, node, payload=b"".join(rows))
 
     def write(self, path: Path, closed: bool = True) -> Path:
@@ -123,13 +136,14 @@ def depth_builder(
     closed: bool = True,
     table: bool = False,
     times_us: Sequence[int] | None = None,
+    crop: bytes = bytes(12),
 ) -> OniBuilder:
     """A file with one depth node, all but its last record. record: form of the node's own one; table: of seeking."""
     where = 0
     for _ in range(2 if table else 1):  # where the table is, is known only once it is there
         made = OniBuilder(old)
         made.node(1, "Depth", DEPTH, codec, len(payloads) if closed else OPEN_FILE, record, where)
-        made.depth_properties(1, width, height)
+        made.depth_properties(1, width, height, crop=crop)
         made.begin(1)
         for k, payload in enumerate(payloads):
             made.frame(1, times_us[k] if times_us else k * STEP_US, payload)

@@ -50,7 +50,7 @@ def _run(folder: Path, *arguments: str) -> Witnessed:
         pytest.skip(f"{LIBRARY} is not installed (apt install libopenni2-0)")
     out = folder / "witnessed.npz"
     command = [sys.executable, "-m", "tests.recordings.openni2", str(out), *arguments]
-    ran = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
+    ran = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=30)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     with np.load(out) as found:
         return Witnessed(found["frames"], found["times_us"], tuple(found["fov"].tolist()))
