@@ -93,8 +93,10 @@ def _writer(recording: Recording, target: Path, part: Path, step_mm: float | Non
     if kind == ".oni":
         if step not in _STEPS_MM[kind]:
             raise RecordingError(f"{target.name} holds steps of 1 mm or 0.1 mm, got {step:g}; state one of them")
-        start_ns = int(recording.times_ns[0])
-        return OniRecordingWriter(part, camera, step_mm=step, exact=step_mm is None, start_ns=start_ns)
+        return OniRecordingWriter(
+            part, camera, step_mm=step, exact=step_mm is None, start_ns=int(recording.times_ns[0]),
+            rate_hz=recording.rate_hz if len(recording) > 1 else 30.0,
+        )  # fmt: skip
     return PictureFolderWriter(part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata)
 
 

@@ -97,15 +97,22 @@ class OniRecordingWriter(RecordingWriter):
     """PrimeSense's .oni; step_mm: 1.0 or 0.1; exact: refuse depths between steps instead of rounding them."""
 
     def __init__(
-        self, path: Path, camera: Camera, *, step_mm: float = 1.0, exact: bool = True, start_ns: int = 0
+        self,
+        path: Path,
+        camera: Camera,
+        *,
+        step_mm: float = 1.0,
+        exact: bool = True,
+        start_ns: int = 0,
+        rate_hz: float = 30.0,
     ) -> None:
-        """start_ns: of the first frame; the format has no time before zero."""
+        """start_ns: of the first frame, for the format has no time before zero; rate_hz: what the file says of it."""
         from liex_lab.recordings.primesense_writer import OniWriter
 
         super().__init__(path, camera)
         self._step_mm, self._exact, self._earlier_ns = step_mm, exact, min(0, start_ns)
         self._rounded = False
-        self._oni = OniWriter(path, camera, unit_mm=step_mm, exact=exact)
+        self._oni = OniWriter(path, camera, unit_mm=step_mm, rate_hz=rate_hz, exact=exact)
 
     def add(self, frame: DepthFrame) -> None:
         """Write a picture with its time in microseconds."""
