@@ -130,7 +130,7 @@ class SessionWriter:
         """The track as the tables see it."""
         origin = self.origin
         index = np.array(self._index, np.int64)
-        return Rows(self.track, index, origin.name, origin.individual, origin.gaps)
+        return Rows(self.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones)
 
     @property
     def frames(self) -> pd.DataFrame:
