@@ -14,8 +14,8 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera, Lens
-from liex_lab.errors import RecordingError
+from liex_lab.camera import Camera, Distortion, Lens
+from liex_lab.errors import LiexError, RecordingError
 from liex_lab.progress import Progress
 from liex_lab.recordings._depth_pictures import decode, picture_size
 from liex_lab.recordings._message_file import Channel, Envelope, MessageFile, Place, printable
@@ -254,19 +254,7 @@ def _camera(
     """Stated by the caller, or else calibrated in the file, or else in a camera.toml beside it."""
     found = _calibration_of(topic, calibrations)
     if stated is None and found is not None:
-        where, message = found
-        rectified = len(message.p) == 12 and message.p[0] > 0 and "rect" in topic.name.rpartition("/")[2]
-        k = (*message.p[0:3], *message.p[4:7]) if rectified else message.k[:6]
-        if any(message.d) and not rectified:
-            problems.append(f"{printable(where)} states a lens distortion, which is not undone")
-        kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
-        source = notes.get("camera_source", f"{kind} on {where}")  # a converted file keeps where the numbers came from
-        size = _size(topic, (message.width, message.height))
-        camera = Camera(
-            fx=k[0], fy=k[4], cx=k[2], cy=k[5], width=message.width or size[0], height=message.height or size[1],
-            source=printable(source),
-        )  # fmt: skip
-        return fitting(camera, *size, f"the {printable(source)}")
+        return _calibrated(topic, *found, notes, problems)
     if stated is None and not camera_file.intrinsics:
         several = f", which has {len(calibrations)} calibrations, none of them for" if calibrations else " for"
         raise RecordingError(
@@ -281,6 +269,32 @@ def _camera(
             "with [camera], width = ... and height = ... in pixels, to say which picture they are seen in"
         )
     return camera_file.camera(*size, stated)
+
+
+def _calibrated(
+    topic: _Topic, where: str, calibration: Calibration, notes: dict[str, str], problems: list[str]
+) -> Camera:
+    """The camera of a calibration; without distortion where the picture was straightened, and for points."""
+    is_cloud = plain_schema(topic.channel) in CLOUD_SCHEMAS
+    straight = "rect" in topic.name.rpartition("/")[2] or is_cloud
+    p = calibration.p
+    k = (*p[0:3], *p[4:7]) if straight and len(p) == 12 and p[0] > 0 else calibration.k[:6]
+    bent = None
+    try:
+        bent = None if straight else Distortion.of(calibration.model, calibration.d)
+    except LiexError:
+        problems.append(
+            f"{printable(where)} states a lens distortion ({printable(calibration.model)}) that is not known and so "
+            "not undone"
+        )
+    kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
+    source = notes.get("camera_source", f"{kind} on {where}")  # a converted file keeps where the numbers came from
+    size = _size(topic, (calibration.width, calibration.height))
+    camera = Camera(
+        fx=k[0], fy=k[4], cx=k[2], cy=k[5], width=calibration.width or size[0], height=calibration.height or size[1],
+        source=printable(source), distortion=bent,
+    )  # fmt: skip
+    return fitting(camera, *size, f"the {kind} on {printable(where)}")
 
 
 def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:

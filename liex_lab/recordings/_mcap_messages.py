@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from liex_lab.camera import Camera
+from liex_lab.camera import KANNALA_BRANDT, Camera
 from liex_lab.errors import RecordingError
 
 FRAME_ID = "camera"
@@ -53,6 +53,17 @@ def _matrices(camera: Camera) -> tuple[list[float], list[float], list[float]]:
     return k.ravel().tolist(), np.eye(3).ravel().tolist(), p.ravel().tolist()
 
 
+def _distortion(camera: Camera) -> tuple[str, list[float]]:
+    """ROS's name of the lens's model, and its coefficients; Foxglove takes the same."""
+    bent = camera.distortion
+    if bent is None:
+        return "plumb_bob", [0.0] * 5
+    values = list(bent.coefficients)
+    if bent.model == KANNALA_BRANDT:
+        return "equidistant", values
+    return ("rational_polynomial", values) if any(values[5:]) else ("plumb_bob", values[:5])
+
+
 class FoxgloveMessages(Messages):
     """foxglove.RawImage, CompressedImage and CameraCalibration."""
 
@@ -77,7 +88,11 @@ class FoxgloveMessages(Messages):
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         k, r, p = _matrices(camera)
-        return _stamped(self._lens(width=camera.width, height=camera.height, K=k, R=r, P=p), time_ns)
+        model, d = _distortion(camera)
+        lens = self._lens(
+            width=camera.width, height=camera.height, distortion_model=model, D=d, K=k, R=r, P=p
+        )  # fmt: skip
+        return _stamped(lens, time_ns)
 
 
 def _stamped(message: Any, time_ns: int) -> bytes:
@@ -166,9 +181,10 @@ class RosMessages(Messages):
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         out = _Cdr(time_ns)
         out.whole(camera.height, camera.width)
-        out.text("plumb_bob")
-        out.whole(5)
-        out.floats([0.0] * 5)
+        model, d = _distortion(camera)
+        out.text(model)
+        out.whole(len(d))
+        out.floats(d)
         for numbers in _matrices(camera):
             out.floats(numbers)
         out.whole(0, 0, 0, 0, 0, 0)  # not binned, the whole picture

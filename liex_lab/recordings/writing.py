@@ -82,6 +82,8 @@ class PictureFolderWriter(RecordingWriter):
         camera = self.camera
         numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
         facts: dict[str, Any] = numbers | {"unit_mm": self._step_mm} | self._facts
+        if camera.distortion is not None:
+            facts |= {"distortion": camera.distortion.coefficients, "distortion_model": camera.distortion.model}
         lines = [f"# intrinsics: {' '.join(camera.source.split())}", "[camera]"]
         lines += [f"{key} = {json.dumps(value)}" for key, value in facts.items()]
         (self.path / CAMERA_FILE).write_text("\n".join([*lines, ""]), encoding="utf-8")
@@ -127,6 +129,10 @@ class OniRecordingWriter(RecordingWriter):
             self.notes.append("times were rounded to microseconds, which is what .oni holds")
         if self._earlier_ns:
             self.notes.append(f"times count from {self._earlier_ns} ns, for .oni has none before zero")
+        if self.camera.distortion is not None:
+            self.notes.append(
+                f"the lens distortion ({self.camera.distortion}) was left out, for .oni has no place for it"
+            )
         if not self._exact:
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
 

@@ -36,6 +36,7 @@ class How:
     camera: Camera = SMALL
     calibrated: bool = True
     distortion: tuple[float, ...] = ()
+    model: str = "plumb_bob"
     big_endian: bool = False
     padding: int = 0
     log_delay_ns: int = 0
@@ -55,7 +56,7 @@ def ros_messages(ros: int, frames: NDArray[Any], how: How) -> Iterator[tuple[str
     for topic in how.topics:
         if how.calibrated:
             info = topic.rpartition("/")[0] + "/camera_info"
-            yield info, times[0] + how.log_delay_ns, _camera_info(ros, how.camera, topic, times[0], how.distortion)
+            yield info, times[0] + how.log_delay_ns, _camera_info(ros, topic, times[0], how)
     for time_ns, frame in zip(times, frames, strict=True):
         for topic in how.topics:
             stamp = time_ns if how.stamped else 0
@@ -129,13 +130,13 @@ def _header(ros: int, time_ns: int, frame_id: str) -> Any:
     return types["std_msgs/msg/Header"](*([7] if ros == 1 else []), stamp, frame_id)
 
 
-def _camera_info(ros: int, camera: Camera, frame_id: str, time_ns: int, distortion: Sequence[float]) -> Any:
-    types = store(ros).types
+def _camera_info(ros: int, frame_id: str, time_ns: int, how: How) -> Any:
+    types, camera = store(ros).types, how.camera
     k = camera.matrix
     p = np.hstack([k, np.zeros((3, 1))])
     region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     return types["sensor_msgs/msg/CameraInfo"](
-        _header(ros, time_ns, frame_id), camera.height, camera.width, "plumb_bob", np.array(distortion, float),
+        _header(ros, time_ns, frame_id), camera.height, camera.width, how.model, np.array(how.distortion, float),
         k.ravel(), np.eye(3).ravel(), p.ravel(), 0, 0, region,
     )  # fmt: skip
 

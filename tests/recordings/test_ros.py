@@ -13,7 +13,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1
 from rosbags.highlevel import AnyReader
 
-from liex_lab.camera import Camera, Lens
+from liex_lab.camera import Camera, Distortion, Lens
 from liex_lab.recordings import open_recording
 from tests.recordings.asking import opened_or_refused, refusal
 from tests.recordings.ros_writers import How, ros_messages, store, write_bag, write_db3, write_ros_mcap
@@ -143,13 +143,24 @@ def test_a_file_without_stamps_has_the_times_of_logging(write: Writer) -> None:
         assert any("no stamp" in problem for problem in recording.problems)
 
 
-def test_distortion_is_told_unless_the_picture_is_rectified(write: Writer) -> None:
-    how = {"distortion": (0.1, 0.0, 0.0, 0.0, 0.0), "topics": ("/d/image_raw", "/rect/image_rect_raw")}
-    path = write(**how)
+def test_distortion_belongs_to_the_camera_unless_the_picture_is_straightened(write: Writer) -> None:
+    path = write(distortion=(0.1, 0.0, 0.0, 0.0, 0.0), topics=("/d/image_raw", "/straight/image_rect_raw"))
     with open_recording(path, topic="/d/image_raw") as recording:
-        assert any("distortion" in problem for problem in recording.problems)
-    with open_recording(path, topic="/rect/image_rect_raw") as recording:
-        assert recording.problems == []
+        assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
+    with open_recording(path, topic="/straight/image_rect_raw") as recording:
+        assert recording.camera.distortion is None
+
+
+def test_points_are_straight_already(write: Writer) -> None:
+    with open_recording(write(kind="loose cloud", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))) as recording:
+        assert recording.camera.distortion is None
+        np.testing.assert_allclose(recording.frame(2).depth, STORED[2], atol=1e-3)
+
+
+def test_a_distortion_that_is_not_known_is_told(write: Writer) -> None:
+    with open_recording(write(model="Inverse Brown Conrady", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))) as recording:
+        assert recording.camera.distortion is None
+        assert "Inverse Brown Conrady" in recording.problems[0]
 
 
 @pytest.mark.parametrize("compression", [*CompressionType])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
+from liex_lab.camera import Distortion
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame, depth_mm
@@ -57,6 +59,25 @@ def test_what_is_written_is_read_again(tmp_path: Path, kind: str, start_ns: int)
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
         assert recording.camera.matrix.tolist() == SMALL.matrix.tolist()
     assert notes == (["times were rounded to microseconds, which is what .oni holds"] if kind == "oni" else [])
+
+
+BENT = [
+    Distortion.of("plumb_bob", [0.1, -0.02, 0.001, 0.002, 0.03]),
+    Distortion.of("rational_polynomial", [0.1, -0.02, 0.001, 0.002, 0.03, 0.4, 0.05, 0.06]),
+    Distortion.of("equidistant", [0.1, -0.02, 0.01, 0.001]),
+]
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("distortion", BENT, ids=str)
+def test_a_bent_lens_stays_bent(tmp_path: Path, kind: str, distortion: Distortion, monkeypatch: Any) -> None:
+    monkeypatch.setattr("tests.recordings.test_writing.SMALL", replace(SMALL, distortion=distortion))
+    writer = WRITERS[kind](tmp_path)
+    notes = fill(writer, STORED[:2])
+    with open_recording(writer.path) as recording:
+        assert recording.camera.distortion == (None if kind == "oni" else distortion)
+        np.testing.assert_array_equal(recording.frame(0).depth, STORED[0])
+    assert any("distortion" in note for note in notes) == (kind == "oni")
 
 
 def test_oni_counts_from_zero_where_a_recording_begins_before(tmp_path: Path) -> None:
