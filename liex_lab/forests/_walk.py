@@ -219,7 +219,7 @@ def llvm_text(name: str, several: bool) -> str:
         f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
         f"declare i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS})",
         f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 %stride, i32 %side, "
-        "ptr noalias %leaf, i64 %first) {",
+        "ptr noalias %leaf, i64 %first) noinline {",
         "entry:", *text.lines, "}",
     ])  # fmt: skip
 
