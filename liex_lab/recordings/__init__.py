@@ -19,16 +19,17 @@ __all__ = ["DepthFrame", "Gap", "Recording", "open_recording"]
 _READS = (
     "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix camera with a "
     "raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or .tar.gz), a PrimeSense recording "
-    "(.oni) or an MCAP file with Foxglove depth pictures"
+    "(.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
 _MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
 _ALONE = {  # how the name of a file ends that holds a whole recording: its module and function
     ".tar.gz": "moseq.open_moseq", ".tgz": "moseq.open_moseq", ".tar": "moseq.open_moseq", ".avi": "moseq.open_moseq",
     ".mkv": "moseq.open_moseq", ".mcap": "mcap.open_mcap", ".oni": "primesense.open_oni",
+    ".bag": "rosbag.open_bag", ".db3": "rosbag.open_bag",
 }  # fmt: skip
 _FILES = _ALONE | {".dat": "moseq.open_moseq"} | dict.fromkeys(_PICTURES, "images.open_images")
-_WITH_TOPICS = ("mcap.open_mcap",)
+_WITH_TOPICS = ("mcap.open_mcap", "rosbag.open_bag")
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; compute metric depth in RxLive, save "
     "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, write a raytrix.toml "
@@ -46,7 +47,7 @@ _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".ply", ".xyz"), _CLOUD),
     **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT),
-    **dict.fromkeys((".bag", ".db3", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
+    **dict.fromkeys((".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
 
 
@@ -81,8 +82,9 @@ def open_recording(
 
     path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual mouse (see `open_synthetic`); camera:
     comes before whatever the files state, a `Lens` for pictures of any size; fps: used only where the files hold no
-    time stamps; topic: of an MCAP file with several depth topics; strict: refuse a recording that is cut short, instead
-    of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an index made.
+    time stamps; topic: of an MCAP file or a ROS bag with several depth topics; strict: refuse a recording that is cut
+    short, instead of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an
+    index made.
     """
     path = Path(path)
     try:

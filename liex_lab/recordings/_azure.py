@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from liex_lab.camera import Camera
+from liex_lab.camera import Camera, Distortion
 
 
 class Mode(NamedTuple):
@@ -70,5 +70,7 @@ def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
         "cx": cx * mode.side - mode.left - 0.5, "cy": cy * mode.side - mode.top - 0.5,
         "width": mode.width, "height": mode.height,
     }  # fmt: skip
-    source = f"typical Azure Kinect, {mode.name}" if lens is None else "the camera's factory calibration in the file"
-    return Camera(**facts, source=source)
+    if lens is None:
+        return Camera(**facts, source=f"typical Azure Kinect, {mode.name}")
+    distortion = Distortion.of("rational_polynomial", lens.distortion)
+    return Camera(**facts, source="the camera's factory calibration in the file", distortion=distortion)

@@ -221,8 +221,6 @@ class _Session:
         lenses = [read_calibration(data) for data in track.attachments.values()] if track is not None else []
         lens = next((lens for lens in lenses if lens is not None), None)
         if mode is not None and lens is not None:
-            if any(lens.distortion):
-                self.problems.append("the factory calibration states a lens distortion, which is not undone")
             return azure_camera(mode, lens)
         kind = self._which_camera(track)
         if kind == beside.KINECT_V2 and (width, height) == _KINECT_V2_SIZE:

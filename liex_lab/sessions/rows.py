@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
+from liex_lab.recordings.walls import UNKNOWN, Arena
+from liex_lab.recordings.zones import Zone, zone_names
 from liex_lab.sessions.tables import ROWS_PER_GROUP, Block, Words
 from liex_lab.tracking.track import Track
 
@@ -25,13 +27,15 @@ _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 @dataclass(frozen=True)
 class Rows:
-    """A track, the camera's frame count of its rows, and the names that every row carries."""
+    """A track, the camera's frame count of its rows, the names that every row carries, and where the animal can be."""
 
     track: Track
     frame_index: NDArray[np.int64]
     session_id: str
     individual: str
     camera_gaps: Sequence[Gap] = ()
+    arena: Arena = UNKNOWN
+    zones: Sequence[Zone] = ()
 
     @property
     def time_s(self) -> Array:
@@ -53,6 +57,8 @@ class Rows:
             "n_foreground_px": track.n_foreground_px,
             **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
             **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
+            "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
+            "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
             "spine_mm": track.spine_mm, "scale": track.scale,
             "flag": track.flag,
         }  # fmt: skip

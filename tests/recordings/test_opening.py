@@ -37,7 +37,7 @@ STORED = depth_frames(4)
         ("colour.JPG", "16-bit depth was expected"),
         ("colour.mp4", "16-bit depth was expected"),
         ("xtion.oni", "something else"),
-        ("session.bag", "not read yet"),
+        ("session.bag", "something else"),
         ("notes.txt", "a folder of 16-bit PNG, TIFF"),
         ("noextension", "a folder of 16-bit PNG, TIFF"),
         ("empty.png", "cut short"),

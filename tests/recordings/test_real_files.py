@@ -146,6 +146,24 @@ def test_an_mcap_without_depth_says_what_it_holds(reference_data: Path) -> None:
     assert "/image/compressed (foxglove.CompressedImage, json)" in sentence
 
 
+def test_a_realsense_bag_holds_what_independent_readers_found(
+    reference_data: Path, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    path = reference_data / "depth_files" / "realsense_bag" / "single_depth_color_640x480.bag"
+    with open_recording(path, strict=True) as recording:
+        assert (len(recording), recording.width, recording.height, recording.problems) == (2, 640, 480, [])
+        camera = recording.camera
+        np.testing.assert_allclose(
+            [camera.fx, camera.fy, camera.cx, camera.cy], [390.43, 390.43, 331.39, 242.19], atol=0.01
+        )
+        assert recording.times_ns.tolist() == [360_815_089_000, 360_981_765_000]
+        for frame in recording:
+            assert_as_expected(frame.depth, expected[f"realsense_bag/{path.name} message {frame.index}"])
+        with open_recording(cut(path, 0.97, tmp_path / "cut.bag")) as part:
+            assert part.truncated
+            np.testing.assert_array_equal(part.frame(0).depth, recording.frame(0).depth)
+
+
 def test_a_real_kinect_session_is_read_as_it_was_recorded(reference_data: Path) -> None:
     with open_recording(reference_data / "mouse_kinect2" / "session_20170125.tar.gz", strict=True) as recording:
         assert (len(recording), recording.width, recording.height) == (300, 512, 424)
