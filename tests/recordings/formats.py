@@ -17,6 +17,7 @@ import numpy as np
 import tifffile
 from mcap.reader import make_reader
 from numpy.typing import NDArray
+from rosbags import rosbag1
 
 from tests.recordings.picture_writers import (
     write_folder,
@@ -28,6 +29,7 @@ from tests.recordings.picture_writers import (
     write_tiff,
     write_xyz,
 )
+from tests.recordings.ros_writers import write_bag, write_db3, write_ros_mcap
 from tests.recordings.video_writers import write_video_session
 from tests.recordings.writers import (
     Frames,
@@ -157,9 +159,18 @@ def _mcap_ends(path: Path) -> list[int]:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None
-        times = [message.log_time for _, _, message in reader.iter_messages(topics=["/camera/depth"])]
+        topics = ["/camera/depth", "/camera/depth/image_raw"]
+        times = [message.log_time for _, _, message in reader.iter_messages(topics=topics)]
     chunks = summary.chunk_indexes
     return [next(c.chunk_start_offset + c.chunk_length for c in chunks if t <= c.message_end_time) for t in times]
+
+
+def _bag_ends(path: Path) -> list[int]:
+    """For each depth picture the end of its chunk, as the file's own index has it."""
+    with rosbag1.Reader(path) as reader:
+        (depth,) = [c for c in reader.connections if c.msgtype.endswith("/Image")]
+        ends = {at: chunk.datapos + chunk.datasize for at, chunk in reader.chunks.items()}
+        return [ends[entry.chunk_pos] for entry in reader.indexes[depth.id]]
 
 
 def _moseq(folder: Path, frames: Frames) -> Path:
@@ -188,6 +199,19 @@ FORMATS = (
     Format("moseq-avi", write_video_session, before(_avi_ends, ".avi"), promise=_promise_avi),
     Format("azure-mkv", lambda f, s: write_video_session(f, s, "depth.mkv"), before(_mkv_ends, ".mkv")),
     Format("mcap-foxglove", lambda f, s: write_mcap(f / "recording.mcap", s), before(_mcap_ends, ".mcap")),
+    Format(
+        "mcap-ros1", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 1, chunk_size=4096),
+        before(_mcap_ends, ".mcap"),
+    ),
+    Format(
+        "mcap-ros2", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="rvl"), before(_mcap_ends, ".mcap")
+    ),
+    Format(
+        "mcap-cloud", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="loose cloud"),
+        before(_mcap_ends, ".mcap"), atol_mm=1e-3,
+    ),
+    Format("ros-bag", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
+    Format("ros2-db3", lambda f, s: write_db3(f / "recording", s), lambda path, at: None),
     Format(
         "raytrix-float",
         lambda f, s: write_raytrix(f, -s.astype(np.float32), "raytrix-f32-negative-mm", ".tif", write_tiff),
