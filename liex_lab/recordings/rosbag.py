@@ -106,7 +106,7 @@ class BagFile(MessageFile):
                 facts, begin, end = self._record(at)
                 if facts["op"][0] == _CHUNK_INFO:
                     self.starts += struct.unpack("<Q", facts["chunk_pos"])
-                elif facts["op"][0] == _CONNECTION and end <= self.size:
+                elif facts["op"][0] == _CONNECTION and end <= self.size:  # else it would be read into nothing
                     self.file.seek(begin)
                     self._connect(facts, memoryview(self.file.read(end - begin)))
                 else:

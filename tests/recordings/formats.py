@@ -6,6 +6,7 @@ test_laws.py, the damage in test_damage.py.
 
 from __future__ import annotations
 
+import struct
 import tarfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -16,9 +17,15 @@ from typing import Any
 import numpy as np
 import tifffile
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
 from numpy.typing import NDArray
-from rosbags import rosbag1
 
+from liex_lab.progress import silent
+from liex_lab.recordings._message_file import MessageFile
+from liex_lab.recordings.mcap import McapFile
+from liex_lab.recordings.primesense_writer import Codec
+from liex_lab.recordings.rosbag import BagFile
+from tests.recordings.oni_files import depth_builder, plain_payload
 from tests.recordings.picture_writers import (
     write_folder,
     write_nyu,
@@ -37,6 +44,7 @@ from tests.recordings.writers import (
     write_camera,
     write_mcap,
     write_moseq_folder,
+    write_oni_file,
     write_png_folder,
     write_tiff_stack,
 )
@@ -51,7 +59,8 @@ class Format:
     write: put frames (n, H, W) uint16 mm of the camera `SMALL` and even times into an empty folder, and return what to
     open. survivors: given a file and its first damaged byte, the frames that must still come out exactly; None where
     the recording may be refused. atol_mm: how far depth may be from what was written. streams: its file is large, and
-    so must never be read at once. promise: change the header to one that promises 2^31 frames, where it counts them.
+    so must never be read at once. n_damaged: variants of it that are tried. promise: change the header to one that
+    promises 2^31 frames, where it counts them.
     """
 
     name: str
@@ -59,6 +68,7 @@ class Format:
     survivors: Survivors
     atol_mm: float = 0.0
     streams: bool = True
+    n_damaged: int = 200
     promise: Callable[[Path], None] | None = None
 
 
@@ -159,18 +169,58 @@ def _mcap_ends(path: Path) -> list[int]:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None
-        topics = ["/camera/depth", "/camera/depth/image_raw"]
-        times = [message.log_time for _, _, message in reader.iter_messages(topics=topics)]
+        times = [message.log_time for _, _, message in reader.iter_messages(topics=["/camera/depth"])]
     chunks = summary.chunk_indexes
     return [next(c.chunk_start_offset + c.chunk_length for c in chunks if t <= c.message_end_time) for t in times]
 
 
+def _message_ends(file: MessageFile) -> list[int]:
+    """For each depth picture the end of its chunk, or its own where there are no chunks."""
+    found = []
+    for envelope in file.walk(lambda channel: "Image" in channel.schema, silent):
+        place = envelope.place
+        chunk = file.chunks[place.chunk] if place.chunk >= 0 else None
+        found.append(place.offset + place.length if chunk is None else chunk.offset + chunk.length)
+    file.close()
+    return found
+
+
+def _mcap_message_ends(path: Path) -> list[int]:
+    return _message_ends(McapFile(path, path.open("rb")))
+
+
 def _bag_ends(path: Path) -> list[int]:
-    """For each depth picture the end of its chunk, as the file's own index has it."""
-    with rosbag1.Reader(path) as reader:
-        (depth,) = [c for c in reader.connections if c.msgtype.endswith("/Image")]
-        ends = {at: chunk.datapos + chunk.datasize for at, chunk in reader.chunks.items()}
-        return [ends[entry.chunk_pos] for entry in reader.indexes[depth.id]]
+    return _message_ends(BagFile(path, path.open("rb")))
+
+
+def _oni_ends(path: Path) -> list[int]:
+    """The end of every frame's record, walking from record to record."""
+    content, ends, at = path.read_bytes(), [], 24
+    head = 28 if content[4:10] >= bytes([1, 0, 1, 0, 0, 0]) else 24
+    while content[at : at + 4] == b"NIR\0":
+        _, kind, _, fields, payload = struct.unpack_from("<IIIII", content, at)
+        assert fields >= head
+        at += fields + payload
+        ends += [at] if kind == 0x0A else []
+    return ends
+
+
+def _oni(codec: Codec) -> Callable[[Path, Frames], Path]:
+    return lambda folder, frames: write_oni_file(folder / "recording.oni", frames, codec=codec)
+
+
+def _old_oni(folder: Path, frames: Frames) -> Path:
+    """As programs before OpenNI 2 wrote them; the camera stated, for theirs is another one's."""
+    write_camera(folder)
+    payloads = [plain_payload(frame, "NONE") for frame in frames]
+    return depth_builder(payloads, "NONE", old=True, table=True).write(folder / "recording.oni")
+
+
+def _promise_oni(path: Path) -> None:
+    """The frames that the depth node states."""
+    content = path.read_bytes()
+    at = content.index(b"16zT", content.index(b"Depth")) + 4
+    overwrite(path, at, 2**31)
 
 
 def _moseq(folder: Path, frames: Frames) -> Path:
@@ -198,20 +248,38 @@ FORMATS = (
     Format("moseq-archive", _archive, before(_archive_ends, ".gz")),
     Format("moseq-avi", write_video_session, before(_avi_ends, ".avi"), promise=_promise_avi),
     Format("azure-mkv", lambda f, s: write_video_session(f, s, "depth.mkv"), before(_mkv_ends, ".mkv")),
+    Format("oni-16zT", _oni("16zT"), before(_oni_ends, ".oni"), promise=_promise_oni),
+    Format("oni-16zP", _oni("16zP"), before(_oni_ends, ".oni"), n_damaged=60),
+    Format("oni-old", _old_oni, before(_oni_ends, ".oni"), n_damaged=60),
     Format("mcap-foxglove", lambda f, s: write_mcap(f / "recording.mcap", s), before(_mcap_ends, ".mcap")),
     Format(
-        "mcap-ros1", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 1, chunk_size=4096),
-        before(_mcap_ends, ".mcap"),
+        "mcap-unchunked", lambda f, s: write_mcap(f / "recording.mcap", s, use_chunks=False),
+        before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format(
-        "mcap-ros2", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="rvl"), before(_mcap_ends, ".mcap")
+        "mcap-png", lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png"),
+        before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format(
-        "mcap-cloud", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="loose cloud"),
-        before(_mcap_ends, ".mcap"), atol_mm=1e-3,
+        "mcap-ros1", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 1, compression=CompressionType.NONE),
+        before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
-    Format("ros-bag", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
-    Format("ros2-db3", lambda f, s: write_db3(f / "recording", s), lambda path, at: None),
+    Format(
+        "mcap-ros2",
+        lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4),
+        before(_mcap_message_ends, ".mcap"), n_damaged=60,
+    ),
+    Format("bag-lz4", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
+    Format(
+        "bag-bz2", lambda f, s: write_bag(f / "recording.bag", s, compression="bz2", kind="png"),
+        before(_bag_ends, ".bag"), n_damaged=60,
+    ),
+    Format(
+        "bag-plain", lambda f, s: write_bag(f / "recording.bag", s, compression=None, chunk_bytes=1 << 18, kind="rvl"),
+        before(_bag_ends, ".bag"), n_damaged=60,
+    ),
+    # SQLite keeps its tables in pages of a tree, so that nothing is promised of what comes before
+    Format("ros2-db3", lambda f, s: write_db3(f / "bag", s), lambda path, at: None),
     Format(
         "raytrix-float",
         lambda f, s: write_raytrix(f, -s.astype(np.float32), "raytrix-f32-negative-mm", ".tif", write_tiff),
