@@ -38,11 +38,11 @@ RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
 PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
 OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
-Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
-]
 TopicName = Annotated[
     str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
+]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
 ]
 AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse or hand.")]
 VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
