@@ -38,6 +38,9 @@ RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
 PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
 OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
+]
 TopicName = Annotated[
     str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
 ]
@@ -75,9 +78,7 @@ def run(
     plan: PlanName = "mouse",
     out: OutFolder = Path(),
     topic: TopicName = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
-    ] = None,
+    settings: Settings = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
 ) -> None:
     """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
@@ -98,12 +99,17 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
     topic: TopicName = None,
+    plan: PlanName = "mouse",
+    settings: Settings = None,
 ) -> None:
     """Say what is in a recording and what is wrong with it. Needs no model."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
     from liex_lab.pipelines.doctor import examine, print_report
 
     with progress_bar() as progress:
-        findings = examine(recording, fps=fps, topic=topic, progress=progress)
+        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
     if as_json:
         typer.echo(_json(findings))
     else:

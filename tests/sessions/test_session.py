@@ -79,7 +79,7 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
         tmp_path / "c.liex", mouse, arena=bowl, zones=(half, Zone("middle", (0.0, 0.0, 20.0))), optics=optics
     )
     assert session.arena == bowl
-    assert session.zone_names == ["upper", "middle"]
+    assert session.zones == [half, Zone("middle", (0.0, 0.0, 20.0))]
     assert session.metadata["camera"]["optics"] == optics
     assert session.camera == mouse.camera
     frames = session.frames
@@ -99,7 +99,7 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
 
 def test_a_session_without_walls_and_zones_says_so(session):
     assert session.arena == UNKNOWN
-    assert session.zone_names == []
+    assert session.zones == []
     assert session.frames["wall_distance_mm"].isna().all()
     assert (session.frames["zone"] == "").all()
     assert not [name for name in session.summary.columns if name.startswith("zone_")]
