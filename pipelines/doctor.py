@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
+from liex_lab.recordings.times import DROPPED, Gap
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
@@ -25,6 +26,7 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "jitter_ms": "standard deviation of the steps, without those across a gap",
     "n_gaps": "places where the camera left out frames",
     "n_missing": "frames that it left out there",
+    "n_time_faults": "stamps that were moved, for they repeat or run back, and jumps of the clock",
     "width": "pixels in a row",
     "height": "rows",
     "fx": "focal length along a row, px",
@@ -105,6 +107,7 @@ def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
 
 def _time_facts(recording: Recording) -> dict[str, Any]:
     step = np.diff(recording.times_ns) / 1e6
+    dropped = _dropped(recording)
     usual = step[step < 1.5 * np.median(step)] if len(step) else step
     return {
         "format": recording.format,
@@ -112,20 +115,26 @@ def _time_facts(recording: Recording) -> dict[str, Any]:
         "duration_s": _finite(recording.duration_s),
         "rate_hz": _finite(recording.rate_hz),
         "jitter_ms": float(usual.std()) if len(usual) > 1 else None,
-        "n_gaps": len(recording.gaps),
-        "n_missing": sum(gap.n_frames_missing for gap in recording.gaps),
+        "n_gaps": len(dropped),
+        "n_missing": sum(gap.n_frames_missing for gap in dropped),
+        "n_time_faults": len(recording.faults) + len(recording.gaps) - len(dropped),
     }
+
+
+def _dropped(recording: Recording) -> list[Gap]:
+    """The gaps that the camera left while its clock went on."""
+    return [gap for gap in recording.gaps if gap.reason == DROPPED]
 
 
 def _time_problems(recording: Recording) -> list[str]:
     found = []
-    jumps = [gap for gap in recording.gaps if gap.reason == "clock_jumped"]
-    if jumps:
+    gaps = _dropped(recording)
+    if jumps := [gap for gap in recording.gaps if gap not in gaps]:
         found.append(
             f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before frame "
             f"{jumps[0].start_frame}; nothing is measured across them"
         )
-    if gaps := [gap for gap in recording.gaps if gap.reason != "clock_jumped"]:
+    if gaps:
         missing = sum(gap.n_frames_missing for gap in gaps)
         share = missing / (len(recording) + missing)
         longest_s = max(gap.stop_ns - recording.times_ns[gap.start_frame - 1] for gap in gaps) / 1e9
@@ -226,6 +235,7 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
         ("frames", f"{f['n_frames']} in {_text(f['duration_s'], 's', 2)}"),
         ("rate", f"{_text(f['rate_hz'], 'frames/s', 2)}, steps vary by {_text(f['jitter_ms'], 'ms', 2)}"),
         ("gaps", f"{f['n_gaps']}, {f['n_missing']} frames missing" if f["n_gaps"] else "none"),
+        ("time stamps", f"{f['n_time_faults']} could not be true" if f["n_time_faults"] else "increase as they should"),
         ("picture", f"{f['width']} x {f['height']} px"),
         ("intrinsics", f"fx {f['fx']:.1f}, fy {f['fy']:.1f}, cx {f['cx']:.1f}, cy {f['cy']:.1f} px"),
         ("intrinsics from", f["intrinsics_source"]),

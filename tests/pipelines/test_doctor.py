@@ -33,10 +33,10 @@ from tests.recordings.writers import (
 )
 
 KEYS = [
-    "format", "n_frames", "duration_s", "rate_hz", "jitter_ms", "n_gaps", "n_missing", "width", "height", "fx", "fy",
-    "cx", "cy", "intrinsics_source", "distortion", "water", "depth_min_mm", "depth_max_mm", "unread_share",
-    "floor_unread_share", "noise_mm", "floor_mm", "floor_tilt_rad", "water_depth_mm", "arena", "animal_length_mm",
-    "animal_area_mm2", "animal_share", "animal_sits_still", "problems",
+    "format", "n_frames", "duration_s", "rate_hz", "jitter_ms", "n_gaps", "n_missing", "n_time_faults", "width",
+    "height", "fx", "fy", "cx", "cy", "intrinsics_source", "distortion", "water", "depth_min_mm", "depth_max_mm",
+    "unread_share", "floor_unread_share", "noise_mm", "floor_mm", "floor_tilt_rad", "water_depth_mm", "arena",
+    "animal_length_mm", "animal_area_mm2", "animal_share", "animal_sits_still", "problems",
 ]  # fmt: skip
 CAMERA = Camera(140.0, 141.0, 79.5, 59.5, 160, 120)
 
@@ -133,6 +133,17 @@ def test_jitter_and_missing_frames_are_told_apart(tmp_path: Path) -> None:
     findings = examined(write_png_folder(tmp_path / "r", frames(20), CAMERA, times.tolist()))
     assert (findings["n_gaps"], findings["n_missing"]) == (1, 3)
     assert findings["jitter_ms"] == pytest.approx(np.sqrt(2) * 6 / np.sqrt(12), rel=0.4)
+
+
+def test_what_the_clock_did_is_told(tmp_path: Path) -> None:
+    times = even_times(30)
+    times[7] = times[6]
+    times[15:] = [t + 3600 * 10**9 for t in times[15:]]
+    findings = examined(write_png_folder(tmp_path, frames(30), CAMERA, times))
+    assert (findings["n_gaps"], findings["n_time_faults"]) == (0, 2)
+    told = " ".join(findings["problems"])
+    assert "1 of 30 are repeated or out of order" in told
+    assert "the camera was stopped, or its clock set, in 1 places, the first before frame 15" in told
 
 
 def test_a_primesense_recording_says_where_its_intrinsics_come_from(tmp_path: Path) -> None:
