@@ -61,6 +61,13 @@ class Camera(Lens):
         z = np.asarray(depth, float)
         return np.stack([(u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z * np.ones_like(u)], axis=-1)
 
+    def every(self, stride: int) -> Camera:
+        """The camera whose picture is every `stride`-th row and column of this one's."""
+        if stride == 1:
+            return self
+        fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
+        return Camera(fx, fy, cx, cy, -(-self.width // stride), -(-self.height // stride), self.source)
+
     @property
     def matrix(self) -> Array:
         """The intrinsic matrix K (3, 3)."""

@@ -69,9 +69,10 @@ def evaluate_pose(
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The figures of one split and variant; `liex evaluate pose`."""
-    from liex_lab.recordings.synthetic import test_split
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.recordings.worlds import world_of
 
-    sessions = test_split(split, spine_mm=spine_mm)
+    sessions = world_of(Skeleton.load(animal)).test_split(split, spine_mm=spine_mm)
     estimator = estimator_of(animal, variant, progress)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
@@ -117,11 +118,13 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
     """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate speed`."""
     import numba
 
+    from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.scoring import choose
     from liex_lab.recordings.foreground import Scene
-    from liex_lab.recordings.synthetic import test_split
+    from liex_lab.recordings.worlds import world_of
 
-    recording = next(s for s in test_split("clean") if s.width == 640)
+    sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
+    recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
     plan = Plan.load(animal)
     default, paper = estimator_of(animal, "default"), estimator_of(animal, "paper", progress)
     scene, sample = Scene.learn(recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm))

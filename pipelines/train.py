@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -46,6 +45,12 @@ class Recipe:
 AREA_MM2 = 1070.0  # of a home-sized mouse seen from above; only ranks the blobs of a training window
 
 RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
+_OWN: dict[tuple[str, str], Recipe] = {}  # of an animal and a variant, where it is not the mouse's
+
+
+def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
+    """How much the variant is trained on for an animal."""
+    return _OWN.get((skeleton.name, variant), RECIPES[variant])
 
 
 def train_model(
@@ -60,9 +65,7 @@ def train_model(
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     skeleton = Skeleton.load(animal)
-    if skeleton.name != "mouse":
-        raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")
-    model = make_model(skeleton, method_of(variant), RECIPES[variant], progress)
+    model = make_model(skeleton, method_of(variant, skeleton), recipe_of(variant, skeleton), progress)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     content = model.to_bytes()
@@ -110,15 +113,17 @@ def rendered_set(
 ) -> TrainingSet:
     """N training images from number `first` on, cut out by the product's own foreground."""
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.windows import BLOCK, training_blocks
+    from liex_lab.recordings.windows import BLOCK
+    from liex_lab.recordings.worlds import world_of
 
+    world = world_of(skeleton)
     blocks, begin = -(-n // BLOCK), -(-first // BLOCK)
     parts: list[TrainingSet] = []
     for number in range(begin, begin + blocks):
         progress(number - begin, blocks, "rendering training images")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
-        (windows,) = training_blocks(
-            recipe.seed, 1, skeleton, first=number, family="augmented", degraded_share=recipe.degraded_share,
+        (windows,) = world.training_blocks(
+            recipe.seed, 1, first=number, family="augmented", degraded_share=recipe.degraded_share,
             spine_mm=spine_mm or None, window_px=window_px,
         )  # fmt: skip
         parts.append(cut_out(skeleton, method, windows))
@@ -165,12 +170,15 @@ def cut_rank(
 
 def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
     """A model that does not come with the package, trained once and kept in the user's cache folder."""
+    from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.method import method_of
     from liex_lab.sessions.provenance import package_version
 
-    made_from: dict[str, Any] = {"method": method_of(variant).to_dict(), "recipe": vars(RECIPES[variant])}
+    skeleton = Skeleton.load(animal)
+    method, recipe = method_of(variant, skeleton), recipe_of(variant, skeleton)
+    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe)}
     key = hashlib.sha256(json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()).hexdigest()[:12]
-    path = cache_folder() / f"{animal}-{variant}-{key}.npz"
+    path = cache_folder() / f"{skeleton.name}-{variant}-{key}.npz"
     return path if path.is_file() else train_model(animal, variant, path, progress=progress)
 
 

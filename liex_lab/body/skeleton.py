@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +23,49 @@ AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the jo
 PRESETS = Path(__file__).parent / "presets"
 _JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
 _ROOT_DOF = 6
+REFERENCE_MM = 52.834  # home length of the mouse: lengths that hold for every animal are stated for it
+VIEWS = ("floor", "camera")
+_BEHIND_MM, _SMOOTH_MM = 120.0, 2.0  # of an animal of the reference length
+_AREA = (0.12, 1.3)
+
+
+@dataclass(frozen=True)
+class View:
+    """How an animal is looked at: the [view] table of its TOML.
+
+    frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
+    behind_mm (at home size) behind its mean depth, for one that swims or is held up. smooth_mm: readings this near to
+    one another, at home size, are averaged. area: the smallest and the largest area seen from above, of the squared
+    length.
+    """
+
+    frame: str = VIEWS[0]
+    behind_mm: float = _BEHIND_MM
+    smooth_mm: float = _SMOOTH_MM
+    area: tuple[float, float] = _AREA
+
+    @staticmethod
+    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> View:
+        """The view that a TOML states; what it leaves out follows from the animal's size."""
+        known = View.__annotations__
+        for key in table:
+            if key not in known:
+                raise LiexError(f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}")
+        frame, area = table.get("frame", VIEWS[0]), table.get("area", list(_AREA))
+        if frame not in VIEWS:
+            raise LiexError(f"{origin}: [view] frame is one of {', '.join(VIEWS)}, got {frame!r}")
+        if not (isinstance(area, list) and [_is_number(a) for a in area] == [True, True] and 0 < area[0] < area[1]):
+            raise LiexError(f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got {area}")
+        lengths = {"behind_mm": _BEHIND_MM * relative_size, "smooth_mm": _SMOOTH_MM * relative_size}
+        for key, usual in lengths.items():
+            value = table.get(key, usual)
+            if not (_is_number(value) and value > 0):
+                raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
+            lengths[key] = float(value)
+        return View(frame, lengths["behind_mm"], lengths["smooth_mm"], (float(area[0]), float(area[1])))
+
+
+MOUSE_VIEW = View()
 
 
 @dataclass(frozen=True)
@@ -30,7 +75,7 @@ class Skeleton:
     Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a joint away from
     its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame into the joint's at home; `axes`
     (J, 3) says which of roll, pitch and yaw the joint can do; `limits` (J, 3, 2) rad. The base joint, 0, has all six
-    degrees of freedom. Parents precede their children.
+    degrees of freedom. Parents precede their children. surface: the [surface] table, see `Surface.of`.
     """
 
     name: str
@@ -41,6 +86,7 @@ class Skeleton:
     axes: NDArray[np.bool_]
     limits: Array
     surface: dict[str, Any]
+    view: View
 
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
@@ -78,15 +124,20 @@ class Skeleton:
             raise LiexError(f"{origin}: two joints have the same name; every joint needs its own")
         axes = np.array([row.axes for row in rows], bool)
         axes[0] = True
+        offsets = np.array([row.offset for row in rows], float)
+        relative_size = _relative_size(parents, offsets)
+        if relative_size <= 0.0:
+            raise LiexError(f"{origin}: a skeleton needs a second joint at some distance from the first one")
         return Skeleton(
             name=table["name"],
             names=tuple(names),
             parents=np.array(parents, np.int64),
-            offsets=np.array([row.offset for row in rows], float),
+            offsets=offsets,
             rest=so3.exp(np.radians([row.rest for row in rows])),
             axes=axes,
             limits=np.radians([row.limits for row in rows]),
             surface=table.get("surface", {}),
+            view=View.from_table(table.get("view", {}), relative_size, origin),
         )
 
     @property
@@ -107,10 +158,12 @@ class Skeleton:
     @cached_property
     def length(self) -> float:
         """Length of the longest chain from the base at home, mm: the spine of a mouse, the body of a fish."""
-        reach = np.zeros(self.n_joints)
-        for parent, child in self.edges:
-            reach[child] = reach[parent] + np.linalg.norm(self.offsets[child])
-        return float(reach.max())
+        return _length(self.parents, self.offsets)
+
+    @cached_property
+    def relative_size(self) -> float:
+        """Home length over REFERENCE_MM, to six digits: 1 for the mouse."""
+        return _relative_size(self.parents, self.offsets)
 
     @cached_property
     def next_joint(self) -> NDArray[np.int64]:
@@ -124,6 +177,22 @@ class Skeleton:
     def solved(self) -> list[int]:
         """The joints that move and so need a regressor, base first."""
         return [0] + [j for j in range(1, self.n_joints) if self.axes[j].any()]
+
+
+def _length(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -> float:
+    """Length of the longest chain from the base, mm."""
+    reach = np.zeros(len(offsets))
+    for child in range(1, len(offsets)):
+        reach[child] = reach[parents[child]] + np.linalg.norm(offsets[child])
+    return float(reach.max())
+
+
+def _relative_size(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -> float:
+    return round(_length(parents, offsets) / REFERENCE_MM, 6)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 _START_SEED = 20170125
 _SIZE_PASSES = 8  # of estimating the size with the size just found; each goes about a third of the way
-_MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error
+_MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error, at
+# the reference length
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,9 @@ class PoseEstimator:
         n, k = len(looks), self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
-            crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start
-        )
+            crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
+            method.camera_view,
+        )  # fmt: skip
         rotations = np.zeros((n, k, skeleton.n_joints, 3, 3))
         positions = np.zeros((n, k, skeleton.n_joints, 3))
         rotations[:, :, 0], positions[:, :, 0] = base_rotation, base_position
@@ -144,7 +146,8 @@ class PoseEstimator:
 
         Told by area and volume and, where the metric has learned what is no animal, by its scores first, second (n,).
         """
-        likeness = [_MM_PER_MISFIT * scene.misfit(scene.extract(depths, size, rank=rank)) for rank in (0, 1)]
+        weight = _MM_PER_MISFIT * self.skeleton.relative_size
+        likeness = [weight * scene.misfit(scene.extract(depths, size, rank=rank)) for rank in (0, 1)]
         if not self.model.method.metric_on_own:
             return likeness[1] < likeness[0]
         return second + likeness[1] < first + likeness[0]

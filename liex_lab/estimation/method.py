@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.forests.grow import GrowthPlan
 
@@ -78,8 +79,32 @@ METHODS = {
 }  # fmt: skip
 
 
-def method_of(variant: str) -> Method:
-    """The method of a variant's name."""
+# what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
+_OWN: dict[tuple[str, str], dict[str, Any]] = {
+    ("fish", "paper"): {
+        "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
+    },
+    ("hand", "paper"): {
+        "n_candidates": 20, "reach_mm": 50.0, "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
+    },
+}  # fmt: skip
+_LENGTHS = (
+    "reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm", "joint_lever_mm",
+    "scale_lever_mm",
+)  # fmt: skip
+
+
+def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
+    """The method of a variant's name for an animal; None is the mouse.
+
+    Lengths are the mouse's over its home length times the animal's, unless the animal has its own; where the animal is
+    looked at along the optical axis, every variant does so.
+    """
     if variant not in METHODS:
         raise PlanError(f"there is no variant '{variant}'; known are {', '.join(METHODS)}")
-    return METHODS[variant]
+    method = METHODS[variant]
+    if skeleton is None:
+        return method
+    scaled = {name: getattr(method, name) * skeleton.relative_size for name in _LENGTHS}
+    scaled["camera_view"] = method.camera_view or skeleton.view.frame == VIEWS[1]
+    return replace(method, **(scaled | _OWN.get((skeleton.name, variant), {})))

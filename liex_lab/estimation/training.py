@@ -19,7 +19,8 @@ from liex_lab.geometry import SE3, so3
 Array = NDArray[np.float64]
 Tell = Callable[[float, str], None]  # share done, what is being done
 
-_ERROR_CAP_MM = 30.0  # a pose worse than this is simply wrong; how wrong is not worth learning
+_ERROR_CAP_MM = 30.0  # a pose worse than this, at the reference length, is simply wrong; how wrong is not worth learning
+_FEW_JOINTS = 3
 _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 
 
@@ -62,8 +63,9 @@ def start_candidates(data: TrainingSet, skeleton: Skeleton, method: Method, rng:
     else:
         size = np.ones((m, k))
     rotation, position, scale = start_poses(
-        data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start
-    )
+        data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start,
+        method.camera_view,
+    )  # fmt: skip
     image = np.repeat(np.arange(m, dtype=np.int32), k)
     return Candidates.start(
         skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), size.ravel()
@@ -114,14 +116,17 @@ def perturbed_truth(data: TrainingSet, cascade: Cascade, rng: np.random.Generato
     image = np.repeat(np.flatnonzero(data.animal).astype(np.int32), n_each)
     size = np.ones(len(image)) if not cascade.method.session_size else data.size[image]
     strength = rng.uniform(0.0, 1.0, len(image))[:, None]
-    twist = rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, 8.0, 8.0, 8.0]) * strength
+    off = 8.0 * skeleton.relative_size
+    twist = rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, off, off, off]) * strength
     base = SE3(data.truth.rotations[image, 0], data.truth.positions[image, 0]) @ SE3.exp(twist)
     candidates = Candidates.start(skeleton, image, base.rotation, base.translation, data.truth.scale[image], size)
+    # a long chain bends no more as a whole than a short one
+    bent = 0.35 * np.sqrt(min(1.0, _FEW_JOINTS / max(1, len(skeleton.solved) - 1)))
     for joint in range(1, j):
         cascade.place(candidates, joint)
         parent = skeleton.parents[joint]
         true = np.swapaxes(data.truth.rotations[image, parent], 1, 2) @ data.truth.rotations[image, joint]
-        turn = 0.35 * strength * rng.standard_normal((len(image), 3)) * skeleton.axes[joint]
+        turn = bent * strength * rng.standard_normal((len(image), 3)) * skeleton.axes[joint]
         candidates.rotations[:, joint] = candidates.rotations[:, parent] @ true @ so3.exp(turn)
     return candidates
 
@@ -135,7 +140,7 @@ def train_metric(
     """
     if not cascade.method.metric_on_own:
         candidates = perturbed_truth(data, cascade, rng)
-    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM)
+    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
     samples = cascade.samples(data.images, candidates, list(range(cascade.skeleton.n_joints)))
     labels, method = error[:, None].astype(np.float32), cascade.method
     if method.metric_shrinkage > 0:

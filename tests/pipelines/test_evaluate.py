@@ -45,11 +45,11 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two recordings of 10 small frames stand for every split, toy models for every variant; what was asked for."""
     asked: list[str] = []
 
-    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 2) -> list[SyntheticSession]:
+    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
         asked.append(f"{name} {spine_mm}")
         return [
             SyntheticSession.draw([5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}")
-            for k in range(n_sessions)
+            for k in range(min(n_sessions, 2))
         ]
 
     monkeypatch.setattr(synthetic, "test_split", small_split)
@@ -111,7 +111,7 @@ def test_errors_over_sizes_are_told_in_per_cent_of_the_spine(monkeypatch):
 
 
 def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(small_world, monkeypatch):
-    def one_of_640(name: str) -> list[SyntheticSession]:
+    def one_of_640(name: str, *how: Any) -> list[SyntheticSession]:
         return [SyntheticSession.draw(3, 6, sensor=synthetic.SENSORS[0], name=name)]
 
     monkeypatch.setattr(synthetic, "test_split", one_of_640)

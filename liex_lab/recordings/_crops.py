@@ -1,0 +1,128 @@
+"""Numba kernels that find the animal's blob in a frame and cut its height map, over many frames at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.recordings import _segment as segment
+
+AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
+_ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
+
+
+@njit(cache=True, parallel=True)
+def blob_areas(depths, limit, on_floor, mm2_per_px, areas):
+    """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
+    for k in prange(depths.shape[0]):
+        labels = np.empty((depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32)
+        blobs = np.empty((segment.MAX_BLOBS, 7))
+        for slot in range(segment.label_blobs(depths[k], limit, on_floor, labels, blobs)):
+            if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
+                areas[k, slot] = blob_area(blobs[slot], mm2_per_px)
+
+
+@njit(cache=True)
+def blob_area(blob, mm2_per_px):
+    """Area mm^2 seen from above of a blob (7,); mm2_per_px is 1 / (fx fy)."""
+    return blob[0] * (blob[5] / blob[0]) ** 2 * mm2_per_px
+
+
+@njit(cache=True)
+def choose_blob(blobs, n_blobs, area, mm2_per_px, rank):
+    """The blob whose area comes next near (`rank`) to the animal's, -1 for none, and how many have about its area.
+
+    While `area` is 0 the largest comes first.
+    """
+    distances = np.full(n_blobs, np.inf)
+    n_near = 0
+    for slot in range(n_blobs):
+        if blobs[slot, 6] < _ON_FLOOR_SHARE * blobs[slot, 0]:
+            continue
+        here = blob_area(blobs[slot], mm2_per_px)
+        distances[slot] = abs(np.log(here / area)) if area > 0 else 1.0 / here
+        if area > 0 and distances[slot] > np.log(AREA_FACTOR):
+            distances[slot] = np.inf
+        else:
+            n_near += 1
+    if rank >= n_near:
+        return -1, n_near
+    return np.argsort(distances)[rank], n_near
+
+
+@njit(cache=True)
+def extract_one(
+    depth, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
+    n_px, moments, distance, n_blobs, k,
+):  # fmt: skip
+    """Find the animal in one frame and fill row k of the batch; distance[k] comes in as the floor's.
+
+    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth.
+    """
+    labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
+    blobs = np.empty((segment.MAX_BLOBS, 7))
+    mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
+    n_found = segment.label_blobs(depth, limit, on_floor, labels, blobs)
+    slot, n_blobs[k] = choose_blob(blobs, n_found, area, mm2_per_px, rank)
+    if slot < 0:
+        return
+    blob = blobs[slot]
+    mean_depth = blob[5] / blob[0]
+    view_plane = plane
+    if behind_mm > 0.0:
+        distance[k] = mean_depth + behind_mm
+        view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
+    cut_crop(depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, view_plane, distance[k], rotation,
+             heights, origin, n_steps, moments, k)  # fmt: skip
+    n_px[k] = int(blob[0])
+
+
+@njit(cache=True)
+def cut_crop(
+    depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, distance, rotation, heights, origin,
+    n_steps, moments, k,
+):  # fmt: skip
+    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k."""
+    crop = heights.shape[1]
+    v0, v1 = blob[1] * segment.BLOCK, (blob[2] + 1) * segment.BLOCK
+    u0, u1 = blob[3] * segment.BLOCK, (blob[4] + 1) * segment.BLOCK
+    span = max(v1 - v0, u1 - u0) + 2 * segment.BLOCK
+    step = max(1, int(np.ceil(span / (crop - 4))))
+    origin[k, 0] = int((u0 + u1) / 2 - step * crop / 2)
+    origin[k, 1] = int((v0 + v1) / 2 - step * crop / 2)
+    n_steps[k] = step
+    raw = np.empty((crop, crop), np.float32)
+    segment.cut_heights(depth, limit, labels, slot, plane, distance, origin[k], step, raw)
+    segment.keep_largest(raw, np.empty((crop, crop), np.int32), np.empty((crop * crop, 2), np.int32))
+    mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
+    radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
+    segment.smooth_heights(raw, radius, heights[k])
+    segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance, moments[k])
+
+
+@njit(cache=True, parallel=True)
+def extract_all(
+    depths, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
+    n_px, moments, distance, n_blobs,
+):  # fmt: skip
+    for k in prange(depths.shape[0]):
+        extract_one(depths[k], limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm,
+                    heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+
+
+@njit(cache=True, parallel=True)
+def extract_windows(
+    depths, background, margin, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs,
+):  # fmt: skip
+    for k in prange(depths.shape[0]):
+        limit, everywhere = np.empty(depths.shape[1:], np.float32), np.ones(depths.shape[1:], np.bool_)
+        for v in range(limit.shape[0]):
+            for u in range(limit.shape[1]):
+                behind = float(background[k, v, u])
+                if behind == 0.0:
+                    inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
+                    behind = 1.0 / inverse if inverse > 1e-6 else 0.0
+                limit[v, u] = max(behind - margin, 0.0)
+        extract_one(depths[k], limit, everywhere, area[k], rank, smooth_mm[k], intrinsics[k], plane[k], rotation[k],
+                    behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip

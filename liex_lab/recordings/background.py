@@ -1,0 +1,70 @@
+"""What a camera sees without the animal: the depth behind it at every pixel, and where the floor lies."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.recordings import _segment as kernels
+from liex_lab.recordings.recording import Recording
+
+_MODE_SHARE, _MODE_MM = 0.012, 6.0  # readings this near to one another, of the depth or in mm, are one surface
+_NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual depth
+_LENGTH_PX, _MAX_STRIDE = 64.0, 4  # an animal of this many pixels is looked at finely enough
+_FLAT_MM = 15.0  # background this near to the plane is floor: flatness, noise and lens errors together
+
+
+def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArray[np.float32]:
+    """Every `stride`-th pixel of up to `n_frames` frames (n, H, W) mm spread evenly over the recording."""
+    chosen = np.unique(np.linspace(0, len(recording) - 1, min(n_frames, len(recording))).astype(int))
+    sample = np.empty((len(chosen), -(-recording.height // stride), -(-recording.width // stride)), np.float32)
+    if len(chosen) == len(recording):  # in order, which every format reads fastest
+        for frames in recording.chunks(32):
+            for frame in frames:
+                sample[frame.index] = frame.depth[::stride, ::stride]
+        return sample
+    for k, index in enumerate(chosen):
+        sample[k] = recording.frame(int(index)).depth[::stride, ::stride]
+    return sample
+
+
+def stride_for(recording: Recording, length_mm: float) -> int:
+    """How many pixels apart the picture may be looked at so that an animal of length_mm is still some pixels long."""
+    for index in {0, len(recording) // 2}:
+        depth = recording.frame(index).depth
+        if (depth > 0).any():
+            px = length_mm * recording.camera.fx / float(np.median(depth[depth > 0]))
+            return min(_MAX_STRIDE, max(1, int(px / _LENGTH_PX)))
+    return 1
+
+
+def learn_background(
+    sample: NDArray[np.float32] | Recording,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Background depth, its spread, and the nearest usual depth (H, W) mm of a sample (n, H, W) mm or of a recording;
+    0 = never read.
+    """
+    stack = sample if isinstance(sample, np.ndarray) else sample_frames(sample, 96)
+    depth, spread, near = np.zeros((3, *stack.shape[1:]), np.float32)
+    numbers = [np.float32(value) for value in (_MODE_SHARE, _MODE_MM, _NEAR_SHARE)]
+    kernels.far_modes(stack, *numbers, depth, spread, near)
+    return depth, spread, near
+
+
+def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H, W) the floor lies: the convex hull of the largest connected part of the background on the plane.
+
+    Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the hull closes.
+    """
+    import cv2
+
+    flat = ((background > 0) & (np.abs(background - bare) < _FLAT_MM)).astype(np.uint8)
+    opened = cv2.morphologyEx(flat, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    if n < 2:
+        return flat.astype(bool)
+    largest = (labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))).astype(np.uint8)
+    points = cv2.findNonZero(largest)
+    region = np.zeros(flat.shape, np.uint8)
+    cv2.fillConvexPoly(region, cv2.convexHull(points), 1)
+    return region.astype(bool)

@@ -1,0 +1,104 @@
+"""Height maps of one animal, cut out of whole pictures (see `Scene`) or out of windows around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.skeleton import MOUSE_VIEW, View
+from liex_lab.camera import Camera
+from liex_lab.recordings import _crops as kernels
+from liex_lab.recordings.arena import Floor
+
+Array = NDArray[np.float64]
+
+CROP = 96  # pixels a side of a height map
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Height maps of one animal, a batch (n), and how the animal's mass lies on the floor.
+
+    heights (n, CROP, CROP) int16, 1/16 mm above the floor, 0 = not the animal; origin (n, 2) picture pixel (u, v) of
+    crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,) readings on the animal, 0 = not found; n_blobs
+    (n,) how many things in the frame have about the animal's size;
+    moments (n, 8): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), and the standard
+    deviation mm along and across it, all in the view frame. The view frame is the arena frame, or (camera_view) an
+    upright frame whose z axis is the optical axis backwards; its origin is `distance` (n,) mm in front of the camera.
+    """
+
+    heights: NDArray[np.int16]
+    origin: NDArray[np.int32]
+    step: NDArray[np.int32]
+    n_px: NDArray[np.int64]
+    moments: Array
+    distance: Array
+    n_blobs: NDArray[np.int64]
+
+    def __getitem__(self, index: NDArray[np.bool_]) -> Crops:
+        """Some crops out of a batch."""
+        return Crops(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def put(self, rows: NDArray[np.int64], other: Crops) -> None:
+        """Replace some rows by all of another batch."""
+        for field in fields(self):
+            getattr(self, field.name)[rows] = getattr(other, field.name)
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """(n,) True where an animal is in view."""
+        return self.n_px > 0
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Parts of pictures from many cameras (n), each around one animal on a known floor.
+
+    depth, background (n, H, W) mm, 0 = unread; intrinsics (n, 4) fx fy cx cy, pixels of the whole picture; origin
+    (n, 2) picture pixel of each window's first; inverse_depth (n, 3): 1 / z of the floor = a u + b v + c in pixels of
+    the whole picture; view: how such animals are looked at.
+    """
+
+    depth: NDArray[np.uint16] | NDArray[np.float32]
+    background: NDArray[np.uint16] | NDArray[np.float32]
+    intrinsics: Array
+    origin: Array
+    inverse_depth: Array
+    view: View = MOUSE_VIEW
+
+    def floor(self, k: int) -> Floor:
+        """The floor of window k."""
+        fx, fy, cx, cy = self.intrinsics[k]
+        return Floor.from_inverse_depth(self.inverse_depth[k], Camera(fx, fy, cx, cy, 1, 1))
+
+    def extract(
+        self, size: Array, area_mm2: Array, min_height_mm: float = 7.0, camera_view: bool = False, rank: int = 0
+    ) -> tuple[Crops, Array]:
+        """The blobs of each window whose areas are nearest to area_mm2 (n,), by rank, and their looks (n, 17); see
+        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home.
+        """
+        n = len(self.depth)
+        crops = Crops(
+            np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
+            np.zeros(n, np.int64), np.zeros((n, 8)), np.empty(n), np.zeros(n, np.int64),
+        )  # fmt: skip
+        # a window is the picture of a camera whose centre is shifted
+        intrinsics, plane = self.intrinsics.copy(), self.inverse_depth.copy()
+        intrinsics[:, 2:] -= self.origin
+        plane[:, 2] += plane[:, 0] * self.origin[:, 0] + plane[:, 1] * self.origin[:, 1]
+        rotation = np.empty((n, 3, 3))
+        for k in range(n):
+            floor = self.floor(k)
+            crops.distance[k] = floor.distance_mm
+            rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
+        kernels.extract_windows(
+            self.depth, self.background, np.float32(min_height_mm), area_mm2, rank, self.view.smooth_mm * size,
+            intrinsics, plane, rotation, (self.view.behind_mm if camera_view else 0.0) * size, crops.heights,
+            crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
+        )  # fmt: skip
+        looks = np.concatenate(
+            [intrinsics, rotation.reshape(n, 9), crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1
+        )
+        return crops, looks

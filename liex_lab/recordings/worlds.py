@@ -1,0 +1,69 @@
+"""The worlds that animals are rendered in: training images, test splits and continuous recordings of each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError
+from liex_lab.recordings import synthetic, walking, windows
+from liex_lab.recordings.synthetic import SyntheticSession
+from liex_lab.recordings.windows import TrainingWindows
+
+
+class World(Protocol):
+    """Where an animal's training and test data come from. Everything is drawn from seeds, in any order."""
+
+    skeleton: Skeleton
+    splits: tuple[str, ...]
+
+    def training_blocks(
+        self,
+        seed: int,
+        n_blocks: int,
+        *,
+        first: int = 0,
+        family: str = "train",
+        noise: float = 1.0,
+        erosion_px: int = 0,
+        degraded_share: float = 0.0,
+        spine_mm: float | None = None,
+        window_px: int = 144,
+        parallel: bool = True,
+    ) -> Iterator[TrainingWindows]:
+        """Blocks of training images from block `first` on; see `windows.training_blocks`."""
+
+    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+        """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing it."""
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+        """A recording in which one animal moves; settings as in `walking.walking_session`."""
+
+
+@dataclass(frozen=True)
+class MouseWorld:
+    """A mouse in an arena, seen from above."""
+
+    skeleton: Skeleton
+    splits: tuple[str, ...] = tuple(synthetic.SPLITS)
+
+    def training_blocks(self, seed: int, n_blocks: int, **settings: Any) -> Iterator[TrainingWindows]:
+        """Blocks of training images."""
+        return windows.training_blocks(seed, n_blocks, self.skeleton, **settings)
+
+    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+        """The recordings of a split."""
+        return synthetic.test_split(name, spine_mm, n_sessions)
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+        """A mouse that walks, turns, rears and curls up."""
+        return walking.walking_session(seed, n_frames, skeleton=self.skeleton, **settings)
+
+
+def world_of(skeleton: Skeleton) -> World:
+    """The world of an animal."""
+    if skeleton.name == "mouse":
+        return MouseWorld(skeleton)
+    raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")
