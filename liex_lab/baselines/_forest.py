@@ -124,9 +124,7 @@ def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leave
 
 
 @njit(cache=True, parallel=True)
-def locate_all(
-    heights, looks, image, phases, n_points, reach, bandwidth, nodes, roots, leaves, used, places, headings
-):
+def locate_all(heights, looks, image, phases, n_points, reach, bandwidth, nodes, roots, leaves, used, places, headings):
     """`locate` for a batch: image (n,), phases (n,), used (n, T) into places (n, 3) and headings (n,)."""
     for s in prange(image.size):
         headings[s] = locate(heights[image[s]], looks[image[s]], phases[s], n_points, reach, bandwidth, nodes, roots,

@@ -41,6 +41,8 @@ from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
 
+_F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
+_F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
 _LEAST_LEVER = 0.05  # of the animal's length: a turn about its own axis moves no joint of a straight animal
 
 
@@ -50,8 +52,8 @@ class ForestPlan:
     at; draws: times that F2 sees each image, from other pixels; bandwidths (2) of the modes, of the animal's length.
     """
 
-    where: GrowthPlan = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
-    pose: GrowthPlan = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
+    where: GrowthPlan = _F1
+    pose: GrowthPlan = _F2
     training_points: int = 16
     n_points: int = 32
     draws: int = 2
@@ -106,7 +108,7 @@ class RegressionForest:
                     for name in ("where", "pose")
                 )
         except (OSError, ValueError, KeyError, EOFError) as error:
-            raise ModelError(f"{path} is not a whole regression forest ({error}); remove it, and train it again") from None
+            raise ModelError(f"{path} is not a whole regression forest ({error}); remove it and train again") from None
         return RegressionForest(skeleton, plan, where, pose)
 
 
@@ -116,9 +118,7 @@ def levers(skeleton: Skeleton) -> Array:
     Coordinates: the base's rotation about x, y, z (rad), its translation (mm, lever 1), log scale, then the angles
     about the other joints' free axes in the skeleton's order. One unit of label is then about one millimetre of error.
     """
-    rotations, positions = forward_kinematics(
-        skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(())
-    )
+    rotations, positions = forward_kinematics(skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(()))
     below = np.eye(skeleton.n_joints, dtype=bool)
     for j in range(skeleton.n_joints - 1, 0, -1):
         below[skeleton.parents[j]] |= below[j]
@@ -137,7 +137,9 @@ def levers(skeleton: Skeleton) -> Array:
     return lever
 
 
-def coordinates(data: TrainingSet, skeleton: Skeleton, image: Array, places: Array, headings: Array) -> Array:
+def coordinates(
+    data: TrainingSet, skeleton: Skeleton, image: NDArray[np.int32], places: Array, headings: Array
+) -> Array:
     """True coordinates (n, D) of F2 in lever units, as seen from places (n, 3) and headings (n,) in images (n,)."""
     zero = np.zeros_like(headings)
     start = SE3(so3.exp(np.stack([zero, zero, headings], axis=1)), places)

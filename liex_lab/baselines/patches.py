@@ -21,8 +21,8 @@ _MM = 16.0  # heights are sixteenths
 
 
 def frames_of(heights: NDArray[np.int16], looks: Array) -> Array:
-    """Where each animal (n) is: picture pixel (u, v) of its square's centre, half the side in pixels, its mean depth mm,
-    and half the side in mm at that depth; (n, 5). heights (n, S, S) with at least one pixel, looks (n, 17).
+    """Where each animal (n) is: picture pixel (u, v) of its square's centre, half the side in pixels, the animal's mean
+    depth mm, and half the side in mm there; (n, 5). heights (n, S, S) with at least one pixel, looks (n, 17).
     """
     frames = np.empty((len(looks), 5))
     _frames_all(heights, looks, frames)
