@@ -110,7 +110,7 @@ def _sensitivity(results: Mapping[str, Mapping[str, Any]]) -> Figure:
                 used = [p for p in points if p["value"] == curve["chosen"][number]]
                 panel.plot([p["value"] for p in used], [p["mean_mm"] for p in used], "o", color=_CHOSEN, ms=6)
             panel.set(xlabel=number, ylabel="mm")
-            panel.xaxis.get_major_locator().set_params(integer=True)
+            panel.locator_params(axis="x", integer=True)
             panel.margins(y=0.1)
             panel.set_ylim(bottom=0)
             panel.grid(alpha=0.3)
