@@ -80,4 +80,5 @@ class Camera(Lens):
 
 KINECT_V2 = Camera(365.0, 365.0, 255.5, 211.5, 512, 424, source="typical Kinect v2")
 PRIMESENSE = Camera(575.8, 575.8, 319.5, 239.5, 640, 480, source="typical PrimeSense")
+RAYTRIX_R5 = Camera(2363.0, 2363.0, 511.5, 511.5, 1024, 1024, source="typical Raytrix R5")
 PRIMESENSE_QVGA = Camera(287.9, 287.9, 159.5, 119.5, 320, 240, source="typical PrimeSense at 320 x 240")

@@ -225,15 +225,21 @@ def skin_tubes_parallel(joints, rotations, girth, stations, half_width, half_hei
                   tail[i], bends[i], out[i])  # fmt: skip
 
 
-@njit(cache=True)
-def skin_capsules(joints, girth, parents, radii, out):
-    """Vertices of one capsule a bone, round at both ends: joints (n, J, 3), girth (n,), radii (J,) mm -> (n, V, 3)."""
-    frame = np.empty((4, 3))
-    for i in range(len(joints)):
-        at = 0
-        for j in range(1, len(parents)):
-            at = _capsule(joints[i, parents[j]], joints[i, j], girth[i] * radii[parents[j]], girth[i] * radii[j],
-                          frame, out[i], at)  # fmt: skip
+@njit(cache=True, parallel=True)
+def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out):
+    """Vertices of C capsules, round at both ends, for a batch: rotations (n, J, 3, 3), joints (n, J, 3), which (C, 2)
+    joints carry the ends, offsets (n, C, 2, 3) mm times scale (n,), radii (n, C, 2) mm times girth (n,); out (n, V, 3).
+    """
+    for i in prange(len(joints)):
+        at, frame, ends = 0, np.empty((4, 3)), np.empty((2, 3))
+        for c in range(len(which)):
+            for e in range(2):
+                j = which[c, e]
+                for axis in range(3):
+                    ends[e, axis] = joints[i, j, axis]
+                    for k in range(3):
+                        ends[e, axis] += scale[i] * rotations[i, j, axis, k] * offsets[i, c, e, k]
+            at = _capsule(ends[0], ends[1], girth[i] * radii[i, c, 0], girth[i] * radii[i, c, 1], frame, out[i], at)
 
 
 @njit(cache=True)

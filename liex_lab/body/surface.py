@@ -1,7 +1,7 @@
 """The surface around a skeleton, as a triangle mesh, and its picture in a depth camera.
 
 A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a tube along one chain
-of joints (the mouse), `radii_mm` a capsule around every bone (anything else).
+of joints (the mouse), `radii_mm` a capsule around every bone and `capsules` further ones (anything else).
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body import _render, _skin
+from liex_lab.body.capsules import Capsules
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
-from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
+from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
+Body = BodyShape | Capsules
 Window = tuple[int, int, int, int]
 
 
@@ -27,14 +29,14 @@ Window = tuple[int, int, int, int]
 class Surface:
     """A mesh of fixed topology that follows a skeleton: `faces` (F, 3) index the vertices (V, 3) of every pose.
 
-    shape: the default animal of a tubular body; radii (J,) mm at scale 1 of a capsule body. The other one is None.
+    shape: the default animal of a tubular body; capsules: a capsule body. The other one is None.
     """
 
     skeleton: Skeleton
     faces: NDArray[np.int32]
     stations: Array
     shape: BodyShape | None
-    radii: Array | None
+    capsules: Capsules | None
 
     @staticmethod
     def of(skeleton: Skeleton) -> Surface:
@@ -47,14 +49,8 @@ class Surface:
             parts += [(_skin.BLOB_RINGS, _skin.BLOB_SEGMENTS)] * len(shape.blobs)
             parts += [(_skin.TAIL_RINGS, _skin.TAIL_SEGMENTS)]
             return Surface(skeleton, _skin.joined_faces(parts), stations, shape, None)
-        radii = np.array(table.get("radii_mm", []), float)
-        if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
-            raise LiexError(
-                f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each of its "
-                f"{skeleton.n_joints} joints, or stations with half_width_mm and half_height_mm"
-            )
-        parts = [(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * (skeleton.n_joints - 1)
-        return Surface(skeleton, _skin.joined_faces(parts), np.zeros(0), None, radii)
+        capsules = Capsules.of(skeleton)
+        return Surface(skeleton, capsules.faces, np.zeros(0), None, capsules)
 
     @property
     def n_vertices(self) -> int:
@@ -74,7 +70,7 @@ class Surface:
     def vertices(
         self,
         pose: Pose,
-        shape: BodyShape | None = None,
+        shape: Body | None = None,
         girth: Array | float | None = None,
         bends: Array | None = None,
         parallel: bool = True,
@@ -90,13 +86,16 @@ class Surface:
         joints = np.ascontiguousarray(frames.translation).reshape(-1, self.skeleton.n_joints, 3)
         n = len(joints)
         size = np.broadcast_to(pose.scale if girth is None else girth, batch).astype(float).reshape(n)
-        out = np.empty((n, self.n_vertices, 3))
-        if self.shape is None:
-            _skin.skin_capsules(joints, size, self.skeleton.parents, self.radii, out)
-            return out.reshape(*batch, -1, 3)
-        body = (self.shape.bare() if shape is None else shape).broadcast(n)
-        turns = np.zeros((n, _skin.TAIL_RINGS)) if bends is None else np.asarray(bends, float)
         rotations = np.ascontiguousarray(frames.rotation).reshape(n, self.skeleton.n_joints, 3, 3)
+        if self.capsules is not None:
+            flesh = shape if isinstance(shape, Capsules) else self.capsules
+            scale = np.broadcast_to(pose.scale, batch).astype(float).reshape(n)
+            with threads(parallel):
+                return flesh.vertices(rotations, joints, scale, size).reshape(*batch, -1, 3)
+        assert self.shape is not None
+        out = np.empty((n, self.n_vertices, 3))
+        body = (shape if isinstance(shape, BodyShape) else self.shape.bare()).broadcast(n)
+        turns = np.zeros((n, _skin.TAIL_RINGS)) if bends is None else np.asarray(bends, float)
         skin = _skin.skin_tubes_parallel if parallel and n > 16 else _skin.skin_tubes
         skin(joints, rotations, size, self.stations, body.half_width, body.half_height, body.power, body.blobs,
              body.tail, turns, out)  # fmt: skip

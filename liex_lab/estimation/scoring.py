@@ -17,8 +17,8 @@ from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
 
-# at the reference length: the least error that is ever expected, and what stands for the score of the opposite direction
-# where no candidate points there
+# at the reference length: the least error that is ever expected, and what stands for the score of the opposite
+# direction where no candidate points there
 LEAST_MM, _NO_OPPOSITE_MM = 0.1, 40.0
 
 
@@ -100,7 +100,8 @@ def with_expected_error(chosen: Chosen, model: Model, moments: Array, looks: Arr
 def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Array, size: float) -> Samples:
     """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
 
-    Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high the animal looks; how many millimetres a pixel covers.
+    Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high
+    the animal looks; how many millimetres a pixel covers.
     """
     pose = chosen.pose
     unit, whole = skeleton.relative_size, size * skeleton.relative_size

@@ -1,0 +1,105 @@
+"""A body made of capsules: one around every bone, and more where a skeleton's [surface] table puts them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body import _skin
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError
+
+Array = NDArray[np.float64]
+
+_KEYS = {"from", "to", "from_mm", "to_mm", "radii_mm"}
+
+
+@dataclass(frozen=True)
+class Capsules:
+    """C tapered capsules that move with a skeleton; one body, or a batch (n) of them. Lengths in mm at scale 1.
+
+    joints (C, 2): which joints carry the two ends; offsets (..., C, 2, 3): where the ends lie in these joints' frames;
+    radii (..., C, 2) at the ends; fur (...) as in `BodyShape`. The first J - 1 capsules are the skeleton's bones, in
+    order.
+    """
+
+    joints: NDArray[np.int64]
+    offsets: Array
+    radii: Array
+    fur: Array = field(default_factory=lambda: np.array(0.0))
+
+    def __len__(self) -> int:
+        return len(self.fur)
+
+    def __getitem__(self, index: int | slice | NDArray[np.int64]) -> Capsules:
+        """One body, or some, out of a batch."""
+        return replace(self, offsets=self.offsets[index], radii=self.radii[index], fur=self.fur[index])
+
+    def broadcast(self, n: int) -> Capsules:
+        """A batch (n,) of this one body, or this batch."""
+        if self.fur.ndim == 1 and len(self.fur) == n:
+            return self
+        offsets, radii, fur = (np.broadcast_to(a, (n, *a.shape)).copy() for a in (self.offsets, self.radii, self.fur))
+        return replace(self, offsets=offsets, radii=radii, fur=fur)
+
+    @staticmethod
+    def of(skeleton: Skeleton) -> Capsules:
+        """The body that a skeleton's [surface] describes: radii_mm at the joints, and [[surface.capsules]]."""
+        radii = np.array(skeleton.surface.get("radii_mm", []), float)
+        if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each of its "
+                f"{skeleton.n_joints} joints, or stations with half_width_mm and half_height_mm"
+            )
+        joints = [[int(skeleton.parents[j]), j] for j in range(1, skeleton.n_joints)]
+        at_ends = [[radii[a], radii[b]] for a, b in joints]
+        offsets = [[[0.0] * 3, [0.0] * 3] for _ in joints]
+        for table in skeleton.surface.get("capsules", []):
+            ends, where, thick = _parsed(table, skeleton)
+            joints.append(ends)
+            offsets.append(where)
+            at_ends.append(thick)
+        return Capsules(np.array(joints, np.int64), np.array(offsets, float), np.array(at_ends, float))
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """Triangles (F, 3) of the vertices that `vertices` makes."""
+        return _skin.joined_faces([(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * len(self.joints))
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of one pose's mesh."""
+        return len(self.joints) * (_skin.CAPSULE_RINGS * _skin.CAPSULE_SEGMENTS + 2)
+
+    def vertices(self, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
+        """Mesh vertices (n, V, 3) mm for joints (n, J, 3, 3) and (n, J, 3) mm.
+
+        scale (n,) multiplies the offsets, girth (n,) the radii.
+        """
+        body = self.broadcast(len(positions))
+        out = np.empty((len(positions), self.n_vertices, 3))
+        _skin.skin_capsules(rotations, positions, scale, girth, self.joints, body.offsets, body.radii, out)
+        return out
+
+
+def _parsed(table: Any, skeleton: Skeleton) -> tuple[list[int], list[list[float]], list[float]]:
+    """Joints, offsets and radii of one [[surface.capsules]]."""
+    where = f"the [[surface.capsules]] of '{skeleton.name}'"
+    if not isinstance(table, dict) or not set(table) <= _KEYS:
+        raise LiexError(f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}")
+    names = [table.get("from"), table.get("to")]
+    for name in names:
+        if name not in skeleton.names:
+            raise LiexError(f"{where} run from a joint to a joint, but there is no joint {name!r}")
+    offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
+    radii = table.get("radii_mm", [])
+    if not (_numbers(offsets[0], 3) and _numbers(offsets[1], 3) and _numbers(radii, 2) and min(radii) > 0):
+        raise LiexError(f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, got {table}")
+    return [skeleton.names.index(name) for name in names], offsets, radii
+
+
+def _numbers(value: Any, n: int) -> bool:
+    return isinstance(value, list) and len(value) == n and all(isinstance(x, int | float) for x in value)
