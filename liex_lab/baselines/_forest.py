@@ -7,7 +7,7 @@ from numba import njit, prange
 
 from liex_lab.estimation._estimate import mode_of_votes
 from liex_lab.estimation._kernels import correct_base, correct_joint, fill_view, place_joint
-from liex_lab.forests._kernels import VIEW, descend, descend_many
+from liex_lab.forests._kernels import VIEW, descend
 
 _BINS = 72  # of the circle in which headings are counted: 5 degrees each
 _SMOOTH = 3  # bins to either side that a vote for a heading also counts in
@@ -92,18 +92,14 @@ def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leave
     """
     points = np.empty((n_points, 3))
     animal_points(heights, look, phase, points)
-    views, none = np.empty((n_points, 1, VIEW), np.float32), np.zeros((n_points, 1), np.float32)
-    upright = np.eye(3)
-    for p in range(n_points):
-        fill_view(upright, points[p], look, 1.0, reach, views[p, 0])
-    scratch = np.empty((3, n_points), np.int64)
+    view, none, upright = np.empty((1, VIEW), np.float32), np.zeros(1, np.float32), np.eye(3)
     votes, n = np.empty((roots.size * n_points, 5)), 0
-    for t in range(roots.size):
-        if not used[t]:
-            continue
-        descend_many(nodes, roots[t], heights, np.float32(1.0), views, none, scratch[0], scratch[1], scratch[2])
-        for p in range(n_points):
-            leaf = leaves[scratch[2, p]]
+    for p in range(n_points):
+        fill_view(upright, points[p], look, 1.0, reach, view[0])
+        for t in range(roots.size):
+            if not used[t]:
+                continue
+            leaf = leaves[descend(nodes, roots[t], heights, np.float32(1.0), view, none)]
             for i in range(3):
                 votes[n, i] = points[p, i] + leaf[i]
             votes[n, 3], votes[n, 4] = leaf[3], leaf[4]

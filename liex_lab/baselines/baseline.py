@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,6 +13,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.recordings.foreground import Crops, Scene
 
 Array = NDArray[np.float64]
+
+DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile)  # what a broken .npz raises
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines.baseline import Guesses, in_camera_frame, see
+from liex_lab.baselines.baseline import DAMAGE, Guesses, in_camera_frame, see
 from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets_of
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
@@ -156,7 +156,7 @@ class Cnn:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 net.load_state_dict({name: torch.from_numpy(archive[name]) for name in archive.files})
-        except (OSError, ValueError, RuntimeError, EOFError) as error:
+        except DAMAGE as error:
             said = str(error).splitlines()[0]
             raise ModelError(f"{path} does not hold the CNN's weights ({said}); remove it and train again") from None
         return Cnn(skeleton, net)

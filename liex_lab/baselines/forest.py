@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.baselines import _forest as kernels
-from liex_lab.baselines.baseline import Guesses, in_camera_frame, see
+from liex_lab.baselines.baseline import DAMAGE, Guesses, in_camera_frame, see
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
@@ -107,7 +107,7 @@ class RegressionForest:
                     Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
                     for name in ("where", "pose")
                 )
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except DAMAGE as error:
             raise ModelError(f"{path} is not a whole regression forest ({error}); remove it and train again") from None
         return RegressionForest(skeleton, plan, where, pose)
 
