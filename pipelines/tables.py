@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from liex_lab.catalog import MODELS
 from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation import PoseErrors, plain
 from liex_lab.plan import Plan
@@ -168,11 +169,10 @@ def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
 
 def _made_by() -> dict[str, str]:
     """The program and the machine."""
-    import liex_lab
     from liex_lab.sessions.provenance import package_version
 
     sources = hashlib.sha256()
-    for path in sorted(Path(liex_lab.__file__).parent.rglob("*.py")):
+    for path in sorted(MODELS.parent.rglob("*.py")):
         sources.update(path.read_bytes())
     machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
     return {"version": package_version("liex_lab"), "code": sources.hexdigest()[:12], "machine": machine}
