@@ -133,9 +133,7 @@ def perturbed_truth(data: TrainingSet, cascade: Cascade, rng: np.random.Generato
     return candidates
 
 
-def train_metric(
-    data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
-) -> Forest:
+def train_metric(data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator) -> Forest:
     """The learned metric: a forest that predicts the mean joint error (mm at home size) of a pose without the truth.
 
     Trained on the cascade's own final candidates, or on perturbed truth as the paper has it.
@@ -157,7 +155,7 @@ def train_pruner(
 
     The base has not moved since its own rounds, so the cascade's final candidates are its examples, too.
     """
-    plan, method = cascade.method.pruner, cascade.method
+    plan = cascade.method.pruner
     if plan is None:
         return None
     error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)

@@ -213,7 +213,7 @@ def llvm_text(name: str, several: bool) -> str:
     text("%out = getelementptr i32, ptr %leaf, i64 %first")
     text(f"store {_INTS} %leaves, ptr %out, align 4")
     text("ret void")
-    pointers = "ptr noalias %pixels, ptr noalias %base, ptr noalias %scalar_base, ptr noalias %inverse, ptr noalias %views"
+    pointers = ", ".join(f"ptr noalias %{name}" for name in ("pixels", "base", "scalar_base", "inverse", "views"))
     return "\n".join([
         f"declare {_INTS} @llvm.smin.v{LANES}i32({_INTS}, {_INTS})",
         f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
