@@ -40,16 +40,18 @@ class Training:
 
 
 BASELINES: dict[str, ForestPlan | CnnPlan] = {"rf": ForestPlan(), "cnn": CnnPlan()}
+_N_IMAGES, _DEGRADED = 40_960, 0.5
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
-    """As many rendered images as our own model learns from, half of them degraded as for it; all animals near home
-    size, for like the paper's variant the baselines are told nothing of an animal's size.
+    """Rendered images as our own model learns from, half of them degraded; all animals near home size, for like the
+    paper's variant the baselines are told nothing of an animal's size. Their number is no one else's, so that a
+    baseline stays what it is when our own model learns from more or fewer.
     """
     from liex_lab.pipelines.train import recipe_of
 
-    sizes = recipe_of("paper", skeleton).sizes
-    return Training(replace(recipe_of("default", skeleton), sizes=sizes, n_calibration=0), BASELINES[variant])
+    recipe = replace(recipe_of("paper", skeleton), n_images=_N_IMAGES, n_calibration=0, degraded_share=_DEGRADED)
+    return Training(recipe, BASELINES[variant])
 
 
 def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> Baseline:

