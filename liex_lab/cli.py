@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import subprocess
 import sys
@@ -38,14 +37,15 @@ RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
 PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
 OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
-Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
-]
 TopicName = Annotated[
     str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
 ]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
+]
 AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse or hand.")]
 VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
+RowName = Annotated[str, typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
 
 
@@ -161,7 +161,7 @@ def train(
 def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
-    variant: VariantName = "default",
+    variant: RowName = "default",
     n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
     spine_mm: Annotated[
         float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
@@ -211,6 +211,31 @@ def evaluate_sizes(
     with progress_bar() as progress:
         result = measure(animal, n_frames=n_frames, progress=progress)
     _tell_numbers(result, json_file)
+
+
+@evaluate.command("tables")
+def evaluate_tables(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")],
+    animals: Annotated[
+        list[str] | None, typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model.")
+    ] = None,
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="Only this many frames of each split.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="See within minutes that everything runs; the numbers mean nothing.")
+    ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Train and measure every row anew, which takes hours; use no kept result.")
+    ] = False,
+) -> None:
+    """Every row of the paper's Tables 1 to 3 and its figures, measured now or kept from earlier."""
+    from liex_lab.api import run_tables
+
+    with progress_bar() as progress:
+        written = run_tables(out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress)
+    for path in written:
+        typer.echo(path)
 
 
 @evaluate.command("reference")
@@ -312,16 +337,6 @@ def _tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
 
 
 def _json(result: Any) -> str:
-    return json.dumps(_plain(result), indent=2, allow_nan=False, ensure_ascii=False)
+    from liex_lab.evaluation import plain
 
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: NumPy's numbers as Python's, and null for what is not a finite number."""
-    if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    value = value.tolist() if hasattr(value, "tolist") else value
-    if isinstance(value, list):
-        return _plain(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, PlanError
 from liex_lab.evaluation import POSE_PROTOCOL, PoseErrors, angle_between_axes, count_reversals
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.recordings.foreground import Scene
     from liex_lab.recordings.synthetic import SyntheticSession
+
+Array = NDArray[np.float64]
 
 _SPEED_FRAMES = 128
 _SPEED_REPEATS = 5
@@ -37,26 +42,65 @@ def estimator_of(animal: str, variant: str, progress: Progress = silent) -> Pose
     return PoseEstimator(Model.load(cached_model(animal, variant, progress)))
 
 
-def pose_errors(
-    estimator: PoseEstimator, sessions: Sequence[SyntheticSession], plan: Plan, progress: Progress
-) -> PoseErrors:
+def subject_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator | Baseline:
+    """What `liex evaluate pose --variant` measures: a variant of the method, one of its ablations, or a baseline."""
+    from liex_lab.pipelines.baselines import BASELINES, trained_baseline
+
+    from liex_lab.baselines.ablations import PlainMean
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.estimation.method import METHODS
+
+    if variant in METHODS:
+        return estimator_of(animal, variant, progress)
+    if variant == "paper-one-pose":
+        return PoseEstimator(estimator_of(animal, "paper", progress).model, 1)
+    if variant == "paper-no-metric":
+        return PlainMean(estimator_of(animal, "paper", progress))
+    if variant in BASELINES:
+        return trained_baseline(animal, variant, progress)
+    known = ", ".join([*METHODS, "paper-one-pose", "paper-no-metric", *BASELINES])
+    raise PlanError(f"there is no variant '{variant}'; known are {known}")
+
+
+def measure(
+    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Scene
+) -> tuple[Array, Array, Array]:
+    """Joints (n, J, 3) mm in the camera frame, their predicted error (n,) mm, NaN where the subject predicts none, and
+    the quantiles (2,) of its 90 % interval; the animal's size is found over the frames (n, H, W) mm.
+    """
+    from liex_lab.baselines.baseline import Guesses
+
+    found = subject.estimate(frames, scene, subject.find_size(frames, scene))
+    if isinstance(found, Guesses):
+        return found.joints, np.full(len(frames), np.nan), np.full(2, np.nan)
+    calibration = cast("PoseEstimator", subject).model.calibration
+    return found.chosen.pose.joints(subject.skeleton), found.chosen.error_mm, np.array(calibration.quantiles)
+
+
+def errors_of(
+    subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[SyntheticSession], plan: Plan,
+    progress: Progress,
+) -> dict[str, PoseErrors]:  # fmt: skip
     """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
     from liex_lab.recordings.foreground import Scene
 
-    model, parts = estimator.model, []
-    quantiles = np.array(model.calibration.quantiles)
+    parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
         sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
         scene, frames = Scene.learn(recording, sizes, len(recording), plan.foreground.min_height_mm)
-        estimates = estimator.estimate(frames, scene, estimator.find_size(frames, scene))
-        joints = estimates.chosen.pose.joints(estimator.skeleton)
-        parts.append(
-            PoseErrors.compare(
-                joints, recording.joints_camera, estimator.skeleton.n_joints - 1, estimates.chosen.error_mm, quantiles
-            )
-        )
-    return PoseErrors.join(parts)
+        for name, subject in subjects.items():
+            joints, predicted_mm, quantiles = measure(subject, frames, scene)
+            tip = subject.skeleton.n_joints - 1
+            parts[name].append(PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles))
+    return {name: PoseErrors.join(some) for name, some in parts.items()}
+
+
+def pose_errors(
+    subject: PoseEstimator | Baseline, sessions: Sequence[SyntheticSession], plan: Plan, progress: Progress
+) -> PoseErrors:
+    """`errors_of` one subject."""
+    return errors_of({"": subject}, sessions, plan, progress)[""]
 
 
 def evaluate_pose(
@@ -73,10 +117,10 @@ def evaluate_pose(
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split(split, spine_mm=spine_mm)
-    estimator = estimator_of(animal, variant, progress)
+    subject = subject_of(animal, variant, progress)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
-    errors = pose_errors(estimator, sessions, Plan.load(animal), progress)
+    errors = pose_errors(subject, sessions, Plan.load(animal), progress)
     how = (
         f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, each with its own camera, arena, animal; "
         "the background, the floor, the blob and the animal's size are found by the product, nothing is handed over. "
@@ -103,11 +147,11 @@ def evaluate_sizes(
             "worst_ratio": max(rows.values()) / best, "protocol": result["protocol"]}  # fmt: skip
 
 
-def _best_seconds(job: Callable[[], Any]) -> float:
+def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
     """Shortest of several runs after one that compiles: the least disturbed by what else the machine does."""
     job()
     times = []
-    for _ in range(_SPEED_REPEATS):
+    for _ in range(n_repeats or _SPEED_REPEATS):
         began = time.perf_counter()
         job()
         times.append(time.perf_counter() - began)
@@ -135,14 +179,14 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
     rate: dict[str, float] = {}
     for name, estimator, parallel in (("one", default, False), ("two", default, True), ("paper", paper, True)):
         progress(len(rate), 3, f"timing {name}")
-        rate[name] = _SPEED_FRAMES / _best_seconds(partial(estimator.estimate, frames, scene, size, parallel))
+        rate[name] = _SPEED_FRAMES / best_seconds(partial(estimator.estimate, frames, scene, size, parallel))
     crops = scene.extract(frames, size)
     looks = scene.looks(crops)
     rotations, positions, _, scores = default.candidates(crops, looks, size)
     stages = {
-        "foreground": _best_seconds(lambda: scene.extract(frames, size, False)),
-        "candidates": _best_seconds(lambda: default.candidates(crops, looks, size, False)),
-        "choice": _best_seconds(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
+        "foreground": best_seconds(lambda: scene.extract(frames, size, False)),
+        "candidates": best_seconds(lambda: default.candidates(crops, looks, size, False)),
+        "choice": best_seconds(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
                                                rotations, positions, scores)),
     }  # fmt: skip
     return {
