@@ -37,12 +37,30 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
     """
     import cv2
 
+    if not _sums_agree(data):  # the decoder would find it too, and write about it into the terminal
+        return None
     try:
         picture: NDArray[Any] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:  # of an empty buffer, and of sizes beyond OpenCV's own limits
         return None
     kind = (3, np.dtype(np.uint8)) if colour else (2, np.dtype(np.uint16))
     return picture if picture is not None and (picture.ndim, picture.dtype) == kind else None
+
+
+def _sums_agree(data: NDArray[np.uint8]) -> bool:
+    """Whether every chunk up to the last agrees with its check sum."""
+    at = len(_SIGNATURE)
+    while at + 12 <= data.size:
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 12 + length
+        if end > data.size or zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(
+            data[end - 4 : end].tobytes(), "big"
+        ):
+            return False
+        if data[at + 4 : at + 8].tobytes() == b"IEND":
+            return True
+        at = end
+    return False
 
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:

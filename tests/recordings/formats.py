@@ -239,7 +239,7 @@ def _pictures(suffix: str, write: Callable[[Path, NDArray[Any]], object]) -> Cal
 
 FORMATS = (
     Format("png", write_png_folder, others(".png"), streams=False),
-    Format("tiff", _pictures(".tif", write_tiff), lambda path, at: None, streams=False),
+    Format("tiff", _pictures(".tif", write_tiff), lambda path, at: None, streams=False, n_damaged=60),
     Format("tiff-stack", lambda f, s: write_tiff_stack(f / "depth.tif", s).parent, before(_tiff_ends, ".tif")),
     Format("pgm", _pictures(".pgm", write_pgm), others(".pgm"), streams=False),
     Format("pclzf", _pictures(".pclzf", write_pclzf), others(".pclzf"), streams=False),
@@ -257,7 +257,7 @@ FORMATS = (
         before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format(
-        "mcap-png", lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png"),
+        "mcap-png", lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png", chunk_size=4096),
         before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format(
@@ -266,12 +266,14 @@ FORMATS = (
     ),
     Format(
         "mcap-ros2",
-        lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4),
+        lambda f, s: write_ros_mcap(
+            f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4, chunk_size=4096
+        ),
         before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format("bag-lz4", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
     Format(
-        "bag-bz2", lambda f, s: write_bag(f / "recording.bag", s, compression="bz2", kind="png"),
+        "bag-bz2", lambda f, s: write_bag(f / "recording.bag", s, compression="bz2", kind="png", chunk_bytes=4096),
         before(_bag_ends, ".bag"), n_damaged=60,
     ),
     Format(
@@ -287,10 +289,10 @@ FORMATS = (
     ),
     Format(
         "raytrix-xyz", lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".xyz", write_xyz), others(".xyz"),
-        atol_mm=1e-3, streams=False,
+        atol_mm=1e-3, streams=False, n_damaged=60,
     ),
     Format(
         "raytrix-ply", lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".ply", write_ply), others(".ply"),
-        atol_mm=1e-3, streams=False, promise=_promise_ply,
+        atol_mm=1e-3, streams=False, n_damaged=60, promise=_promise_ply,
     ),
 )  # fmt: skip

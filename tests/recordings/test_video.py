@@ -119,6 +119,21 @@ def test_a_recorder_that_was_stopped_leaves_a_file_that_reads(tmp_path: Path) ->
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
 
 
+def test_an_avi_of_more_than_a_gigabyte_goes_on_in_a_second_part(tmp_path: Path) -> None:
+    content = write_avi(tmp_path / "depth.avi", STORED).read_bytes()
+    at = start = content.index(b"movi") + 4
+    for _ in range(13):
+        at += 8 + int.from_bytes(content[at + 4 : at + 8], "little")
+        at += at % 2
+    end = content.index(b"idx1")
+    more = b"AVIX" + b"LIST" + (4 + end - at).to_bytes(4, "little") + b"movi" + content[at:end]
+    first = content[: start - 8] + (4 + at - start).to_bytes(4, "little") + content[start - 4 : at]
+    first = first[:4] + (len(first) - 8).to_bytes(4, "little") + first[8:]
+    (tmp_path / "depth.avi").write_bytes(first + b"RIFF" + len(more).to_bytes(4, "little") + more)
+    with open_recording(tmp_path, camera=SMALL, strict=True) as recording:
+        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+
+
 def test_stamps_beside_a_video_come_first_and_a_mkv_has_its_own(tmp_path: Path) -> None:
     times = [k * 33 + 100 * (k > 10) for k in range(30)]
     folder = write_video_session(tmp_path, STORED, "depth.mkv", times_ms=times)
