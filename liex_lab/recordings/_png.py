@@ -49,12 +49,12 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
 
 def _sums_agree(data: NDArray[np.uint8]) -> bool:
     """Whether every chunk up to the last agrees with its check sum."""
-    at = len(_SIGNATURE)
+    at, content = len(_SIGNATURE), data.tobytes()
     while at + 12 <= data.size:
-        (length,) = struct.unpack_from(">I", data, at)
+        (length,) = struct.unpack_from(">I", content, at)
         end = at + 12 + length
-        if end > data.size or zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(
-            data[end - 4 : end].tobytes(), "big"
+        if end > data.size or zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(
+            content[end - 4 : end], "big"
         ):
             return False
         if data[at + 4 : at + 8].tobytes() == b"IEND":

@@ -51,9 +51,9 @@ def test_a_lever_is_how_far_a_small_step_moves_the_joints(animal):
         moved.append(Pose(SE3.exp(twist), home.angles, home.scale))
     moved.append(Pose(home.root, home.angles, np.exp(np.array(step))))
     for j in skeleton.solved[1:]:
-        for k in np.flatnonzero(skeleton.axes[j]):
+        for axis in np.flatnonzero(skeleton.axes[j]):
             angles = home.angles.copy()
-            angles[j, k] = step
+            angles[j, axis] = step
             moved.append(Pose(home.root, angles, home.scale))
     by_hand = [np.sqrt(((p.joints(skeleton) - rest) ** 2).sum(-1).mean()) / step for p in moved]
     assert len(lever) == len(by_hand)
