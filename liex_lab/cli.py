@@ -191,7 +191,7 @@ def evaluate_speed(
 
             result = evaluate_recordings(progress=progress)
         else:
-            from liex_lab.pipelines.evaluate import evaluate_speed as measure
+            from liex_lab.pipelines.speed import evaluate_speed as measure
 
             result = measure(animal, progress=progress)
     _tell_numbers(result, json_file)

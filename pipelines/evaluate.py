@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import platform
-import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -24,9 +21,6 @@ if TYPE_CHECKING:
     from liex_lab.recordings.synthetic import SyntheticSession
 
 Array = NDArray[np.float64]
-
-_SPEED_FRAMES = 128
-_SPEED_REPEATS = 5
 
 
 def estimator_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator:
@@ -145,60 +139,6 @@ def evaluate_sizes(
     return {"animal": animal, "n_frames": result["n_frames"], "error_percent_of_spine": rows,
             "ratio_to_best": {name: value / best for name, value in rows.items()},
             "worst_ratio": max(rows.values()) / best, "protocol": result["protocol"]}  # fmt: skip
-
-
-def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
-    """Shortest of several runs after one that compiles: the least disturbed by what else the machine does."""
-    job()
-    times = []
-    for _ in range(n_repeats or _SPEED_REPEATS):
-        began = time.perf_counter()
-        job()
-        times.append(time.perf_counter() - began)
-    return min(times)
-
-
-def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
-    """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate speed`."""
-    import numba
-
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.scoring import choose
-    from liex_lab.recordings.foreground import Scene
-    from liex_lab.recordings.worlds import world_of
-
-    sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
-    recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
-    plan = Plan.load(animal)
-    default, paper = estimator_of(animal, "default"), estimator_of(animal, "paper", progress)
-    scene, sample = Scene.learn(recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm))
-    size = default.find_size(sample, scene)
-    frames = sample[np.arange(_SPEED_FRAMES) % len(sample)]
-    cores = min(2, numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(cores)
-    rate: dict[str, float] = {}
-    for name, estimator, parallel in (("one", default, False), ("two", default, True), ("paper", paper, True)):
-        progress(len(rate), 3, f"timing {name}")
-        rate[name] = _SPEED_FRAMES / best_seconds(partial(estimator.estimate, frames, scene, size, parallel))
-    crops = scene.extract(frames, size)
-    looks = scene.looks(crops)
-    rotations, positions, _, scores = default.candidates(crops, looks, size)
-    stages = {
-        "foreground": best_seconds(lambda: scene.extract(frames, size, False)),
-        "candidates": best_seconds(lambda: default.candidates(crops, looks, size, False)),
-        "choice": best_seconds(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
-                                               rotations, positions, scores)),
-    }  # fmt: skip
-    return {
-        "animal": animal,
-        "frames_per_s_1core": rate["one"],
-        f"frames_per_s_{2}cores": rate["two"],
-        "ratio_to_paper": rate["two"] / rate["paper"],
-        "stages_ms": {name: 1000.0 * seconds / _SPEED_FRAMES for name, seconds in stages.items()},
-        "machine": f"{platform.processor() or platform.machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
-        "protocol": f"{_SPEED_FRAMES} rendered {recording.width} x {recording.height} frames in memory, foreground to "
-        f"final pose, best of {_SPEED_REPEATS}; ratio to the paper variant on two cores in the same run; stages on one",
-    }
 
 
 def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:

@@ -213,7 +213,7 @@ def rates_of(
 ) -> dict[str, dict[str, Any]]:
     """Frames per second of each subject on at most two cores, foreground included, all on the same frames in memory."""
     import numba
-    from liex_lab.pipelines.evaluate import best_seconds
+    from liex_lab.pipelines.speed import best_seconds
 
     from liex_lab.recordings.foreground import Scene
 

@@ -189,9 +189,12 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 def test_the_other_measures_reach_their_jobs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     job(
+        monkeypatch, "speed",
+        evaluate_speed=lambda animal, progress: {"animal": animal, "stages_ms": {"foreground": 0.1}},
+    )  # fmt: skip
+    job(
         monkeypatch,
         "evaluate",
-        evaluate_speed=lambda animal, progress: {"animal": animal, "stages_ms": {"foreground": 0.1}},
         evaluate_sizes=lambda animal, n_frames, progress: {"n_frames": n_frames},
         evaluate_reference=lambda session, reference: {"session": str(session), "reference": str(reference)},
     )

@@ -79,7 +79,7 @@ def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
         nn.Linear(plan.connected, plan.connected), nn.ReLU(inplace=True),
         nn.Linear(plan.connected, n_outputs),
     )  # fmt: skip
-    net.to(memory_format=torch_layout())  # type: ignore[call-overload]  # torch's own types forget it
+    net.to(memory_format=torch_layout())
     return net
 
 

@@ -47,6 +47,7 @@ class PoseEstimator:
     model: Model
     n_candidates: int = 0  # 0: as the model's method says
     unpruned: bool = False  # all candidates run the whole chain
+    n_joints: int = 0  # only so many joints are moved, to see what each costs; 0: all that can be
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
@@ -68,7 +69,7 @@ class PoseEstimator:
     @cached_property
     def _chain(self) -> kernels.Chain:
         s = self.skeleton
-        return kernels.Chain(s.parents, s.offsets, s.rest, s.axes, np.array(s.solved))
+        return kernels.Chain(s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None]))
 
     def _tuning(self, n_starts: int) -> kernels.Tuning:
         method = self.model.method

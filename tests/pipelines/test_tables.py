@@ -119,7 +119,7 @@ def test_every_figure_is_a_picture(made):
 
     assert sorted(path.name for path in made.glob("*.png")) == FIGURES
     for name in FIGURES:
-        picture = cv2.imread(str(made / name))
+        picture = np.asarray(cv2.imread(str(made / name)))
         assert min(picture.shape[:2]) > 250
         assert picture.std() > 10
 
