@@ -25,9 +25,9 @@ from tests.recordings.writers import SMALL, cut, depth_frames, write_archive, wr
 STORED = depth_frames(30)
 
 
-@pytest.mark.parametrize("gop", [1, 12, 250])
-def test_an_avi_gives_any_picture_at_any_time(tmp_path: Path, gop: int) -> None:
-    folder = write_video_session(tmp_path, STORED, gop=gop)
+@pytest.mark.parametrize(("gop", "level"), [(1, 3), (12, 3), (250, 3), (12, 1)])
+def test_an_avi_gives_any_picture_at_any_time(tmp_path: Path, gop: int, level: int) -> None:
+    folder = write_video_session(tmp_path, STORED, gop=gop, level=level)
     rng = np.random.default_rng(1)
     with open_recording(folder, strict=True) as recording:
         for index in [29, 0, 1, 2, 13, 12, 11, 28, 29, *rng.integers(0, 30, 40).tolist()]:
