@@ -49,15 +49,13 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
 
 def _sums_agree(data: NDArray[np.uint8]) -> bool:
     """Whether every chunk up to the last agrees with its check sum."""
-    at, content = len(_SIGNATURE), data.tobytes()
-    while at + 12 <= data.size:
-        (length,) = struct.unpack_from(">I", content, at)
+    view, at = data.data, len(_SIGNATURE)
+    while at + 12 <= len(view):
+        (length,) = struct.unpack_from(">I", view, at)
         end = at + 12 + length
-        if end > data.size or zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(
-            content[end - 4 : end], "big"
-        ):
+        if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
             return False
-        if data[at + 4 : at + 8].tobytes() == b"IEND":
+        if bytes(view[at + 4 : at + 8]) == b"IEND":
             return True
         at = end
     return False
