@@ -239,7 +239,7 @@ def _pictures(suffix: str, write: Callable[[Path, NDArray[Any]], object]) -> Cal
 
 FORMATS = (
     Format("png", write_png_folder, others(".png"), streams=False),
-    Format("tiff", _pictures(".tif", write_tiff), lambda path, at: None, streams=False, n_damaged=60),
+    Format("tiff", _pictures(".tif", write_tiff), lambda path, at: None, streams=False),
     Format("tiff-stack", lambda f, s: write_tiff_stack(f / "depth.tif", s).parent, before(_tiff_ends, ".tif")),
     Format("pgm", _pictures(".pgm", write_pgm), others(".pgm"), streams=False),
     Format("pclzf", _pictures(".pclzf", write_pclzf), others(".pclzf"), streams=False),
@@ -289,10 +289,10 @@ FORMATS = (
     ),
     Format(
         "raytrix-xyz", lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".xyz", write_xyz), others(".xyz"),
-        atol_mm=1e-3, streams=False, n_damaged=60,
+        atol_mm=1e-3, streams=False,
     ),
     Format(
         "raytrix-ply", lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".ply", write_ply), others(".ply"),
-        atol_mm=1e-3, streams=False, n_damaged=60, promise=_promise_ply,
+        atol_mm=1e-3, streams=False, promise=_promise_ply,
     ),
 )  # fmt: skip
