@@ -37,7 +37,7 @@ class Recipe:
 
     seed: int = 20
     n_images: int = 49_152
-    n_calibration: int = 12_288
+    n_calibration: int = 24_576
     degraded_share: float = 0.5
     sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
 

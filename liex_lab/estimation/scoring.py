@@ -114,6 +114,7 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
             10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
             5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
             moments[:, 6] / whole, moments[:, 7] / whole, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
+            *chosen.sd_root.T[3:] / whole, 10 * chosen.sd_angles.sum(axis=(1, 2)),
         ],
         axis=1,
     )  # fmt: skip
