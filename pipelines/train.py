@@ -42,10 +42,15 @@ class Recipe:
     sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
 
 
-AREA_MM2 = 1070.0  # of a home-sized mouse seen from above; only ranks the blobs of a training window
+_AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
 RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
-_OWN: dict[tuple[str, str], Recipe] = {}  # of an animal and a variant, where it is not the mouse's
+_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 320))
+# of an animal and a variant, where it is not the mouse's
+_OWN: dict[tuple[str, str], Recipe] = {
+    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_calibration=4_096, sizes=_FISH_SIZES),
+    ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
+}
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
@@ -136,7 +141,11 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
     from liex_lab.recordings.foreground import Windows
 
     size = windows.spine_mm / skeleton.length
-    cut = Windows(windows.depth, windows.background, windows.intrinsics, windows.origin.astype(float), windows.floor)
+    depth, background = (
+        picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+        for picture in (windows.depth, windows.background)
+    )
+    cut = Windows(depth, background, windows.intrinsics, windows.origin.astype(float), windows.floor, skeleton.view)
     shown = size if method.session_size else np.ones(len(size))
     parts = [cut_rank(skeleton, method, windows, cut, shown, rank) for rank in (0, 1)]
     return TrainingSet.join(parts)
@@ -152,7 +161,8 @@ def cut_rank(
     from liex_lab.geometry import SE3
 
     size = windows.spine_mm / skeleton.length
-    crops, looks = cut.extract(shown, AREA_MM2 * size**2, camera_view=method.camera_view, rank=rank)
+    area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
+    crops, looks = cut.extract(shown, area, skeleton.view.min_height_mm, method.camera_view, rank)
     rotation = looks[:, 4:13].reshape(-1, 3, 3)
     T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
@@ -166,6 +176,13 @@ def cut_rank(
         size[good],
         animal[good],
     )
+
+
+def home_area_mm2(skeleton: Skeleton) -> float:
+    """About the area of a home-sized animal seen from above."""
+    from liex_lab.body.surface import Surface
+
+    return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
 
 
 def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:

@@ -81,6 +81,10 @@ METHODS = {
 
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
+    ("fish", "default"): {
+        "rounds": 3, "training_candidates": 5, "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
+        "reach_mm": 12.5, "keep_off_mm": 4.0, "top_tau": 0.25, "top_radius_mm": 4.5, "base_lever_mm": 10.0,
+    },
     ("fish", "paper"): {
         "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
     },

@@ -67,7 +67,7 @@ class Sensor:
 def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
     """The habits of n plenoptic cameras into p (n, N_PARAMETERS)."""
     n = len(p)
-    p[:, k.SMOOTH] = rng.uniform(0.3, 1.0, n)  # mm at 250 mm
+    p[:, k.SMOOTH] = rng.uniform(0.4, 1.2, n)  # mm at 250 mm
     p[:, k.WHITE] = rng.uniform(0.1, 0.4, n)
     p[:, k.LUMPS] = rng.uniform(0.05, 0.25, n)
     p[:, k.GRID] = rng.uniform(5.0, 11.0, n)  # the footprint of a few micro lenses, pixels

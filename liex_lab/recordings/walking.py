@@ -165,32 +165,20 @@ def _path(rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array)
     """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back before a wall."""
     n, camera = len(speed), stage.camera
     middle = floor_point(camera, stage.T_arena_camera, np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]))
-    home = stage.centre if _freedom(stage, stage.centre) > _freedom(stage, middle) else middle
-    margin = min(0.85 * spine_mm, 0.7 * _freedom(stage, home))
+    home = stage.centre if stage.freedom(stage.centre) > stage.freedom(middle) else middle
+    margin = min(0.85 * spine_mm, 0.7 * stage.freedom(home))
     position, heading = np.empty((n, 2)), np.empty(n)
     at, way, rate = home + rng.normal(0.0, 0.2 * margin, 2), rng.uniform(-np.pi, np.pi), 0.0
     for i in range(n):
         rate = 0.93 * rate + rng.normal(0.0, 0.25)
         back = np.arctan2(home[1] - at[1], home[0] - at[0])
         away = (back - way + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (_freedom(stage, at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
+        close = np.clip(1.0 - (stage.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
         # it turns back faster the faster it goes, and stays within a mouse's turning rate
         pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
         way += np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
         step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
-        if _freedom(stage, at + step) > margin or _freedom(stage, at + step) > _freedom(stage, at):
+        if stage.freedom(at + step) > margin or stage.freedom(at + step) > stage.freedom(at):
             at = at + step
         position[i], heading[i] = at, way
     return position, heading
-
-
-def _freedom(stage: Stage, xy: Array) -> float:
-    """How far (mm) a point of the floor is from the nearest wall, clutter and border of the picture."""
-    c = stage.camera
-    p = stage.T_arena_camera.inverse() @ np.array([xy[0], xy[1], 0.0])
-    uv = c.project(p)
-    border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min() * p[2] / c.fx
-    free = min(float(stage.room(xy)), float(border))
-    if len(stage.clutter):
-        free = min(free, float(np.linalg.norm(stage.clutter - xy, axis=1).min()))
-    return free

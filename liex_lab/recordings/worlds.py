@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings import synthetic, walking, windows
+from liex_lab.recordings.fish import FishHabits
 from liex_lab.recordings.habits import Habits, MouseHabits
 from liex_lab.recordings.synthetic import SyntheticSession
 from liex_lab.recordings.windows import TrainingWindows
@@ -79,8 +80,19 @@ class MouseWorld(RenderedWorld):
         return walking.walking_session(seed, n_frames, habits=self.habits, **settings)
 
 
+@dataclass(frozen=True)
+class FishWorld(RenderedWorld):
+    """A zebrafish in a tank, seen from above."""
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+        """A fish that swims."""
+        raise NotImplementedError
+
+
 def world_of(skeleton: Skeleton) -> World:
     """The world of an animal."""
     if skeleton.name == "mouse":
         return MouseWorld(MouseHabits(skeleton))
+    if skeleton.name == "fish":
+        return FishWorld(FishHabits(skeleton))
     raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")
