@@ -12,31 +12,61 @@ from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.behaviour.bouts import MouseRules
+    from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
+    from liex_lab.water import Water
 
 
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
     """The recording at a path, opened as the plan says, or one that is open already; the plan's camera overrules.
 
-    A plan that states all four intrinsics opens a recording that has none, too.
+    A plan that states all four intrinsics opens a recording that has none, too. Lens distortion and the water's
+    refraction are undone whenever a frame is read: what comes back is a recording of an ideal camera in air.
     """
-    from liex_lab.camera import Lens
     from liex_lab.recordings import open_recording
+    from liex_lab.recordings.rectify import rectified
 
     settings = plan.recording
-    stated: dict[str, Any] = plan.camera.model_dump(exclude_none=True)
     if isinstance(recording, str | Path):
-        lens = {name: stated[name] for name in ("fx", "fy", "cx", "cy") if name in stated}
         recording = open_recording(
-            recording, camera=Lens(**lens) if len(lens) == 4 else None, fps=settings.fps, topic=settings.topic,
+            recording, camera=_stated_lens(plan), fps=settings.fps, topic=settings.topic,
             strict=not settings.accept_truncated, progress=progress,
         )  # fmt: skip
-    if stated:
-        recording.camera = replace(recording.camera, **{"source": "plan", **stated})
-    return recording
+    recording.camera = _overruled(recording.camera, plan)
+    return rectified(recording, build_water(plan))
+
+
+def build_water(plan: Plan) -> Water | None:
+    """The water surface of the plan, if there is one."""
+    from liex_lab.water import Water
+
+    stated = plan.water.model_dump()
+    return Water(**stated) if stated["height_mm"] is not None else None
+
+
+def _stated_lens(plan: Plan) -> Lens | None:
+    """The plan's camera where it states all of it."""
+    from liex_lab.camera import Lens
+
+    stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
+    return None if None in stated.values() else Lens(**stated, distortion=_stated_distortion(plan))
+
+
+def _stated_distortion(plan: Plan) -> Distortion | None:
+    from liex_lab.camera import Distortion
+
+    return Distortion.of(plan.camera.distortion_model or "plumb_bob", plan.camera.distortion or [])
+
+
+def _overruled(camera: Camera, plan: Plan) -> Camera:
+    """The camera with what the plan states put in."""
+    stated: dict[str, Any] = plan.camera.model_dump(exclude_none=True, exclude={"distortion", "distortion_model"})
+    if plan.camera.distortion is not None:
+        stated["distortion"] = _stated_distortion(plan)
+    return replace(camera, **{"source": "plan", **stated}) if stated else camera
 
 
 def build_estimator(plan: Plan) -> PoseEstimator:

@@ -42,6 +42,8 @@ class Method:
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
+    survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
+    pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card."""
@@ -53,6 +55,8 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
+        if plain.get("pruner"):
+            plain["pruner"] = GrowthPlan(**plain["pruner"])
         return Method(**plain)
 
 
@@ -60,13 +64,14 @@ _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
     "default": Method(
-        variant="default", rounds=5, n_candidates=10, training_candidates=8,
+        variant="default", rounds=5, n_candidates=16, training_candidates=8,
         regressors=GrowthPlan(12, 18, 22, 100, 0.3, 0.15, 0.3, 0.63),
         metric=GrowthPlan(80, 9, 50, 100, 0.45, 0.1, 0.3, 0.5),
         reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
         keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
         metric_shrinkage=0.15, mean_shift_mm=0.0,
         top_k=10, top_tau=1.0, top_radius_mm=15.0,
+        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
     ),
     "paper": Method(
         variant="paper", rounds=3, n_candidates=40, training_candidates=6,

@@ -22,6 +22,7 @@ Tell = Callable[[float, str], None]  # share done, what is being done
 # at the reference length: a pose worse than this is simply wrong; how wrong is not worth learning
 _ERROR_CAP_MM = 30.0
 _FEW_JOINTS = 3
+_PRUNER_SHRINKAGE = 0.3
 _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 
 
@@ -147,3 +148,18 @@ def train_metric(
     if method.metric_shrinkage > 0:
         return quantised(boost_forest(samples, labels, method.metric, method.metric_shrinkage, rng))
     return quantised(grow_forest(samples, labels, np.ones(len(candidates), np.bool_), method.metric, rng)[0])
+
+
+def train_pruner(
+    data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
+) -> Forest | None:
+    """The small metric that tells from the base joint alone how far off the whole pose will be (METHOD lesson 9).
+
+    The base has not moved since its own rounds, so the cascade's final candidates are its examples, too.
+    """
+    plan = cascade.method.pruner
+    if plan is None:
+        return None
+    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
+    samples = cascade.samples(data.images, candidates, [0])
+    return quantised(boost_forest(samples, error[:, None].astype(np.float32), plan, _PRUNER_SHRINKAGE, rng))

@@ -93,7 +93,7 @@ def cut_crop(
     n_steps[k] = step
     raw = np.empty((crop, crop), np.float32)
     segment.cut_heights(depth, limit, labels, slot, plane, distance, origin[k], step, raw)
-    segment.keep_largest(raw, np.empty((crop, crop), np.int32), np.empty((crop * crop, 2), np.int32))
+    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from liex_lab.camera import Camera, Lens
-from liex_lab.errors import RecordingError
+from liex_lab.camera import Camera, Distortion, Lens
+from liex_lab.errors import LiexError, RecordingError
 from liex_lab.recordings.times import start_of_day
 
 CAMERA_FILE = "camera.toml"
@@ -20,17 +20,18 @@ WHAT_TO_WRITE = (
 )
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
-_TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time")
-_KEYS = (*_NUMBERS, "unread", *_TEXTS)
+_TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
+_KEYS = (*_NUMBERS, "unread", "distortion", *_TEXTS)
 
 
 @dataclass(frozen=True)
 class CameraFile:
     """What a camera.toml states, under [camera] or at its top; everything may be left out.
 
-    intrinsics: any of fx, fy, cx, cy; width, height: pixels; unit_mm: millimetres per stored step; unread: stored
-    values that mean "no reading"; fps: used where there are no stamps; timestamps: name of the stamp file; pattern:
-    which pictures of the folder to read, as in "*_depth.png"; metadata: subject_id, session_start_time.
+    intrinsics: any of fx, fy, cx, cy; distortion: of the lens, from distortion (a list of coefficients in OpenCV's
+    order) and distortion_model; width, height: pixels; unit_mm: millimetres per stored step; unread: stored values that
+    mean "no reading"; fps: used where there are no stamps; timestamps: name of the stamp file; pattern: which pictures
+    of the folder to read, as in "*_depth.png"; metadata: subject_id, session_start_time.
     """
 
     path: Path
@@ -44,6 +45,7 @@ class CameraFile:
     pattern: str = "*"
     metadata: dict[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
+    distortion: Distortion | None = None
 
     @staticmethod
     def read(path: Path) -> CameraFile:
@@ -70,13 +72,17 @@ class CameraFile:
         missing = [name for name in _INTRINSICS if name not in self.intrinsics]
         if missing:
             raise RecordingError(f"{self.path} does not state {', '.join(missing)}; {WHAT_TO_WRITE}")
-        camera = Camera(**self.intrinsics, width=self.width or width, height=self.height or height, source=CAMERA_FILE)
+        camera = Camera(
+            **self.intrinsics, width=self.width or width, height=self.height or height, source=CAMERA_FILE,
+            distortion=self.distortion,
+        )  # fmt: skip
         return fitting(camera, width, height, str(self.path))
 
 
 def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
     """The camera itself, if it belongs to pictures of this size; one stated without a size belongs to any."""
-    camera = lens if isinstance(lens, Camera) else Camera(lens.fx, lens.fy, lens.cx, lens.cy, width, height)
+    bare = (lens.fx, lens.fy, lens.cx, lens.cy, width, height)
+    camera = lens if isinstance(lens, Camera) else Camera(*bare, distortion=lens.distortion)
     if (camera.width, camera.height) != (width, height):
         raise RecordingError(
             f"{where} is for pictures of {camera.width} x {camera.height} pixels, but these have {width} x {height}; "
@@ -106,7 +112,7 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
             )
     if numbers.get("unit_mm", 1.0) == 0.0:
         raise RecordingError(f"{path} states unit_mm = 0; it is the number of millimetres in one stored step")
-    for key in ("timestamps", "pattern", "subject_id"):
+    for key in ("timestamps", "pattern", "subject_id", "distortion_model"):
         if key in table and not (isinstance(table[key], str) and table[key]):
             raise RecordingError(f"{path} states {key} = {table[key]!r}; it is a text in quotation marks")
     metadata = {"subject_id": table["subject_id"]} if "subject_id" in table else {}
@@ -130,7 +136,21 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
         pattern=table.get("pattern", "*"),
         metadata=metadata,
         problems=problems,
+        distortion=_distortion(path, table),
     )
+
+
+def _distortion(path: Path, table: dict[str, Any]) -> Distortion | None:
+    values = table.get("distortion", [])
+    if not isinstance(values, list):
+        raise RecordingError(
+            f"{path} states distortion = {values!r}; it is a list of coefficients, as in [-0.1, 0.02, 0, 0]"
+        )
+    coefficients = [_number(path, "distortion", value) for value in values]
+    try:
+        return Distortion.of(table.get("distortion_model", "plumb_bob"), coefficients)
+    except LiexError as error:
+        raise RecordingError(f"{path}: {error}") from None
 
 
 def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:

@@ -32,7 +32,7 @@ class Recording:
     name; format ("images", "moseq", "mcap", ...); camera; times_ns (n,) int64 on the recording's own clock, strictly
     increasing; problems: sentences about what is odd in the file, also those found while reading; truncated: the file
     is cut or damaged, and n_whole of its frames are whole; metadata: subject_id and session_start_time (ISO 8601 with
-    zone) where the file tells them.
+    zone) where the file tells them; optics: what was undone on reading, empty where nothing was (see `rectify`).
     """
 
     def __init__(
@@ -59,6 +59,7 @@ class Recording:
         self.truncated = truncated
         self.n_whole = len(self.times_ns) if n_whole is None else n_whole
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
+        self.optics: dict[str, Any] = {}
         self._read, self._sources = read, tuple(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
@@ -133,8 +134,23 @@ class Recording:
             read=self._read, sources=self._sources, problems=self.problems, truncated=self.truncated,
             metadata=self.metadata, step_ns=self._step_ns * step, stored=self._stored[rows],
         )  # fmt: skip
-        cut._whole = self._whole or self
+        cut._whole, cut.optics = self._whole or self, self.optics
         return cut
+
+    def seen_by(self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]) -> Recording:
+        """The same frames as another camera would have seen them: `change` turns each depth picture when it is read.
+
+        The input, and so the digest, stays the same; closing one closes both.
+        """
+        read = self._read
+        other = Recording(
+            name=self.name, format=self.format, camera=camera, times_ns=self.times_ns.copy(),
+            read=lambda number: change(read(number)), sources=self._sources, problems=self.problems,
+            truncated=self.truncated, n_whole=self.n_whole, metadata=self.metadata, step_ns=self._step_ns,
+            stored=self._stored, close=self.close,
+        )  # fmt: skip
+        other._whole, other.optics = self._whole or self, optics
+        return other
 
     def digest(self, progress: Progress = silent) -> str:
         """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in order of name.
