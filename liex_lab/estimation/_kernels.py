@@ -154,11 +154,13 @@ def place_all(j, parents, offsets, rest, scale, rotations, positions):
 
 @njit(cache=True, parallel=True)
 def look_all(joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars):
-    """Views (n, V, 9) of the given joints and scalars (n, N_SCALARS) of the first of them, for a batch."""
+    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars (n, N_SCALARS) of the
+    first of them, for a batch.
+    """
     for s in prange(scale.size):
         i = image[s]
         for v in range(joints.size):
-            fill_view(rotations[s, joints[v]], positions[s, joints[v]], looks[i], size[s], reach, views[s, v])
+            fill_view(rotations[s, joints[v]], positions[s, joints[v]], looks[i], size[s], reach[v], views[s, v])
         if scalars.shape[1] > 0:
             fill_scalars(rotations[s, joints[0]], positions[s, joints[0]], scale[s], moments[i], size[s], scalars[s])
 

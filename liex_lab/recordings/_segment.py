@@ -9,6 +9,7 @@ BLOCK = 4  # pixels a side; blobs are connected in blocks
 _ROW_STEP = 2  # every other row is looked at: reading a picture takes longer than anything that is done with it
 _MIN_IN_BLOCK = 3  # of the 8 pixels looked at
 MAX_BLOBS = 32
+N_MOMENTS = 9
 
 
 @njit(cache=True)
@@ -270,14 +271,14 @@ def smooth_heights(raw, radius, out):
 
 @njit(cache=True)
 def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments):
-    """Mass, area and axes of an animal from its height map, in the arena frame, into moments (8,).
+    """Mass, area and axes of an animal from its height map, in the arena frame, into moments (N_MOMENTS,).
 
     moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of the long axis
-    (mod pi), and the standard deviations mm along and across it. intrinsics (fx, fy, cx, cy); rotation (3, 3) of
+    (mod pi), the standard deviations mm along and across it, and how steeply the back rises along it. intrinsics (fx, fy, cx, cy); rotation (3, 3) of
     T_arena_camera, whose translation is (0, 0, distance).
     """
     n, area, volume = 0, 0.0, 0.0
-    sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
+    sx, sy, sxx, sxy, syy, sxh, syh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for r in range(1, heights.shape[0] - 1):
         v = origin[1] + step * r
@@ -299,7 +300,9 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
             sxx += w * x * x
             sxy += w * x * y
             syy += w * y * y
-    for k in range(8):
+            sxh += w * x * h
+            syh += w * y * h
+    for k in range(N_MOMENTS):
         moments[k] = 0.0
     if n == 0:
         return
@@ -309,3 +312,5 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     half, root = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
     moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = n, area, volume, mx, my, angle
     moments[6], moments[7] = np.sqrt(max(half + root, 0.0)), np.sqrt(max(half - root, 0.0))
+    rise = np.cos(angle) * (sxh - mx * volume) + np.sin(angle) * (syh - my * volume)
+    moments[8] = rise / (area * max(half + root, 1e-6))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.camera import Camera
 from liex_lab.recordings import _crops as kernels
+from liex_lab.recordings._segment import N_MOMENTS
 from liex_lab.recordings.arena import Floor
 
 Array = NDArray[np.float64]
@@ -24,8 +25,8 @@ class Crops:
     heights (n, CROP, CROP) int16, 1/16 mm above the floor, 0 = not the animal; origin (n, 2) picture pixel (u, v) of
     crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,) readings on the animal, 0 = not found; n_blobs
     (n,) how many things in the frame have about the animal's size;
-    moments (n, 8): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), and the standard
-    deviation mm along and across it, all in the view frame. The view frame is the arena frame, or (camera_view) an
+    moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), the standard
+    deviation mm along and across it, and the slope of the back along it, all in the view frame. The view frame is the arena frame, or (camera_view) an
     upright frame whose z axis is the optical axis backwards; its origin is `distance` (n,) mm in front of the camera.
     """
 
@@ -82,7 +83,7 @@ class Windows:
         n = len(self.depth)
         crops = Crops(
             np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, 8)), np.empty(n), np.zeros(n, np.int64),
+            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.empty(n), np.zeros(n, np.int64),
         )  # fmt: skip
         # a window is the picture of a camera whose centre is shifted
         intrinsics, plane = self.intrinsics.copy(), self.inverse_depth.copy()

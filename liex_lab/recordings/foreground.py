@@ -12,7 +12,7 @@ from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
 from liex_lab.recordings import _crops as kernels
-from liex_lab.recordings._segment import MAX_BLOBS
+from liex_lab.recordings._segment import MAX_BLOBS, N_MOMENTS
 from liex_lab.recordings.arena import Floor, find_floor
 from liex_lab.recordings.background import floor_region, learn_background, sample_frames, stride_for
 from liex_lab.recordings.crops import CROP, Crops, Windows
@@ -92,7 +92,9 @@ class Scene:
         behind = np.where(on_floor, background, near)
         margin = np.maximum(np.float32(min_height_mm), np.float32(_SPREADS) * spread)
         limit = np.maximum(behind - margin, 0).astype(np.float32)
-        scene = Scene(recording.camera, floor, background, limit, on_floor, view=view, stride=stride)
+        stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
+        over = on_floor if stands else np.ones_like(on_floor)
+        scene = Scene(recording.camera, floor, background, limit, over, view=view, stride=stride)
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit).astype(np.float32)
@@ -100,7 +102,7 @@ class Scene:
             still_area, still_share = still.usual_area(sample, spine_mm)
             if still_share > share:
                 scene, area, share = still, still_area, still_share
-        else:
+        elif stands:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
         if share == 0.0:
             raise EstimationError(
@@ -208,7 +210,7 @@ class Scene:
             depths = depths[:, :: self.stride, :: self.stride]
         crops = Crops(
             np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, 8)), np.full(n, self.floor.distance_mm), np.zeros(n, np.int64),
+            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.full(n, self.floor.distance_mm), np.zeros(n, np.int64),
         )  # fmt: skip
         grid = self.grid
         with threads(parallel):
