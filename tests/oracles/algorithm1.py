@@ -56,7 +56,7 @@ class Picture:
 
     def scalars(self, joint: Array, scale: float) -> NDArray[np.float32]:
         """The eleven numbers that describe the whole animal as a joint (4, 4) sees it."""
-        _, area, volume, x, y, axis, along, across = self.moments
+        _, area, volume, x, y, axis, along, across, _ = self.moments
         size, place, forward = self.size, joint[:3, 3], joint[:3, 0]
         to_middle = np.array([x - place[0], y - place[1], 0.0])
         turned = axis - np.arctan2(forward[1], forward[0])
