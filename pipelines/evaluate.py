@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from liex_lab.pipelines.build import plan_of
 
 from liex_lab.errors import LiexError
 from liex_lab.evaluation import POSE_PROTOCOL, PoseErrors, angle_between_axes, count_reversals
@@ -20,20 +21,24 @@ if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.recordings.synthetic import SyntheticSession
 
+_SIZES_MM = {"mouse": (45.0, 65.0, 80.0, 100.0), "fish": (18.0, 25.0, 32.0, 45.0)}
+_SIZES = (0.75, 1.0, 1.25, 1.5)  # of other animals, over their home length
 _SPEED_FRAMES = 128
 _SPEED_REPEATS = 5
 
 
-def estimator_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator:
-    """The estimator of a variant: the bundled model, or one that is trained now and kept in the user's cache."""
+def estimator_of(
+    animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
+) -> PoseEstimator:
+    """The estimator of a model file, or of a variant: the bundled model, or one trained now and kept in the cache."""
     from liex_lab.pipelines.train import cached_model
 
-    from liex_lab.catalog import find_model
+    from liex_lab.catalog import bundled_models, find_model
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
 
-    if variant == "default":
-        return PoseEstimator(Model.load(find_model(animal)))
+    if model is not None or (variant == "default" and animal in bundled_models()):
+        return PoseEstimator(Model.load(find_model(model or animal)))
     return PoseEstimator(Model.load(cached_model(animal, variant, progress)))
 
 
@@ -48,7 +53,8 @@ def pose_errors(
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
         sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
-        scene, frames = Scene.learn(recording, sizes, len(recording), plan.foreground.min_height_mm)
+        view = estimator.skeleton.view
+        scene, frames = Scene.learn(recording, sizes, len(recording), plan.foreground.min_height_mm, view)
         estimates = estimator.estimate(frames, scene, estimator.find_size(frames, scene))
         joints = estimates.chosen.pose.joints(estimator.skeleton)
         parts.append(
@@ -64,19 +70,20 @@ def evaluate_pose(
     split: str = "clean",
     variant: str = "default",
     *,
+    model: str | Path | None = None,
     n_frames: int | None = None,
     spine_mm: float | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The figures of one split and variant; `liex evaluate pose`."""
+    """The figures of one split and variant; `liex evaluate pose`. model: of another file than the animal's own."""
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split(split, spine_mm=spine_mm)
-    estimator = estimator_of(animal, variant, progress)
+    estimator = estimator_of(animal, variant, progress, *(() if model is None else (model,)))
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
-    errors = pose_errors(estimator, sessions, Plan.load(animal), progress)
+    errors = pose_errors(estimator, sessions, plan_of(animal), progress)
     how = (
         f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, each with its own camera, arena, animal; "
         "the background, the floor, the blob and the animal's size are found by the product, nothing is handed over. "
@@ -85,16 +92,26 @@ def evaluate_pose(
             **errors.summary(), "protocol": how + POSE_PROTOCOL}  # fmt: skip
 
 
+def sizes_of(animal: str) -> tuple[float, ...]:
+    """From how small to how large animals of a kind are, mm."""
+    from liex_lab.body.skeleton import Skeleton
+
+    if animal in _SIZES_MM:
+        return _SIZES_MM[animal]
+    home = Skeleton.load(animal).length
+    return tuple(round(factor * home, 1) for factor in _SIZES)
+
+
 def evaluate_sizes(
     animal: str = "mouse",
-    spines_mm: Sequence[float] = (45.0, 65.0, 80.0, 100.0),
+    spines_mm: Sequence[float] | None = None,
     *,
     n_frames: int | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Mean joint error in per cent of the spine for animals of several sizes, the size estimated and not given."""
     rows = {}
-    for spine in spines_mm:
+    for spine in spines_mm or sizes_of(animal):
         result = evaluate_pose(animal, "clean", "default", n_frames=n_frames, spine_mm=spine, progress=progress)
         rows[f"{spine:g}"] = 100.0 * result["mean_joint_error_mm"] / spine
     best = min(rows.values())
@@ -125,22 +142,26 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
     recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
-    plan = Plan.load(animal)
+    plan = plan_of(animal)
     default, paper = estimator_of(animal, "default"), estimator_of(animal, "paper", progress)
-    scene, sample = Scene.learn(recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm))
-    size = default.find_size(sample, scene)
-    frames = sample[np.arange(_SPEED_FRAMES) % len(sample)]
+    sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
+    scene, sample = Scene.learn(
+        recording, sizes, min_height_mm=plan.foreground.min_height_mm, view=default.skeleton.view
+    )
+    size, camera_view = default.find_size(sample, scene), default.model.method.camera_view
+    frames = recording.depths(0, min(len(recording), _SPEED_FRAMES))  # whole ones, which the sample need not be
+    frames = frames[np.arange(_SPEED_FRAMES) % len(frames)]
     cores = min(2, numba.config.NUMBA_NUM_THREADS)
     numba.set_num_threads(cores)
     rate: dict[str, float] = {}
     for name, estimator, parallel in (("one", default, False), ("two", default, True), ("paper", paper, True)):
         progress(len(rate), 3, f"timing {name}")
         rate[name] = _SPEED_FRAMES / _best_seconds(partial(estimator.estimate, frames, scene, size, parallel))
-    crops = scene.extract(frames, size)
-    looks = scene.looks(crops)
+    crops = scene.extract(frames, size, camera_view=camera_view)
+    looks = scene.looks(crops, camera_view)
     rotations, positions, _, scores = default.candidates(crops, looks, size)
     stages = {
-        "foreground": _best_seconds(lambda: scene.extract(frames, size, False)),
+        "foreground": _best_seconds(lambda: scene.extract(frames, size, False, camera_view)),
         "candidates": _best_seconds(lambda: default.candidates(crops, looks, size, False)),
         "choice": _best_seconds(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
                                                rotations, positions, scores)),

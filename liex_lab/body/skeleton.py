@@ -6,7 +6,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -81,7 +81,8 @@ class Skeleton:
     Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a joint away from
     its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame into the joint's at home; `axes`
     (J, 3) says which of roll, pitch and yaw the joint can do; `limits` (J, 3, 2) rad. The base joint, 0, has all six
-    degrees of freedom. Parents precede their children. surface: the [surface] table, see `Surface.of`.
+    degrees of freedom. Parents precede their children. surface: the [surface] table, see `Surface.of`; table: the whole
+    TOML.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Skeleton:
     limits: Array
     surface: dict[str, Any]
     view: View
+    table: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
@@ -144,6 +146,7 @@ class Skeleton:
             limits=np.radians([row.limits for row in rows]),
             surface=table.get("surface", {}),
             view=View.from_table(table.get("view", {}), relative_size, origin),
+            table=table,
         )
 
     @property

@@ -45,7 +45,8 @@ def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int)
             blobs[:, b, 1] *= wide[:, nearest]
             blobs[:, b, 2] *= high[:, nearest]
             blobs[:, b, 3:] *= size[:, None]
-    return BodyShape(shape.half_width * wide, shape.half_height * high, rng.uniform(1.8, 2.4, n), blobs, shape.tail, fur)
+    power = rng.uniform(1.8, 2.4, n)
+    return BodyShape(shape.half_width * wide, shape.half_height * high, power, blobs, shape.tail, fur)
 
 
 def joint_reaches(skeleton: Skeleton) -> Array:
@@ -64,7 +65,7 @@ def _factors(rng: np.random.Generator, along: Array, family: str, n: int) -> tup
     at = rng.uniform(0.2, 0.5, (n, 1))
     if family == "other":
         log_girth, tilt = sign[0] * (0.24 + 0.12 * size), sign[1] * (0.40 + 0.25 * slope)
-        squeeze, bulge, rough = sign[2] * (0.10 + 0.12 * flat), 0.25 * belly, 0.05
+        squeeze, bulge, rough = sign[2] * (0.10 + 0.12 * flat), 0.25 * belly, np.full((n, 1), 0.05)
     else:
         more = np.where(wild, 2.0, 1.0)
         log_girth, tilt = more * sign[0] * 0.12 * size, more * sign[1] * 0.15 * slope

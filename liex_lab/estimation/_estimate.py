@@ -50,8 +50,8 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C; reach (J,) mm of the offsets from each joint; levers (3,) of base, joints and scale; bandwidth mm of the
-    mean shift, 0 for the mean; how many candidates outlive the base joint.
+    """Rounds C; reach (J,) mm of the offsets from each joint; levers (3,) of base, joints and scale; bandwidth mm of
+    the mean shift, 0 for the mean; how many candidates outlive the base joint.
     """
 
     rounds: int

@@ -154,8 +154,8 @@ def place_all(j, parents, offsets, rest, scale, rotations, positions):
 
 @njit(cache=True, parallel=True)
 def look_all(joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars):
-    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars (n, N_SCALARS) of the
-    first of them, for a batch.
+    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars (n, N_SCALARS) of
+    the first of them, for a batch.
     """
     for s in prange(scale.size):
         i = image[s]

@@ -108,8 +108,8 @@ _OWN: dict[tuple[str, str], dict[str, Any]] = {
     },
 }  # fmt: skip
 _LENGTHS = (
-    "reach_mm", "base_reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm", "joint_lever_mm",
-    "scale_lever_mm",
+    "reach_mm", "base_reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm",
+    "joint_lever_mm", "scale_lever_mm",
 )  # fmt: skip
 
 

@@ -274,8 +274,8 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     """Mass, area and axes of an animal from its height map, in the arena frame, into moments (N_MOMENTS,).
 
     moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of the long axis
-    (mod pi), the standard deviations mm along and across it, and how steeply the back rises along it. intrinsics (fx, fy, cx, cy); rotation (3, 3) of
-    T_arena_camera, whose translation is (0, 0, distance).
+    (mod pi), the standard deviations mm along and across it, and how steeply the back rises along it. intrinsics (fx,
+    fy, cx, cy); rotation (3, 3) of T_arena_camera, whose translation is (0, 0, distance).
     """
     n, area, volume = 0, 0.0, 0.0
     sx, sy, sxx, sxy, syy, sxh, syh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -26,8 +26,9 @@ class Crops:
     crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,) readings on the animal, 0 = not found; n_blobs
     (n,) how many things in the frame have about the animal's size;
     moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), the standard
-    deviation mm along and across it, and the slope of the back along it, all in the view frame. The view frame is the arena frame, or (camera_view) an
-    upright frame whose z axis is the optical axis backwards; its origin is `distance` (n,) mm in front of the camera.
+    deviation mm along and across it, and the slope of the back along it, all in the view frame. The view frame is the
+    arena frame, or (camera_view) an upright frame whose z axis is the optical axis backwards; its origin is `distance`
+    (n,) mm in front of the camera.
     """
 
     heights: NDArray[np.int16]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.recordings.fish import FishHabits, bend_profile, clearance, hung
+from liex_lab.recordings.paths import smoothed, wander
 from liex_lab.recordings.postures import root_rotation
 from liex_lab.recordings.sensors import RAYTRIX_R5_SENSOR, Sensor
 from liex_lab.recordings.stage import Stage
@@ -50,16 +51,16 @@ def swimming_session(
     # a turn begins in front and leaves the body at the tail; the wave runs from head to tail
     hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
     yaw = bend_profile(
-        skeleton, _BEND_PER_TURN * turning, 1.3 * _BEND_PER_TURN * hind, amplitude, beat, np.full(n_frames, 1.0), middle,
-        _smooth(rng.normal(0.0, 0.8, (n_frames, 4)), 6.0),
+        skeleton, _BEND_PER_TURN * turning, 1.3 * _BEND_PER_TURN * hind, amplitude, beat, np.ones(n_frames), middle,
+        smoothed(rng.normal(0.0, 0.8, (n_frames, 4)), 6.0),
     )  # fmt: skip
     size = np.full(n_frames, length / skeleton.length)
-    pitch = _CLIMB_RAD * np.tanh(_smooth(rng.normal(0.0, 6.0, (n_frames, 1)), 25.0)[:, 0])
-    roll = np.radians(_smooth(rng.normal(0.0, 12.0, (n_frames, 1)), 8.0)[:, 0])
+    pitch = _CLIMB_RAD * np.tanh(smoothed(rng.normal(0.0, 6.0, (n_frames, 1)), 25.0)[:, 0])
+    roll = np.radians(smoothed(rng.normal(0.0, 12.0, (n_frames, 1)), 8.0)[:, 0])
     level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
     low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
     top = max(float(stage.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
-    position, heading = _path(rng, stage, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s)
+    position, heading = wander(rng, stage, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s)
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
     cast = assemble(rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False)
@@ -67,7 +68,7 @@ def swimming_session(
 
 
 def _script(rng: np.random.Generator, n: int, step_s: float) -> tuple[Array, Array, Array, Array]:
-    """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,) rad of the tail beat."""
+    """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,) rad of the tail."""
     speed, turning, amplitude, rate = np.zeros((4, n))
     at, pace = 0, 0.0
     while at < n:
@@ -84,46 +85,6 @@ def _script(rng: np.random.Generator, n: int, step_s: float) -> tuple[Array, Arr
         speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / _GLIDE_S)
         pace *= float(np.exp(-resting * step_s / _GLIDE_S))
         at = stop + resting
-    turning = _smooth(turning[:, None], 1.2)[:, 0] + _smooth(rng.normal(0.0, 3.0, (n, 1)), 12.0)[:, 0]
-    amplitude = _smooth(amplitude[:, None], 2.0)[:, 0]
-    return _smooth(speed[:, None], 1.5)[:, 0], turning, amplitude, 2 * np.pi * np.cumsum(rate) * step_s
-
-
-def _path(
-    rng: np.random.Generator, stage: Stage, length: float, speed: Array, turning: Array, pitch: Array,
-    water: tuple[float, float], step_s: float,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Positions (n, 3) mm of the body's middle between two heights of the water, and headings (n,) rad.
-
-    The fish turns away from walls and from the border of the picture; where there is no way on it stays.
-    """
-    n = len(speed)
-    centre = stage.camera.unproject([(stage.camera.width - 1) / 2, (stage.camera.height - 1) / 2], 1.0)
-    ray = stage.T_arena_camera.rotation @ centre
-    low, high = water
-    z = rng.uniform(low, high)
-    home = (stage.T_arena_camera.translation + ray * (stage.T_arena_camera.translation[2] - z) / -ray[2])[:2]
-    margin = 0.6 * length
-    position, headings = np.empty((n, 3)), np.empty(n)
-    xy, way = home + rng.normal(0.0, 0.1 * length, 2), rng.uniform(-np.pi, np.pi)
-    for i in range(n):
-        back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
-        away = (back - way + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (stage.freedom(xy, z) - margin) / (0.8 * length), 0.0, 1.0)
-        way += (turning[i] + 8.0 * close * np.clip(away, -1.0, 1.0)) * step_s
-        run = speed[i] * length * step_s
-        step = run * np.cos(pitch[i]) * np.array([np.cos(way), np.sin(way)])
-        free = stage.freedom(xy + step, z)
-        if free > margin or free > stage.freedom(xy, z):
-            xy = xy + step
-        z = float(np.clip(z + run * np.sin(pitch[i]), low, high))
-        position[i], headings[i] = [*xy, z], way
-    return position, headings
-
-
-def _smooth(rows: Array, frames: float) -> Array:
-    """Columns of (n, k) passed through a bell of that many frames, ends held."""
-    reach = int(4 * frames)
-    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
-    padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1)
+    turning = smoothed(turning[:, None], 1.2)[:, 0] + smoothed(rng.normal(0.0, 3.0, (n, 1)), 12.0)[:, 0]
+    amplitude = smoothed(amplitude[:, None], 2.0)[:, 0]
+    return smoothed(speed[:, None], 1.5)[:, 0], turning, amplitude, 2 * np.pi * np.cumsum(rate) * step_s

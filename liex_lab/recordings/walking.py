@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Callable
-from typing import Any
-from urllib.parse import parse_qsl
-
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import Lens
-from liex_lab.errors import RecordingError
-from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.habits import MouseHabits
 from liex_lab.recordings.postures import KINDS, Posture, draw_postures, stand
-from liex_lab.recordings.sensors import BY_NAME, KINECT_V2_SENSOR, Sensor
+from liex_lab.recordings.sensors import KINECT_V2_SENSOR, Sensor
 from liex_lab.recordings.stage import Stage, floor_point
 from liex_lab.recordings.synthetic import SyntheticSession, assemble
 
@@ -36,56 +27,6 @@ _STRETCHES = {
 }
 _BLEND_S = 0.12  # postures flow into one another over about this long
 _STRIDE_HZ_PER_SPINE = 1.6
-_EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
-_MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
-_SPINES_MM = (30.0, 150.0)
-
-
-def open_synthetic(address: str, camera: Lens | None = None) -> SyntheticSession:
-    """The virtual recording of an address, as in synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
-
-    Each setting may be left out: seed 0, 300 frames, a Kinect v2 (or primesense, primesense-qvga), and a size drawn
-    from the seed. camera: taken for the one that the pictures were made with, to see what a wrong one does.
-    """
-    kind, _, query = address.removeprefix("synthetic:").partition("?")
-    if kind != "walk":
-        raise RecordingError(f"{address} is no virtual recording; the only kind is walk, as in {_EXAMPLE}")
-    stated = dict(parse_qsl(query, keep_blank_values=True))
-    for key in stated:
-        if key not in _SETTINGS:
-            near = difflib.get_close_matches(key, _SETTINGS, 1, cutoff=0.0)[0]
-            raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
-    values = {key: _setting(address, key, text) for key, text in stated.items()}
-    seed = values.get("seed", 0)
-    session = walking_session(
-        seed, values.get("frames", 300), sensor=values.get("sensor", KINECT_V2_SENSOR),
-        spine_mm=values.get("spine_mm"), name=f"synthetic-walk-{seed}",
-    )  # fmt: skip
-    if camera is not None:
-        session.camera = fitting(camera, session.width, session.height, "the camera that was stated")
-    return session
-
-
-def _setting(address: str, key: str, text: str) -> Any:
-    """The value of one setting of an address."""
-    read, holds, expected = _SETTINGS[key]
-    try:
-        value = read(text)
-        if holds(value):
-            return value
-    except (KeyError, ValueError):
-        pass
-    raise RecordingError(f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}")
-
-
-# setting: (how to read it, what holds for it, what to say otherwise)
-_SETTINGS: dict[str, tuple[Callable[[str], Any], Callable[[Any], bool], str]] = {
-    "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
-    "frames": (int, lambda n: 1 <= n <= _MOST_FRAMES, f"a whole number from 1 to {_MOST_FRAMES}"),
-    "sensor": (BY_NAME.__getitem__, lambda _: True, f"one of {', '.join(BY_NAME)}"),
-    "spine_mm": (float, lambda mm: math.isfinite(mm) and _SPINES_MM[0] <= mm <= _SPINES_MM[1],
-                 f"a length from {_SPINES_MM[0]:g} to {_SPINES_MM[1]:g} mm"),
-}  # fmt: skip
 
 
 def walking_session(
