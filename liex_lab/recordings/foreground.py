@@ -185,6 +185,14 @@ class Scene:
         """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame."""
         return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
 
+    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+        if not camera_view:
+            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
+        level = np.zeros((len(crops.step), 3))
+        level[:, 2] = 1.0 / crops.distance
+        return level
+
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""
         looks = np.empty((len(crops.step), 17))

@@ -73,7 +73,7 @@ def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
     p[:, k.GRID] = rng.uniform(5.0, 11.0, n)  # the footprint of a few micro lenses, pixels
     p[:, k.JITTER] = rng.uniform(0.5, 2.5, n)
     p[:, k.BACKGROUND], p[:, k.BIAS] = 0.5, 0.0
-    p[:, k.OUTLIERS] = rng.uniform(2.7, 3.6, n)  # standard deviations of a field
+    p[:, k.OUTLIERS] = rng.uniform(2.3, 3.2, n)  # standard deviations of a field
     # quantiles of a field: from a few per cent to a third of the smooth skin bears no texture, less of the rest
     p[:, k.DARK] = rng.uniform(-2.6, -0.45, n)
     p[:, k.HOLES] = rng.uniform(-4.0, -1.2, n)
