@@ -45,7 +45,7 @@ _AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where i
 
 RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
 _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
-_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 320))
+_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # of an animal and a variant, where it is not the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(seed=31, n_images=16_384, n_calibration=4_096, sizes=_FISH_SIZES),
@@ -178,15 +178,21 @@ def cut_rank(
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.geometry import SE3
+    from liex_lab.recordings.foreground import SPREADS
 
     size = windows.spine_mm / skeleton.length
     area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
-    crops, looks = cut.extract(shown, area, skeleton.view.min_height_mm, method.camera_view, rank)
+    # a scene learned from a recording knows how much its readings spread
+    least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+    crops, looks = cut.extract(shown, area, least, method.camera_view, rank)
     rotation = looks[:, 4:13].reshape(-1, 3, 3)
     T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
-    off = np.linalg.norm(crops.moments[:, 3:5] - frames.translation.mean(axis=1)[:, :2], axis=1)
+    middle = frames.translation.mean(axis=1)
+    off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
+    if method.camera_view:  # what is beside it in depth is another thing as well
+        off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
     animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
     good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
     return TrainingSet(

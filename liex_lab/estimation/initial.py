@@ -13,7 +13,7 @@ _BEHIND = 0.42  # of the body length: the base starts this far from the centroid
 _HIGH = 0.2  # of the body length: the base starts this high above the floor
 _LOW = 0.05  # of the body length: the base of an animal in the camera view starts this far below its mean height
 _JITTER = (0.12, 0.7)  # rad: spread of the headings of a long thin animal, and what a round one adds
-_JITTER_RISE = 0.08  # rad, at most
+_JITTER_RISE = 0.03  # rad, at most
 _JITTER_MM = 2.0  # of the places, for an animal of the reference length
 
 

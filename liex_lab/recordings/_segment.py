@@ -10,6 +10,7 @@ _ROW_STEP = 2  # every other row is looked at: reading a picture takes longer th
 _MIN_IN_BLOCK = 3  # of the 8 pixels looked at
 MAX_BLOBS = 32
 N_MOMENTS = 9
+_SLOPE_PASSES, _LEVEL_PASSES = 5, 3
 
 
 @njit(cache=True)
@@ -227,6 +228,30 @@ def keep_largest(raw, runs):
 
 
 @njit(cache=True)
+def level_heights(raw, behind_mm):
+    """Lift all heights of raw (S, S) so that their mean, without what lies farther than behind_mm from it, becomes
+    behind_mm; what is then not above 0 is background. Returns the lift, mm.
+    """
+    mean, reach = 0.0, np.inf
+    for _ in range(_LEVEL_PASSES):
+        total, n = 0.0, 0
+        for r in range(raw.shape[0]):
+            for c in range(raw.shape[1]):
+                if raw[r, c] >= 0.0 and abs(raw[r, c] - mean) <= reach:
+                    total += raw[r, c]
+                    n += 1
+        mean, reach = total / max(n, 1), behind_mm
+    lift = behind_mm - mean
+    for r in range(raw.shape[0]):
+        for c in range(raw.shape[1]):
+            if raw[r, c] >= 0.0:
+                raw[r, c] += lift
+                if raw[r, c] <= 0.0:
+                    raw[r, c] = -1.0
+    return lift
+
+
+@njit(cache=True)
 def smooth_heights(raw, radius, out):
     """Box-filtered heights in 1/16 mm, int16, into out (S, S): background 0, holes filled from what surrounds them.
 
@@ -274,11 +299,11 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     """Mass, area and axes of an animal from its height map, in the arena frame, into moments (N_MOMENTS,).
 
     moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of the long axis
-    (mod pi), the standard deviations mm along and across it, and how steeply the back rises along it. intrinsics (fx,
-    fy, cx, cy); rotation (3, 3) of T_arena_camera, whose translation is (0, 0, distance).
+    (mod pi), the standard deviations mm along and across it, and 0, where `back_slope` may go. intrinsics (fx, fy, cx,
+    cy); rotation (3, 3) of T_arena_camera, whose translation is (0, 0, distance).
     """
     n, area, volume = 0, 0.0, 0.0
-    sx, sy, sxx, sxy, syy, sxh, syh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for r in range(1, heights.shape[0] - 1):
         v = origin[1] + step * r
@@ -300,8 +325,6 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
             sxx += w * x * x
             sxy += w * x * y
             syy += w * y * y
-            sxh += w * x * h
-            syh += w * y * h
     for k in range(N_MOMENTS):
         moments[k] = 0.0
     if n == 0:
@@ -312,5 +335,47 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     half, root = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
     moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = n, area, volume, mx, my, angle
     moments[6], moments[7] = np.sqrt(max(half + root, 0.0)), np.sqrt(max(half - root, 0.0))
-    rise = np.cos(angle) * (sxh - mx * volume) + np.sin(angle) * (syh - my * volume)
-    moments[8] = rise / (area * max(half + root, 1e-6))
+
+
+@njit(cache=True)
+def back_slope(heights, origin, step, intrinsics, distance, moments):
+    """How steeply the back rises along the long axis, of a height map that was cut along the optical axis.
+
+    A straight line through the heights, in which readings far off it count less with every pass (Geman and McClure's
+    weights), for a light field errs grossly in patches. moments: see `blob_moments`.
+    """
+    size = heights.shape[0]
+    along, height = np.empty(size * size), np.empty(size * size)
+    c, s, n = np.cos(moments[5]), np.sin(moments[5]), 0
+    for r in range(1, size - 1):
+        for k in range(1, size - 1):
+            if heights[r, k] > 0:
+                z = distance - heights[r, k] / 16.0
+                x = (origin[0] + step * k - intrinsics[2]) / intrinsics[0] * z
+                y = -(origin[1] + step * r - intrinsics[3]) / intrinsics[1] * z
+                along[n], height[n] = c * (x - moments[3]) + s * (y - moments[4]), heights[r, k] / 16.0
+                n += 1
+    level, slope, scale = 0.0, 0.0, np.inf
+    for _ in range(_SLOPE_PASSES):
+        sw, sx, sh, sxx, sxh = 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(n):
+            off = (height[i] - level - slope * along[i]) / scale
+            w = 1.0 / (1.0 + off * off) ** 2
+            sw += w
+            sx += w * along[i]
+            sh += w * height[i]
+            sxx += w * along[i] * along[i]
+            sxh += w * along[i] * height[i]
+        spread = sw * sxx - sx * sx
+        if spread <= 1e-9:
+            return slope
+        slope = (sw * sxh - sx * sh) / spread
+        level = (sh - slope * sx) / sw
+        total, weight = 0.0, 0.0
+        for i in range(n):
+            off = abs(height[i] - level - slope * along[i])
+            w = 1.0 if scale == np.inf else 1.0 / (1.0 + (off / scale) ** 2)
+            total += w * off
+            weight += w
+        scale = max(2.0 * total / weight, 1e-3)
+    return slope

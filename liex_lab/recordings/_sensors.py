@@ -20,7 +20,7 @@ SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
 KIND, NOISE, EROSION, FUR, BIAS, HOLES, DARK, SIDE, SMOOTH, WHITE, LUMPS, EDGE_DROP, GRID, JITTER, FLYING = range(15)
 UNIT, BACKGROUND, OUTLIERS = 15, 16, 17  # mm a step of the picture; error of a learned background; outliers' rarity
 N_PARAMETERS = 18
-_TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
+TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
 
 _TABLE_BITS = 13
 _SHIFT = 64 - _TABLE_BITS
@@ -255,7 +255,7 @@ def light_field(depth, what, p, state, table, out):
     smooth_field(state, table, 1.0 * p[GRID], wrong)
     smooth_field(state, table, 1.5 * p[GRID], move_u)
     smooth_field(state, table, 1.5 * p[GRID], move_v)
-    strength, jitter, per_mm, per_step = p[NOISE], np.float32(p[JITTER]), 1.0 / _TYPICAL_MM, 1.0 / p[UNIT]
+    strength, jitter, per_mm, per_step = p[NOISE], np.float32(p[JITTER]), 1.0 / TYPICAL_MM, 1.0 / p[UNIT]
     for v in range(height):
         for u in range(width):
             row = min(max(int(v + jitter * move_v[v, u] + np.float32(0.5)), 0), height - 1)

@@ -26,7 +26,7 @@ class Crops:
     crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,) readings on the animal, 0 = not found; n_blobs
     (n,) how many things in the frame have about the animal's size;
     moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), the standard
-    deviation mm along and across it, and the slope of the back along it, all in the view frame. The view frame is the
+    deviation mm along and across it, and (camera_view, else 0) the slope of the back along it, all in the view frame. The view frame is the
     arena frame, or (camera_view) an upright frame whose z axis is the optical axis backwards; its origin is `distance`
     (n,) mm in front of the camera.
     """
@@ -76,10 +76,11 @@ class Windows:
         return Floor.from_inverse_depth(self.inverse_depth[k], Camera(fx, fy, cx, cy, 1, 1))
 
     def extract(
-        self, size: Array, area_mm2: Array, min_height_mm: float = 7.0, camera_view: bool = False, rank: int = 0
+        self, size: Array, area_mm2: Array, min_height_mm: Array | float = 7.0, camera_view: bool = False,
+        rank: int = 0,
     ) -> tuple[Crops, Array]:
         """The blobs of each window whose areas are nearest to area_mm2 (n,), by rank, and their looks (n, 17); see
-        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home.
+        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home; min_height_mm: one, or (n,).
         """
         n = len(self.depth)
         crops = Crops(
@@ -90,13 +91,14 @@ class Windows:
         intrinsics, plane = self.intrinsics.copy(), self.inverse_depth.copy()
         intrinsics[:, 2:] -= self.origin
         plane[:, 2] += plane[:, 0] * self.origin[:, 0] + plane[:, 1] * self.origin[:, 1]
+        margin = np.broadcast_to(np.asarray(min_height_mm, np.float32), (n,)).copy()
         rotation = np.empty((n, 3, 3))
         for k in range(n):
             floor = self.floor(k)
             crops.distance[k] = floor.distance_mm
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
         kernels.extract_windows(
-            self.depth, self.background, np.float32(min_height_mm), area_mm2, rank, self.view.smooth_mm * size,
+            self.depth, self.background, margin, area_mm2, rank, self.view.smooth_mm * size,
             intrinsics, plane, rotation, (self.view.behind_mm if camera_view else 0.0) * size, crops.heights,
             crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
         )  # fmt: skip

@@ -27,7 +27,7 @@ TANK = Setting(
 # at rest or gliding, scooting with waves down the body, J: the hind half bent, C: both halves, S: against each other
 KINDS = ("glide", "scoot", "j", "c", "s")
 SHARES = (0.28, 0.30, 0.14, 0.14, 0.14)
-_NEAREST_MM = 165.0  # to the camera: nearer, a large fish is not in the picture as a whole
+_NEAREST_MM = 180.0  # to the camera: nearer, a large fish is not in the picture as a whole
 _FLOOR_SHARE = 0.12  # of the fish are just above the floor
 _FRONT = 0.47  # of the body bends as one arc, the rest as another (as in people's annotations)
 

@@ -23,7 +23,7 @@ __all__ = ["CROP", "Crops", "Scene", "Windows", "floor_region", "learn_backgroun
 
 Array = NDArray[np.float64]
 
-_SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
+SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
 _AREA_SD, _VOLUME_SD = 0.25, 0.2  # of the logarithms, from posture to posture of one animal
 _TOUCH_SHARE = 0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
 
@@ -90,7 +90,7 @@ class Scene:
         background = np.where((background == 0) & on_floor, bare, background)
         # the rims and walls around the floor flicker between near and far: there, nearer than ever is what counts
         behind = np.where(on_floor, background, near)
-        margin = np.maximum(np.float32(min_height_mm), np.float32(_SPREADS) * spread)
+        margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
         limit = np.maximum(behind - margin, 0).astype(np.float32)
         stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
         over = on_floor if stands else np.ones_like(on_floor)

@@ -32,6 +32,15 @@ class Sensor:
         coarse[:, [k.GRID, k.JITTER]] /= self.stride
         return coarse
 
+    def spread_mm(self, parameters: Array, distance_mm: Array) -> Array | float:
+        """Standard deviation (n,) mm of what units of a light-field camera read of one surface; of others 0, for it is
+        small beside everything that they are used for.
+        """
+        if self.kind != k.LIGHT_FIELD_KIND:
+            return 0.0
+        smooth, white, noise = (parameters[:, column] for column in (k.SMOOTH, k.WHITE, k.NOISE))
+        return noise * (distance_mm / k.TYPICAL_MM) ** 2 * np.hypot(0.8 * smooth, white)
+
     def draw(self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0) -> Array:
         """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given fur (n,).
 

@@ -14,7 +14,7 @@ from liex_lab.recordings.synthetic import SyntheticSession, assemble
 
 Array = NDArray[np.float64]
 
-_NEAREST_MM = 165.0  # to the camera
+_NEAREST_MM = 180.0  # to the camera
 _BOUT_S, _REST_S = (0.15, 0.6), (0.1, 1.2)  # of beating, and of gliding or hanging still between
 _GLIDE_S = 0.35  # a glide has slowed down by a factor e after this long
 _LENGTHS_S = (1.0, 5.0)  # speed that a bout reaches
