@@ -196,7 +196,8 @@ class Camera(Lens):
         if stride == 1:
             return self
         fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
-        return Camera(fx, fy, cx, cy, -(-self.width // stride), -(-self.height // stride), self.source)
+        width, height = -(-self.width // stride), -(-self.height // stride)
+        return Camera(fx, fy, cx, cy, width, height, self.source, distortion=self.distortion)
 
     @property
     def matrix(self) -> Array:

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.recordings.foreground import Scene
     from liex_lab.recordings.recording import Recording
+    from liex_lab.recordings.walls import Arena
+    from liex_lab.recordings.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
     from liex_lab.water import Water
@@ -24,13 +27,21 @@ _SPANS = (0.6, 1.8)  # of the home length: how small and how large an animal of 
 
 
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
+    """The recording at a path, or one that is open already, as an ideal camera in air would have made it.
+
+    Lens distortion and the water's refraction are undone whenever a frame is read.
+    """
+    from liex_lab.recordings.rectify import rectified
+
+    return rectified(open_planned(recording, plan, progress), build_water(plan))
+
+
+def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
     """The recording at a path, opened as the plan says, or one that is open already; the plan's camera overrules.
 
-    A plan that states all four intrinsics opens a recording that has none, too. Lens distortion and the water's
-    refraction are undone whenever a frame is read: what comes back is a recording of an ideal camera in air.
+    A plan that states all four intrinsics opens a recording that has none, too.
     """
     from liex_lab.recordings import open_recording
-    from liex_lab.recordings.rectify import rectified
 
     settings = plan.recording
     if isinstance(recording, str | Path):
@@ -39,7 +50,7 @@ def build_recording(recording: str | Path | Recording, plan: Plan, progress: Pro
             strict=not settings.accept_truncated, progress=progress,
         )  # fmt: skip
     recording.camera = _overruled(recording.camera, plan)
-    return rectified(recording, build_water(plan))
+    return recording
 
 
 def build_water(plan: Plan) -> Water | None:
@@ -113,6 +124,7 @@ def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     from liex_lab.recordings.foreground import Scene
     from liex_lab.tracking.tracker import FrameTracker
 
+    build_zones(plan)  # a slip in their file is told before any work is done
     estimator = build_estimator(plan)
     animal, foreground = plan.animal, plan.foreground
     scene, sample = Scene.learn(
@@ -130,6 +142,7 @@ def build_provenance(
     from liex_lab.sessions import Provenance
 
     recording.digest(progress)  # kept by the recording; the longest wait here, so it is the one that is shown
+    arena, zones = build_arena(tracker.scene, plan)
     origin = {"plan": "stated in the plan", "recording": "estimated over the recording"}[tracker.size_origin]
     return Provenance.of(
         recording,
@@ -138,7 +151,26 @@ def build_provenance(
         plan,
         model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
         animal_size={"spine_mm": round(tracker.spine_mm, 3), "origin": origin, "girth": round(tracker.body.girth, 3)},
+        arena=arena,
+        zones=zones,
     )
+
+
+def build_arena(scene: Scene, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+    """The shape of the arena, and the plan's zones in it."""
+    from liex_lab.recordings.arena import Floor
+    from liex_lab.recordings.walls import find_arena
+
+    floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
+    arena = find_arena(scene.background, floor, scene.grid)
+    return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
+
+
+def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
+    """The zones of the plan, as they were drawn."""
+    from liex_lab.recordings.zones import read_zones
+
+    return read_zones(plan.arena.zones) if plan.arena.zones else ()
 
 
 def build_rules(plan: Plan) -> MouseRules:

@@ -101,7 +101,9 @@ def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
     width, leaf_base = trees.widths[forest], trees.bases[forest]
     n_trees, n_lanes = trees.roots.shape[1], lanes.base.size
     votes = np.empty((n if bandwidth > 0 else 1, n_trees, width), np.float32)
-    out[:n, :width] = 0.0
+    for k in range(n):
+        for d in range(width):
+            out[k, d] = 0.0
     for t in range(n_trees):
         root = trees.roots[forest, t]
         for first in range(0, n, LANES):
@@ -170,7 +172,9 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
     base, scalar_base = np.zeros(n_lanes, np.int32), np.zeros(n_lanes, np.int32)
     frame, pose = np.zeros(n_lanes, np.int64), np.zeros(n_lanes, np.int64)
     for m in range(frames.size):
-        pixels[m * area : (m + 1) * area] = heights[frames[m]].ravel()
+        for r in range(side):
+            for c in range(side):
+                pixels[m * area + r * side + c] = heights[frames[m], r, c]
     for s in range(n_lanes):
         scalar_base[s] = frames.size * area + s * N_SCALARS
         if s < n:
@@ -187,9 +191,16 @@ def choose_survivors(rotations, scores, chosen):
 
     rotations (K, 3, 3) of the base.
     """
-    order = np.argsort(scores)
-    keep, best = chosen.size, order[0]
-    chosen[:] = order[:keep]
+    keep, order = chosen.size, np.empty(scores.size, np.int64)
+    for k in range(scores.size):  # by insertion: they are few
+        place = k
+        while place > 0 and scores[order[place - 1]] > scores[k]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+    best = order[0]
+    for place in range(keep):
+        chosen[place] = order[place]
     opposite = -1
     for place in range(order.size):
         along = 0.0
@@ -213,7 +224,7 @@ def _solve_joint(joint, j, chain, regressors, tuning, lanes, n, side, looks, mom
     for c in range(tuning.rounds):
         forest = j * tuning.rounds + c
         _see(lanes, n, joint, looks, moments, size, tuning.reach, rotations, positions, scales)
-        _predict(regressors, forest, lanes, n, 0, side, tuning.bandwidth, values)
+        _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
         for s in range(n):
             i, k = lanes.frame[s], lanes.pose[s]
             if joint > 0:
@@ -234,19 +245,25 @@ def _estimate_block(heights, looks, moments, frames, size, chain, regressors, pr
     lanes = _lanes_for(heights, frames, n_starts, 1, size)
     n = frames.size * n_starts
     values = np.empty((lanes.base.size, 7))
-    _solve_joint(0, 0, chain, regressors, tuning, lanes, n, side, looks, moments, size, start_rotations,
-                 start_positions, start_scales, values)  # fmt: skip
+    first, no_view = np.int64(0), np.int64(0)  # typed as numbers: a kernel is compiled anew for every literal
+    _solve_joint(chain.solved[0], first, chain, regressors, tuning, lanes, n, side, looks, moments, size,
+                 start_rotations, start_positions, start_scales, values)  # fmt: skip
     if tuning.keep < n_starts:
         _see(lanes, n, 0, looks, moments, size, tuning.reach, start_rotations, start_positions, start_scales)
-        _predict(pruner, 0, lanes, n, 0, side, 0.0, values)
-    chosen = np.arange(tuning.keep)
+        _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
+    chosen, early = np.arange(tuning.keep), np.empty(n_starts)
     for m in range(frames.size):
         i = frames[m]
         if tuning.keep < n_starts:
-            choose_survivors(start_rotations[i, :, 0], values[m * n_starts : (m + 1) * n_starts, 0], chosen)
+            for k in range(n_starts):
+                early[k] = values[m * n_starts + k, 0]
+            choose_survivors(start_rotations[i, :, 0], early, chosen)
         for p in range(tuning.keep):
-            rotations[i, p, 0], positions[i, p, 0] = start_rotations[i, chosen[p], 0], start_positions[i, chosen[p], 0]
             scales[i, p] = start_scales[i, chosen[p]]
+            for a in range(3):
+                positions[i, p, 0, a] = start_positions[i, chosen[p], 0, a]
+                for b in range(3):
+                    rotations[i, p, 0, a, b] = start_rotations[i, chosen[p], 0, a, b]
     lanes = _lanes_for(heights, frames, tuning.keep, n_joints, size)
     n = frames.size * tuning.keep
     for j in range(1, chain.solved.size):
@@ -257,19 +274,18 @@ def _estimate_block(heights, looks, moments, frames, size, chain, regressors, pr
         place_rest(chain.solved, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k],
                    positions[i, k])  # fmt: skip
     _see_all(lanes, n, looks, moments, size, tuning.reach, rotations, positions, scales)
-    _predict(metric, 0, lanes, n, n_joints, side, 0.0, values)
+    _predict(metric, first, lanes, n, n_joints, side, 0.0, values)
     for s in range(n):
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 
 
 @njit(cache=True, parallel=True)
-def estimate_all(heights, looks, moments, found, size, chain, regressors, pruner, metric, tuning, starts, poses):
-    """Algorithm 1 for the frames in which an animal was found.
+def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner, metric, tuning, starts, poses):
+    """Algorithm 1 for the frames `seen`, in which an animal was found.
 
     starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it moves; poses: rotations
     (n, P, J, 3, 3), positions (n, P, J, 3), scales (n, P) and scores (n, P) of the P survivors, which it fills.
     """
-    seen = np.flatnonzero(found)
     n_blocks = (seen.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):
         frames = seen[b * FRAMES : (b + 1) * FRAMES]

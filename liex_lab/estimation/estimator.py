@@ -104,8 +104,8 @@ class PoseEstimator:
         poses = rotations, positions, np.zeros((n, tuning.keep)), np.full((n, tuning.keep), np.inf)
         with threads(parallel):
             kernels.estimate_all(
-                crops.heights, looks, crops.moments, crops.found, size, self._chain, *self._packed, tuning, starts,
-                poses,
+                crops.heights, looks, crops.moments, np.flatnonzero(crops.found), size, self._chain, *self._packed,
+                tuning, starts, poses,
             )  # fmt: skip
         return poses
 

@@ -76,17 +76,18 @@ class Model:
 
     def to_bytes(self) -> bytes:
         """The model file's content; equal models give equal bytes."""
+        extra = [name for name in _FORESTS if getattr(self, name) is not None]
         head = {
             "schema": SCHEMA,
             "method": self.method.to_dict(),
             "skeleton": self.skeleton_table,
             "calibration": vars(self.calibration),
             "card": self.card,
-            "forests": [name for name in _FORESTS if getattr(self, name) is not None],
+            "forests": extra,
         }
         arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)}
         forests = [forest for rounds in self.cascade.forests for forest in rounds]
-        forests += [getattr(self, name) for name in head["forests"]]
+        forests += [getattr(self, name) for name in extra]
         for k, forest in enumerate(forests):
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
         packed = io.BytesIO()

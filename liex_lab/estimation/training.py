@@ -133,9 +133,7 @@ def perturbed_truth(data: TrainingSet, cascade: Cascade, rng: np.random.Generato
     return candidates
 
 
-def train_metric(
-    data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
-) -> Forest:
+def train_metric(data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator) -> Forest:
     """The learned metric: a forest that predicts the mean joint error (mm at home size) of a pose without the truth.
 
     Trained on the cascade's own final candidates, or on perturbed truth as the paper has it.

@@ -83,9 +83,7 @@ def pack_offsets(u, v, threshold):
         | ((np.int32(u[2]) & 0xFF) << 16)
         | ((np.int32(v[0]) & 0xFF) << 24)
     )
-    word1 = (
-        (np.int32(v[1]) & 0xFF) | ((np.int32(v[2]) & 0xFF) << 8) | ((np.int32(threshold) & 0xFFFF) << 16)
-    )
+    word1 = (np.int32(v[1]) & 0xFF) | ((np.int32(v[2]) & 0xFF) << 8) | ((np.int32(threshold) & 0xFFFF) << 16)
     return np.int32(word0), np.int32(word1)
 
 
@@ -103,4 +101,3 @@ def next_random(state):
 def random_below(state, n):
     """A random integer of 0 .. n - 1."""
     return np.int64((next_random(state) >> np.uint64(33)) % np.uint64(n))
-

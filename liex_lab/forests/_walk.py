@@ -219,7 +219,7 @@ def llvm_text(name: str, several: bool) -> str:
         f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
         f"declare i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS})",
         f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 %stride, i32 %side, "
-        "ptr noalias %leaf, i64 %first) {",
+        "ptr noalias %leaf, i64 %first) noinline {",
         "entry:", *text.lines, "}",
     ])  # fmt: skip
 
@@ -248,8 +248,8 @@ def _emit(name: str, several: bool) -> Any:
     return codegen
 
 
-@intrinsic  # type: ignore[misc]
-def walk_one_view(typing, nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first):  # type: ignore[no-untyped-def]
+@intrinsic
+def walk_one_view(typing, nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first):
     """Leaves of lanes first .. first + LANES - 1 in the tree at `root`, into leaf (n,) int32.
 
     nodes (N, 4) int32; inverse (n,) float32 home size over the animal's; views (9, n) float32 and stride n; side of the
@@ -259,8 +259,8 @@ def walk_one_view(typing, nodes, root, pixels, base, scalar_base, inverse, views
     return types.void(*arguments), _emit("liex_walk_one_view", False)
 
 
-@intrinsic  # type: ignore[misc]
-def walk_views(typing, nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first):  # type: ignore[no-untyped-def]
+@intrinsic
+def walk_views(typing, nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first):
     """`walk_one_view` for nodes that choose among the views (n, V, 9) of a sample; stride is 9 V."""
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_views", True)

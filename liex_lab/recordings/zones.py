@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from liex_lab.camera import Camera
 from liex_lab.errors import PlanError
 from liex_lab.recordings.arena import Floor
-from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.walls import Arena, circle_points
 
 Array = NDArray[np.float64]
 
@@ -49,9 +49,26 @@ class Zone:
             inside ^= crosses & (xy[:, 0] < x0 + (xy[:, 1] - y0) * (x1 - x0) / (y1 - y0))
         return inside
 
+    def outline_mm(self) -> Array:
+        """Corners (n, 2) mm of its outline, for drawing."""
+        if self.circle_mm is None:
+            return np.array(self.polygon_mm)
+        x, y, radius = self.circle_mm
+        return np.array([x, y]) + radius * circle_points(64)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json."""
         return {name: value for name, value in vars(self).items() if value is not None}
+
+    @staticmethod
+    def from_dict(numbers: dict[str, Any]) -> Zone:
+        """The zone that `to_dict` wrote."""
+        circle, polygon = numbers.get("circle_mm"), numbers.get("polygon_mm")
+        return Zone(
+            str(numbers["name"]),
+            None if circle is None else (float(circle[0]), float(circle[1]), float(circle[2])),
+            None if polygon is None else _pairs(np.array(polygon, float)),
+        )
 
 
 def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
@@ -61,8 +78,46 @@ def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
     return [SEPARATOR.join(name for name, held in inside if held[k]) for k in range(len(xy))]
 
 
-def read_zones(path: str | Path, camera: Camera, floor: Floor, arena: Arena) -> tuple[Zone, ...]:
-    """The zones in a TOML file, carried to the arena frame.
+@dataclass(frozen=True)
+class DrawnZone:
+    """A zone as it stands in a file: a circle about its only point, or a polygon. where: what errors call it."""
+
+    name: str
+    points: tuple[tuple[float, float], ...]
+    radius: float | None
+    unit: str
+    relative_to: str | None
+    where: str
+
+    def placed(self, camera: Camera, floor: Floor, arena: Arena) -> Zone:
+        """The zone in the arena frame. Raises PlanError where the floor or the arena do not allow it."""
+        points = np.array(self.points)
+        if self.unit == "px":
+            if self.radius is not None:  # a circle in the picture is none on a tilted floor
+                points = points + self.radius * circle_points(64)
+            return Zone(self.name, polygon_mm=_pairs(self._on_floor(points, camera, floor)))
+        if self.relative_to is not None:
+            if arena.centre_mm is None:
+                raise PlanError(
+                    f"{self.where} is relative to the arena's centre, but no walls were found; state it without that"
+                )
+            c, s = np.cos(arena.yaw_rad or 0.0), np.sin(arena.yaw_rad or 0.0)
+            points = points @ np.array([[c, s], [-s, c]]) + np.array(arena.centre_mm)
+        if self.radius is None:
+            return Zone(self.name, polygon_mm=_pairs(points))
+        return Zone(self.name, circle_mm=(*_pairs(points)[0], self.radius))
+
+    def _on_floor(self, uv: Array, camera: Camera, floor: Floor) -> Array:
+        """Where (n, 2) mm the view rays of pixels (n, 2) meet the floor."""
+        a, b, c = floor.inverse_depth
+        inverse = a * uv[:, 0] + b * uv[:, 1] + c
+        if not (inverse > 0).all():
+            raise PlanError(f"{self.where} reaches above the horizon of the floor; draw it on the floor")
+        return np.asarray((floor.T_arena_camera @ camera.unproject(uv, 1.0 / inverse))[:, :2])
+
+
+def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
+    """The zones in a TOML file.
 
     Each [[zones]] has a name, and a circle = { centre = [x, y], radius = r } or a polygon = [[x, y], ...]. unit = "mm"
     (or left out) are millimetres of the arena frame, "px" pixels (u, v) of the depth picture, whose view rays are met
@@ -79,14 +134,14 @@ def read_zones(path: str | Path, camera: Camera, floor: Floor, arena: Arena) -> 
     entries = table.get("zones")
     if not isinstance(entries, list) or not entries or set(table) != {"zones"}:
         raise PlanError(f"{file} should hold nothing but zones, each beginning with [[zones]]; as in {_EXAMPLE}")
-    zones = [_zone(file, number, entry, camera, floor, arena) for number, entry in enumerate(entries, start=1)]
+    zones = [_zone(file, number, entry) for number, entry in enumerate(entries, start=1)]
     names = [zone.name for zone in zones]
     if double := next((name for name in names if names.count(name) > 1), None):
         raise PlanError(f"{file} has two zones called '{double}'; give each a name of its own")
     return tuple(zones)
 
 
-def _zone(file: Path, number: int, entry: Any, camera: Camera, floor: Floor, arena: Arena) -> Zone:
+def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
     where = f"zone {number} of {file}"
     if not isinstance(entry, dict):
         raise PlanError(f"{where} should be a table with a name and a circle or a polygon; as in {_EXAMPLE}")
@@ -103,30 +158,14 @@ def _zone(file: Path, number: int, entry: Any, camera: Camera, floor: Floor, are
         raise PlanError(f'{where} has unit = "mm" or "px", and with mm perhaps relative_to = "centre"; correct it')
     if ("circle" in entry) == ("polygon" in entry):
         raise PlanError(f"{where} should have either a circle or a polygon; as in {_EXAMPLE}")
-    if relative and arena.centre_mm is None:
-        raise PlanError(f"{where} is relative to the arena's centre, but no walls were found; state it without that")
-    if "circle" in entry:
-        return _circle(where, name, entry["circle"], unit, relative, (camera, floor, arena))
-    corners = _placed(_polygon(where, entry["polygon"]), where, unit, relative, camera, floor, arena)
-    return Zone(name, polygon_mm=tuple((float(x), float(y)) for x, y in corners))
-
-
-def _circle(
-    where: str, name: str, circle: Any, unit: str, relative: str | None, scene: tuple[Camera, Floor, Arena]
-) -> Zone:
+    if "polygon" in entry:
+        return DrawnZone(name, _pairs(_polygon(where, entry["polygon"])), None, unit, relative, where)
+    circle = entry["circle"]
     if not isinstance(circle, dict) or set(circle) != {"centre", "radius"}:
         raise PlanError(f"{where}: a circle is written as {{ centre = [0, 0], radius = 80 }}, got {circle!r}")
-    radius = circle["radius"]
-    if not (_is_number(radius) and radius > 0):
-        raise PlanError(f"{where}: the radius of a circle is a positive number, got {radius!r}")
-    centre = _point(where, circle["centre"])
-    if unit == "mm":
-        x, y = _placed(np.array([centre]), where, unit, relative, *scene)[0]
-        return Zone(name, circle_mm=(float(x), float(y), float(radius)))
-    angle = 2.0 * np.pi * np.arange(64) / 64  # a circle in the picture is none on a tilted floor
-    around = np.array(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    corners = _placed(around, where, unit, relative, *scene)
-    return Zone(name, polygon_mm=tuple((float(x), float(y)) for x, y in corners))
+    if not (_is_number(circle["radius"]) and circle["radius"] > 0):
+        raise PlanError(f"{where}: the radius of a circle is a positive number, got {circle['radius']!r}")
+    return DrawnZone(name, (_point(where, circle["centre"]),), float(circle["radius"]), unit, relative, where)
 
 
 def _polygon(where: str, polygon: Any) -> Array:
@@ -154,23 +193,6 @@ def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
     return side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
 
 
-def _placed(
-    points: Array, where: str, unit: str, relative: str | None, camera: Camera, floor: Floor, arena: Arena
-) -> Array:
-    """Points (n, 2) as drawn -> (n, 2) mm in the arena frame."""
-    if unit == "px":
-        a, b, c = floor.inverse_depth
-        inverse = a * points[:, 0] + b * points[:, 1] + c
-        if not (inverse > 0).all():
-            raise PlanError(f"{where} reaches above the horizon of the floor; draw it on the floor")
-        return np.asarray((floor.T_arena_camera @ camera.unproject(points, 1.0 / inverse))[:, :2])
-    if relative is None or arena.centre_mm is None:
-        return points
-    yaw = arena.yaw_rad or 0.0
-    turned = points @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    return np.asarray(turned + np.array(arena.centre_mm))
-
-
 def _point(where: str, value: Any) -> tuple[float, float]:
     if not (isinstance(value, list) and len(value) == 2 and all(_is_number(number) for number in value)):
         raise PlanError(f"{where}: a point is a pair of numbers [x, y], got {value!r}")
@@ -179,3 +201,7 @@ def _point(where: str, value: Any) -> tuple[float, float]:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _pairs(points: Array) -> tuple[tuple[float, float], ...]:
+    return tuple((float(x), float(y)) for x, y in points)

@@ -24,7 +24,7 @@ corners = st.lists(st.tuples(st.floats(-100, 100), st.floats(-100, 100)), min_si
 def zones(folder: Path, text: str, arena: Arena = ROOM) -> tuple[Zone, ...]:
     path = folder / "zones.toml"
     path.write_text(text, encoding="utf-8")
-    return read_zones(path, CAMERA, FLOOR, arena)
+    return tuple(zone.placed(CAMERA, FLOOR, arena) for zone in read_zones(path))
 
 
 def test_circles_and_polygons_hold_what_is_in_them(tmp_path: Path) -> None:
@@ -132,6 +132,6 @@ def test_no_centre_no_zones_about_it(tmp_path: Path) -> None:
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(PlanError, match=r"there is no file .* arena\.zones"):
-        read_zones(tmp_path / "none.toml", CAMERA, FLOOR, ROOM)
+        read_zones(tmp_path / "none.toml")
     with pytest.raises(PlanError, match="should be a TOML"):
-        read_zones(tmp_path, CAMERA, FLOOR, ROOM)
+        read_zones(tmp_path)
