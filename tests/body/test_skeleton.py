@@ -112,7 +112,7 @@ def test_a_view_follows_from_the_animals_size_unless_the_toml_states_it():
     for joint in table["joints"][1:]:
         joint["offset_mm"] = [3.0 * x for x in joint["offset_mm"]]
     large = Skeleton.from_table(table, "rat.toml").view
-    assert (large.behind_mm, large.smooth_mm, large.min_height_mm) == (pytest.approx(360.0), pytest.approx(6.0), 7.0)
+    assert [large.behind_mm, large.smooth_mm, large.min_height_mm] == pytest.approx([360.0, 6.0, 7.0])
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,8 @@ def test_a_stated_camera_changes_what_is_believed_and_not_the_pictures() -> None
 def test_a_fish_swims_before_a_light_field_camera_at_50_frames_a_second() -> None:
     fish = open_recording("synthetic:swim?seed=2&frames=3&spine_mm=28")
     assert isinstance(fish, SyntheticSession)
-    assert (fish.name, fish.camera, fish.rate_hz) == ("synthetic-swim-2", RAYTRIX_R5, pytest.approx(50.0))
+    assert (fish.name, fish.camera) == ("synthetic-swim-2", RAYTRIX_R5)
+    assert fish.rate_hz == pytest.approx(50.0)
     assert (fish.spine_mm, fish.skeleton.name) == (28.0, "fish")
     np.testing.assert_array_equal(fish.frame(1).depth, swimming_session(2, 3, spine_mm=28.0).frame(1).depth)
 
