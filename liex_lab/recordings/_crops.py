@@ -8,16 +8,17 @@ from numba import njit, prange
 from liex_lab.recordings import _segment as segment
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
+BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
 
 @njit(cache=True, parallel=True)
-def blob_areas(depths, limit, on_floor, mm2_per_px, areas):
+def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
     """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
     for k in prange(depths.shape[0]):
         labels = np.empty((depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32)
         blobs = np.empty((segment.MAX_BLOBS, 7))
-        for slot in range(segment.label_blobs(depths[k], limit, on_floor, labels, blobs)):
+        for slot in range(segment.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)):
             if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
                 areas[k, slot] = blob_area(blobs[slot], mm2_per_px)
 
@@ -62,7 +63,8 @@ def extract_one(
     labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
     blobs = np.empty((segment.MAX_BLOBS, 7))
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
-    n_found = segment.label_blobs(depth, limit, on_floor, labels, blobs)
+    bridge = BRIDGE if behind_mm > 0.0 else 0
+    n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     slot, n_blobs[k] = choose_blob(blobs, n_found, area, mm2_per_px, rank)
     if slot < 0:
         return

@@ -9,6 +9,7 @@ BLOCK = 4  # pixels a side; blobs are connected in blocks
 _ROW_STEP = 2  # every other row is looked at: reading a picture takes longer than anything that is done with it
 _MIN_IN_BLOCK = 3  # of the 8 pixels looked at
 MAX_BLOBS = 32
+_MIN_UNREAD = 9  # of 16 pixels
 N_MOMENTS = 9
 _SLOPE_PASSES, _LEVEL_PASSES = 5, 3
 
@@ -65,8 +66,9 @@ def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
 
 
 @njit(cache=True)
-def label_blobs(depth, limit, on_floor, labels, blobs):
-    """Connected blobs of pixels nearer than `limit` (H, W), in blocks.
+def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
+    """Connected blobs of pixels nearer than `limit` (H, W), in blocks; up to `bridge` blocks without readings do not
+    part them.
 
     labels (H // BLOCK, W // BLOCK) int32 gets the blob of each block, -1 for none. blobs (MAX_BLOBS, 7) gets pixels,
     first and last block row and column, the sum of depths, and the pixels that cover the floor `on_floor` (H, W).
@@ -87,7 +89,7 @@ def label_blobs(depth, limit, on_floor, labels, blobs):
                 count += hits[j * BLOCK + c]
             labels[i, j] = -2 if count >= _MIN_IN_BLOCK else -1
     n_blobs = 0
-    stack = np.empty((n_rows * n_columns, 2), np.int32)
+    stack = np.empty((n_rows * n_columns, 3), np.int32)
     for i in range(n_rows):
         for j in range(n_columns):
             if labels[i, j] != -2:
@@ -98,7 +100,7 @@ def label_blobs(depth, limit, on_floor, labels, blobs):
             else:
                 slot = n_blobs
                 n_blobs += 1
-            _flood(depth, limit, on_floor, labels, i, j, slot, stack, blobs[slot])
+            _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blobs[slot])
     return n_blobs
 
 
@@ -111,17 +113,28 @@ def _forget(labels, slot):
 
 
 @njit(cache=True)
-def _flood(depth, limit, on_floor, labels, i, j, slot, stack, blob):
+def _is_unread(depth, row, column):
+    """Whether most of a block has no reading."""
+    n = 0
+    for v in range(row * BLOCK, row * BLOCK + BLOCK):
+        for u in range(column * BLOCK, column * BLOCK + BLOCK):
+            n += depth[v, u] == 0
+    return n >= _MIN_UNREAD
+
+
+@njit(cache=True)
+def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
     """Give every block connected with (i, j) the label `slot`, and count the blob's pixels into `blob` (7,)."""
     blob[0], blob[1], blob[2], blob[3], blob[4], blob[5], blob[6] = 0, i, i, j, j, 0.0, 0
     top = 1
-    stack[0, 0], stack[0, 1] = i, j
+    stack[0, 0], stack[0, 1], stack[0, 2] = i, j, 0
     labels[i, j] = slot
     while top > 0:
         top -= 1
-        row, column = stack[top, 0], stack[top, 1]
-        blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
-        blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
+        row, column, gone = stack[top, 0], stack[top, 1], stack[top, 2]
+        if gone == 0:
+            blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
+            blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
         for v in range(row * BLOCK, row * BLOCK + BLOCK):
             for u in range(column * BLOCK, column * BLOCK + BLOCK):
                 z = depth[v, u]
@@ -132,9 +145,12 @@ def _flood(depth, limit, on_floor, labels, i, j, slot, stack, blob):
         for di in range(-1, 2):
             for dj in range(-1, 2):
                 a, b = row + di, column + dj
-                if 0 <= a < labels.shape[0] and 0 <= b < labels.shape[1] and labels[a, b] == -2:
+                if not (0 <= a < labels.shape[0] and 0 <= b < labels.shape[1]):
+                    continue
+                on = labels[a, b] == -2
+                if on or (labels[a, b] == -1 and gone < bridge and _is_unread(depth, a, b)):
                     labels[a, b] = slot
-                    stack[top, 0], stack[top, 1] = a, b
+                    stack[top, 0], stack[top, 1], stack[top, 2] = a, b, 0 if on else gone + 1
                     top += 1
 
 

@@ -154,7 +154,8 @@ class Scene:
         One object of constant size is in (nearly) every frame, the animal; other things come and go or differ.
         """
         areas = np.zeros((len(depths), MAX_BLOBS))
-        kernels.blob_areas(depths, self.limit, self.on_floor, 1.0 / (self.grid.fx * self.grid.fy), areas)
+        bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
+        kernels.blob_areas(depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas)
         low, high = self.view.area[0] * spine_mm[0] ** 2, self.view.area[1] * spine_mm[1] ** 2
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
