@@ -6,8 +6,7 @@ import hashlib
 import json
 import os
 import sys
-import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,21 +42,44 @@ class Recipe:
 
 
 _CALIBRATION = 1  # number of the calibration's own random numbers, so that it can be made again by itself
-AREA_MM2 = 1070.0  # of a home-sized mouse seen from above; only ranks the blobs of a training window
+_AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
 RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
-_OWN: dict[tuple[str, str], Recipe] = {}  # of an animal and a variant, where it is not the mouse's
+_OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
+_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
+# of an animal and a variant, where it is not the mouse's
+_OWN: dict[tuple[str, str], Recipe] = {
+    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_calibration=4_096, sizes=_FISH_SIZES),
+    ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
+}
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
-    """How much the variant is trained on for an animal."""
-    return _OWN.get((skeleton.name, variant), RECIPES[variant])
+    """How much the variant is trained on for an animal; for one of the user's own, sizes around its home length."""
+    from liex_lab.recordings.worlds import GenericWorld, world_of
+
+    world = world_of(skeleton)
+    if not isinstance(world, GenericWorld):
+        return _OWN.get((skeleton.name, variant), RECIPES[variant])
+    sizes = tuple((factor * skeleton.length, world.window_px(factor * skeleton.length)) for factor in _OWN_SIZES)
+    images = {name: getattr(_OWN["fish", variant], name) for name in ("n_images", "n_calibration", "degraded_share")}
+    return Recipe(**images, sizes=sizes if variant == "default" else sizes[:1])
 
 
 def train_model(
-    animal: str, variant: str, out: str | Path, *, workers: int = 0, progress: Progress = silent
+    animal: str,
+    variant: str,
+    out: str | Path,
+    *,
+    workers: int = 0,
+    n_images: int | None = None,
+    progress: Progress = silent,
 ) -> Path:
-    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path."""
+    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path.
+
+    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of that to calibrate on,
+    instead of what the recipe says.
+    """
     import numba
 
     from liex_lab.body.skeleton import Skeleton
@@ -66,7 +88,10 @@ def train_model(
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     skeleton = Skeleton.load(animal)
-    model = make_model(skeleton, method_of(variant, skeleton), recipe_of(variant, skeleton), progress)
+    recipe = recipe_of(variant, skeleton)
+    if n_images is not None:
+        recipe = replace(recipe, n_images=n_images, n_calibration=n_images // 4)
+    model = make_model(skeleton, method_of(variant, skeleton), recipe, progress)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     content = model.to_bytes()
@@ -80,7 +105,6 @@ def train_model(
 
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
     """Algorithm 2, the learned metric, and its calibration on images that no tree has seen."""
-    from liex_lab.body.skeleton import PRESETS
     from liex_lab.estimation.calibration import calibrate
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
@@ -96,13 +120,12 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     progress(steps - 2, steps, "growing forests: the learned metric")
     metric = train_metric(data, cascade, candidates, rng)
     pruner = train_pruner(data, cascade, candidates, rng)
-    table = tomllib.loads((PRESETS / f"{skeleton.name}.toml").read_text(encoding="utf-8"))
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
         "images": "rendered from a seed; no recording of an animal was used",
     }  # fmt: skip
-    model = Model(cascade, metric, None, table, Calibration(area_mm2=area), card, pruner)
+    model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
         unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)
@@ -138,7 +161,11 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
     from liex_lab.recordings.foreground import Windows
 
     size = windows.spine_mm / skeleton.length
-    cut = Windows(windows.depth, windows.background, windows.intrinsics, windows.origin.astype(float), windows.floor)
+    depth, background = (
+        picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+        for picture in (windows.depth, windows.background)
+    )
+    cut = Windows(depth, background, windows.intrinsics, windows.origin.astype(float), windows.floor, skeleton.view)
     shown = size if method.session_size else np.ones(len(size))
     parts = [cut_rank(skeleton, method, windows, cut, shown, rank) for rank in (0, 1)]
     return TrainingSet.join(parts)
@@ -152,14 +179,21 @@ def cut_rank(
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.geometry import SE3
+    from liex_lab.recordings.foreground import SPREADS
 
     size = windows.spine_mm / skeleton.length
-    crops, looks = cut.extract(shown, AREA_MM2 * size**2, camera_view=method.camera_view, rank=rank)
+    area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
+    # a scene learned from a recording knows how much its readings spread
+    least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+    crops, looks = cut.extract(shown, area, least, method.camera_view, rank)
     rotation = looks[:, 4:13].reshape(-1, 3, 3)
     T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
-    off = np.linalg.norm(crops.moments[:, 3:5] - frames.translation.mean(axis=1)[:, :2], axis=1)
+    middle = frames.translation.mean(axis=1)
+    off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
+    if method.camera_view:  # what is beside it in depth is another thing as well
+        off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
     animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
     good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
     return TrainingSet(
@@ -170,6 +204,13 @@ def cut_rank(
     )
 
 
+def home_area_mm2(skeleton: Skeleton) -> float:
+    """About the area of a home-sized animal seen from above."""
+    from liex_lab.body.surface import Surface
+
+    return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
+
+
 def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
     """A model that does not come with the package, trained once and kept in the user's cache folder."""
     from liex_lab.body.skeleton import Skeleton
@@ -178,7 +219,7 @@ def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path
 
     skeleton = Skeleton.load(animal)
     method, recipe = method_of(variant, skeleton), recipe_of(variant, skeleton)
-    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe)}
+    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe), "skeleton": skeleton.table}
     key = hashlib.sha256(json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()).hexdigest()[:12]
     path = cache_folder() / f"{skeleton.name}-{variant}-{key}.npz"
     return path if path.is_file() else train_model(animal, variant, path, progress=progress)

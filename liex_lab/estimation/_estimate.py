@@ -50,12 +50,12 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C; reach mm of the offsets; levers (3,) of base, joints and scale; bandwidth mm of the mean shift, 0 for
-    the mean; how many candidates outlive the base joint.
+    """Rounds C; reach (J,) mm of the offsets from each joint; levers (3,) of base, joints and scale; bandwidth mm of
+    the mean shift, 0 for the mean; how many candidates outlive the base joint.
     """
 
     rounds: int
-    reach: float
+    reach: Any
     levers: Any
     bandwidth: float
     keep: int
@@ -141,7 +141,7 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
     view, scalars = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32)
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
-        fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach, view)
+        fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
         for c in range(VIEW):
             lanes.views[c * n_lanes + s] = view[c]
         fill_scalars(rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars)
@@ -156,7 +156,7 @@ def _see_all(lanes, n, looks, moments, size, reach, rotations, positions, scales
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
         for joint in range(n_joints):
-            fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach, view)
+            fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
         fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)

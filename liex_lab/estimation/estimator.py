@@ -75,7 +75,7 @@ class PoseEstimator:
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.Tuning(
-            method.rounds, method.reach_mm,
+            method.rounds, method.reaches(self.skeleton.n_joints),
             np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
             min(keep or n_starts, n_starts),
         )  # fmt: skip

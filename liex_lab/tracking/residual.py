@@ -21,10 +21,14 @@ _MIN_OVERLAP_PX = 20
 
 @dataclass(frozen=True)
 class BodyResidual:
-    """The default body of a skeleton, fattened or thinned by `girth`, held against depth."""
+    """The default body of a skeleton, fattened or thinned by `girth`, held against depth.
+
+    camera_view: how the height maps were cut, see `Scene.extract`.
+    """
 
     surface: Surface
     girth: float = 1.0
+    camera_view: bool = False
 
     def of(self, pose_arena: Pose, crops: Crops, scene: Scene) -> Array:
         """Median absolute difference (n,) mm between body and reading over the pixels that both cover; NaN without.
@@ -36,15 +40,18 @@ class BodyResidual:
             return np.zeros(0)
         rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
         out = np.empty(n)
-        floor = scene.floor
-        _compare(rendered, crops.heights, crops.origin, crops.step, floor.inverse_depth, floor.distance_mm, out)
+        planes = scene.planes(crops, self.camera_view)
+        _compare(rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, out)
         return out
 
     @staticmethod
-    def fit(surface: Surface, pose_arena: Pose, crops: Crops, scene: Scene) -> BodyResidual:
+    def fit(
+        surface: Surface, pose_arena: Pose, crops: Crops, scene: Scene, camera_view: bool = False
+    ) -> BodyResidual:
         """The girth with which the default body explains these frames best."""
-        cost = [np.nanmedian(BodyResidual(surface, float(g)).of(pose_arena, crops, scene)) for g in _GIRTHS]
-        return BodyResidual(surface, float(_GIRTHS[int(np.argmin(cost))]))
+        bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
+        cost = [np.nanmedian(body.of(pose_arena, crops, scene)) for body in bodies]
+        return bodies[int(np.argmin(cost))]
 
 
 def render_crops(
@@ -64,10 +71,10 @@ def render_crops(
 
 
 @njit(cache=True, parallel=True)
-def _compare(rendered, heights, origin, step, plane, distance, out):
+def _compare(rendered, heights, origin, step, planes, distance, out):
     """Median |rendered - observed| depth of each frame over pixels where both are, into out (n,)."""
     for i in prange(rendered.shape[0]):
-        size = rendered.shape[1]
+        size, plane = rendered.shape[1], planes[i]
         off = np.empty(size * size)
         n = 0
         for r in range(size):
@@ -75,7 +82,7 @@ def _compare(rendered, heights, origin, step, plane, distance, out):
             for c in range(size):
                 if rendered[i, r, c] > 0 and heights[i, r, c] > 0:
                     u = origin[i, 0] + step[i] * c
-                    observed = (1.0 - heights[i, r, c] / 16.0 / distance) / (plane[0] * u + plane[1] * v + plane[2])
+                    observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (plane[0] * u + plane[1] * v + plane[2])
                     off[n] = abs(rendered[i, r, c] - observed)
                     n += 1
         out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan

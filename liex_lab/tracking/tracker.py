@@ -51,7 +51,8 @@ class FrameTracker:
             raise EstimationError("no animal was found in the sampled frames; check the depth unit and the plan")
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
         crops, used = estimates.crops, estimates.found
-        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene)
+        camera_view = estimator.model.method.camera_view
+        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view)
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
         return FrameTracker(estimator, scene, size, "plan" if spine_mm else "recording", body, limit)
 
@@ -80,10 +81,14 @@ class FrameTracker:
         track.sd_mm[:], track.sd_root[:], track.sd_angles_rad[:] = chosen.sd_mm, chosen.sd_root, chosen.sd_angles
         track.predicted_error_mm[:] = chosen.error_mm
         track.n_foreground_px[:] = estimates.crops.n_px
-        moments = estimates.crops.moments[seen]
-        T_camera_arena = self.scene.floor.T_arena_camera.inverse()
-        track.centroid_mm[seen] = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
-        track.centroid_px[seen] = self.scene.camera.project(T_camera_arena @ track.centroid_mm[seen])
+        moments, camera_view = estimates.crops.moments[seen], self.estimator.model.method.camera_view
+        centre = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
+        T_arena_camera = self.scene.floor.T_arena_camera
+        if camera_view:  # the view's frame is not the arena's
+            centre[:, 2] -= estimates.crops.distance[seen]
+            centre = T_arena_camera @ (centre @ self.scene.view_rotation(camera_view))
+        track.centroid_mm[seen] = centre
+        track.centroid_px[seen] = self.scene.camera.project(T_arena_camera.inverse() @ track.centroid_mm[seen])
         track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene)
         track.flag[seen] = np.where(chosen.error_mm[seen] > self.doubtful_mm, "doubtful", "")
         track.flag[~seen & ~(depths > 0).any(axis=(1, 2))] = "no_depth"
