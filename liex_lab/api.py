@@ -5,14 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
+from liex_lab.progress import Board, Progress, progress_board, silent
+from liex_lab.study import Study
 
 if TYPE_CHECKING:
+    from liex_lab.pipelines.study_state import Standing
     from liex_lab.recordings.recording import Recording
 
 DEMO = "mouse_walk.mcap"
@@ -23,12 +26,15 @@ def run_session(
     plan: Plan | None = None,
     out: str | Path = ".",
     *,
+    folder: Path | None = None,
     overwrite: bool = False,
+    notes: Mapping[str, Any] | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording and write the session folder `out/<recording's name>.liex`; returns it.
 
-    recording: a path, or a recording that is open already; plan: None takes the mouse's. Raises a LiexError that says
+    recording: a path, or a recording that is open already; plan: None takes the mouse's; folder: the session folder
+    itself, where it should have another name; notes: what session.json is to hold besides. Raises a LiexError that says
     what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
     from liex_lab.dashboards.blueprint import replay_blueprint
@@ -37,8 +43,9 @@ def run_session(
 
     plan = plan or Plan.load("mouse")
     return measure_session(
-        recording, plan, out, overwrite=overwrite, blueprint=replay_blueprint, report=write_report, progress=progress
-    )
+        recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
+        report=write_report, progress=progress,
+    )  # fmt: skip
 
 
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
@@ -46,6 +53,30 @@ def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     from liex_lab.catalog import find_sample
 
     return run_session(find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress)
+
+
+def run_study(
+    study: str | Path,
+    *,
+    workers: int = 0,
+    scheduler: str | None = None,
+    slurm: str | Path | None = None,
+    retry: bool = False,
+    again: bool = False,
+    only: Sequence[str] = (),
+    dry_run: bool = False,
+    board: Callable[[int], AbstractContextManager[Board]] = progress_board,
+) -> list[Standing]:
+    """Measure what is to be done of a study; returns where every session stands then.
+
+    workers: processes on this machine, 0 one for every two cores; scheduler: the address of a Dask scheduler; slurm: a
+    file that says how to ask Slurm; retry: try failed sessions again; again: all sessions; only: ids of sessions;
+    dry_run: only look. A session that fails leaves failed.json and stops no other.
+    """
+    from liex_lab.pipelines.study import run_study as job
+
+    return job(Study.load(study), run_session, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry,
+               again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
 
 
 def run_tables(

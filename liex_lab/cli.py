@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
+from liex_lab.cli_study import cohort
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -32,6 +33,7 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
+app.command()(cohort)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]

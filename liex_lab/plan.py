@@ -19,6 +19,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 _HERE = Path(__file__).resolve().parent
+_NOT_PLANS = {"slurm"}  # it says where sessions are measured, not how
 _HEADER = """\
 # A plan of liex_lab: everything a run depends on. Copy this file, change the copy, and name it:
 #     liex run RECORDING --plan my-plan.toml
@@ -142,9 +143,13 @@ class Estimation(_Table):
 class SessionFacts(_Table):
     """[session]: facts about the animal and the day, copied into every table."""
 
+    name: str | None = Field(None, description="the session's id in every table; not set: the recording's name")
     individual: str = Field("animal", description="name of the animal within this session")
     subject_id: str | None = Field(None, description="the animal's identity across the whole study")
     group: str | None = Field(None, description="experimental group of the animal")
+    cage: str | None = Field(None, description="home cage or tank of the animal")
+    sex: str | None = Field(None, description="sex of the animal")
+    batch: str | None = Field(None, description="batch of the experiment")
     session_start_time: str | None = Field(
         None, description="ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording says"
     )
@@ -287,7 +292,7 @@ def plans_folder() -> Path:
 
 def known_plans() -> list[str]:
     """The names of the bundled plans."""
-    return sorted(path.stem for path in plans_folder().glob("*.toml"))
+    return sorted(path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS)
 
 
 def _read(path: Path) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_tracker
 
@@ -23,14 +24,17 @@ def measure_session(
     plan: Plan,
     out: str | Path,
     *,
+    folder: Path | None = None,
     overwrite: bool = False,
+    notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`.
+    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
 
-    blueprint and report make the views that lie in the folder; see `Session.create`.
+    notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
+    lie in the folder, see `Session.create`.
     """
     from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
@@ -38,7 +42,7 @@ def measure_session(
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
-        folder = Path(out) / f"{opened.name}.liex"
+        folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
         check_place(folder, overwrite)
         progress(0, None, "learning the background, the floor and the animal's size")
         tracker = build_tracker(opened, plan)
@@ -51,7 +55,7 @@ def measure_session(
                 timings["track"] += time.perf_counter() - began
                 writer.add(frames, track)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
-            writer.note(problems=opened.problems)
+            writer.note(problems=opened.problems, **dict(notes or {}))
             zones = [zone.name for zone in provenance.zones]
             behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
             session = writer.close(timings_s=timings, **behaviour.for_session())

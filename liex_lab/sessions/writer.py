@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
+from liex_lab.sessions.failure import FAILED_FILE
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rows import Rows, median_step, stop_times
 from liex_lab.sessions.tables import Column
@@ -319,8 +320,8 @@ def check_place(path: Path, overwrite: bool) -> None:
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(f"{nearest} is a file, and a session needs a folder; choose another place with --out")
-    if not path.exists():
-        return
+    if not path.exists() or {entry.name for entry in path.iterdir()} <= {FAILED_FILE}:
+        return  # what failed before may be replaced
     if not (path / "session.json").is_file():
         raise SessionError(f"{path} exists and is not a session, so it is left alone; choose another place with --out")
     if not overwrite:
