@@ -20,7 +20,9 @@ from tests.estimation.toy import SCENE, toy_mice, trained, training_set, unseen
 def taught(n: int) -> Model:
     """The toy model with a correction learned from n mice that its trees have not seen."""
     model = trained("default").model
-    plan = replace(METHODS["default"].corrector, n_trees=40, min_leaf=10, n_tests=60)
+    usual = METHODS["default"].corrector
+    assert usual is not None
+    plan = replace(usual, n_trees=40, min_leaf=10, n_tests=60)
     method = replace(model.method, corrector=plan)
     model = replace(model, cascade=replace(model.cascade, method=method))
     return with_corrector(model, training_set(toy_mice(n, 11), method), np.random.default_rng(4))
@@ -57,7 +59,10 @@ def test_the_correction_comes_back_from_a_model_file(tmp_path: Path):
     path.write_bytes(corrected_model().to_bytes())
     read = Model.load(path)
     assert read.method == corrected_model().method
-    np.testing.assert_array_equal(read.corrector.nodes, corrected_model().corrector.nodes)
+    made = corrected_model().corrector
+    assert made is not None
+    assert read.corrector is not None
+    np.testing.assert_array_equal(read.corrector.nodes, made.nodes)
     np.testing.assert_array_equal(errors(read), errors(corrected_model()))
 
 
