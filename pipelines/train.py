@@ -45,14 +45,19 @@ class Recipe:
 _CALIBRATION, _CORRECTION = 1, 2  # numbers of their own random numbers, so that each can be made again by itself
 _AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
-RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
+RECIPES = {
+    "default": Recipe(),
+    "paper": Recipe(n_images=10_240, n_correction=0, degraded_share=0.0, sizes=((0.0, 144),)),
+}
 _AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
 _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # of an animal and a variant, where it is not the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES),
-    ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
+    ("fish", "paper"): Recipe(
+        seed=31, n_images=6_144, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)
+    ),
 }
 
 
