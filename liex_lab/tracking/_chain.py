@@ -19,7 +19,7 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
     shift, bend, middle = 0.0, 0.0, np.zeros(3)
     for j in range(n):
         for k in range(3):
-            middle[k] += (joints_b[j, k] - joints_a[j, k]) / n
+            middle[k] += (float(joints_b[j, k]) - float(joints_a[j, k])) / n
     for k in range(3):
         shift += middle[k] ** 2
     for j in range(n):
@@ -96,3 +96,36 @@ def trace_back(frame, hypothesis, parent, first, path):
     while frame >= first:
         path[frame] = hypothesis
         frame, hypothesis = parent[frame, hypothesis, 0], parent[frame, hypothesis, 1]
+
+
+@njit(cache=True)
+def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
+    """Probability (n,) of the second of two ways round of each frame: joints one and two (n, J, 3) mm.
+
+    evidence (n,): by how many nats a frame is for the first way.
+    """
+    n = times.size
+    stay, leap = np.empty((n, 2)), np.empty((n, 2))
+    for t in range(1, n):
+        dt = times[t] - times[t - 1]
+        stay[t, 0] = leap_cost(one[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling)
+        stay[t, 1] = leap_cost(two[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling)
+        leap[t, 0] = leap_cost(one[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling)
+        leap[t, 1] = leap_cost(two[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling)
+    first, second = np.zeros(n), np.zeros(n)  # logarithms of what the past says of each way
+    second[0] = -evidence[0]
+    for t in range(1, n):
+        first[t] = np.logaddexp(first[t - 1] - stay[t, 0], second[t - 1] - leap[t, 1])
+        second[t] = np.logaddexp(first[t - 1] - leap[t, 0], second[t - 1] - stay[t, 1]) - evidence[t]
+        top = max(first[t], second[t])
+        first[t] -= top
+        second[t] -= top
+    a, b = 0.0, 0.0  # and what the future says
+    for t in range(n - 1, -1, -1):
+        doubt[t] = 1.0 / (1.0 + np.exp(min(first[t] + a - second[t] - b, 700.0)))
+        if t > 0:
+            later = b - evidence[t]
+            a, b = (np.logaddexp(a - stay[t, 0], later - leap[t, 0]), np.logaddexp(a - leap[t, 1], later - stay[t, 1]))
+            top = max(a, b)
+            a -= top
+            b -= top

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +27,12 @@ class Motion:
     that neighbouring frames have in common and no smoother takes away.
     """
 
-    middle_error: float = 0.5
-    turn_error: float = 1.2
-    middle_jerk: float = 30.0
-    turn_jerk: float = 200.0
+    middle_error: float = 0.7
+    turn_error: float = 2.4
+    middle_jerk: float = 10.0
+    turn_jerk: float = 60.0
     scale_jerk: float = 0.05
-    freedom: float = 4.0
+    freedom: float = 6.0
     reject: float = 4.0
     lasting: float = 0.75
 
@@ -55,10 +56,32 @@ class Curve:
     sd_turn: Array
     used: NDArray[np.bool_]
 
+    def __getitem__(self, rows: slice) -> Curve:
+        """Some consecutive frames."""
+        return Curve(self.pose[rows], *(getattr(self, name)[rows] for name in _ROWS))
+
+    @staticmethod
+    def join(parts: Sequence[Curve]) -> Curve:
+        """Consecutive parts as one."""
+        poses = [part.pose for part in parts]
+        turns, places = [p.root.rotation for p in poses], [p.root.translation for p in poses]
+        root = SE3(np.concatenate(turns), np.concatenate(places))
+        pose = Pose(root, np.concatenate([p.angles for p in poses]), np.concatenate([p.scale for p in poses]))
+        return Curve(pose, *(np.concatenate([getattr(part, name) for part in parts]) for name in _ROWS))
+
+    @staticmethod
+    def unknown(n: int, n_joints: int) -> Curve:
+        """A curve of frames in which nothing was measured."""
+        nan = np.full((n, n_joints, 3, 3), np.nan)
+        pose = Pose(SE3(nan[:, 0], nan[:, 0, 0]), nan[..., 0], nan[:, 0, 0, 0])
+        return Curve(pose, nan[..., 0], *nan[:, 0, 0].T.copy(), np.zeros(n, np.bool_))
+
+
+_ROWS = ("joints", "error_mm", "sd_middle_mm", "sd_turn", "used")
+
 
 def smooth(
-    skeleton: Skeleton, seconds: Array, pose: Pose, error_mm: Array, length_mm: float, motion: Motion = MOTION,
-    causal: bool = False,
+    skeleton: Skeleton, seconds: Array, pose: Pose, error_mm: Array, length_mm: float, motion: Motion = MOTION
 ) -> Curve:  # fmt: skip
     """The curve through measured poses (n), NaN where none is, with predicted errors error_mm (n,) at times (n,) s.
 
@@ -66,6 +89,8 @@ def smooth(
     very far off nothing. Before the first measurement the curve stands still.
     """
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
+    if not known.any():
+        return Curve.unknown(len(seconds), skeleton.n_joints)
     joints = pose.joints(skeleton)
     weight, used = np.ones(len(seconds)), known.copy()
     curve = _run(skeleton, seconds, pose, joints, error_mm, length_mm, motion, weight, used)
