@@ -29,7 +29,7 @@ class ChainTuning:
 
     score_mm: float = 2.0
     score_most: float = 8.0
-    none: float = 4.0
+    none: float = 5.0
     ceiling: float = 12.0
     error_factor: float = 0.4
     shift: float = 4.0

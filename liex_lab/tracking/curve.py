@@ -48,7 +48,6 @@ def track_whole(
     chain = Chain(subject.skeleton, subject.length_mm)
     path = chain.path(seen)
     doubt = chain.doubt(seen, path)
-    flips = _flips(subject.skeleton, seen, path, doubt)
     pose, error = seen.pose(path), seen.along(seen.error_mm, path)
     for span in corrections:
         if not span.undone_at:
@@ -63,6 +62,7 @@ def track_whole(
         error = np.where(taken, seen.along(seen.error_mm, admitted), error)
         curve = _smoothed(subject, seen, pose, error, motion)
     track = to_track(subject, seen, path, curve, doubt)
+    flips = _flips(seen, track)
     return Tracked(track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))))
 
 
@@ -145,7 +145,7 @@ def to_track(
     return track
 
 
-_ERROR_PER_SD = 1.52  # a mean distance in space over the standard deviation along one axis; of a Gaussian it is 1.6
+_ERROR_PER_SD = 1.4  # a mean distance in space over the standard deviation along one axis; of a Gaussian it is 1.6, and errors have heavier tails
 
 
 def _add_sight(
@@ -180,16 +180,14 @@ def short_gaps(seconds: Array, measured: NDArray[np.bool_], bridge_s: float) -> 
     return inside & (seconds[after] - seconds[before] <= bridge_s)
 
 
-def _flips(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], doubt: Array) -> list[Flip]:
+def _flips(seen: Observations, track: Track) -> list[Flip]:
     """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
-    both = (path >= 0) & seen.known[:, 0]
-    ends = seen.joints([0, skeleton.n_joints - 1])
-    rows = np.arange(len(seen))
-    along = ends[:, :, 1] - ends[:, :, 0]
-    exchanged = both & (np.einsum("nd,nd->n", along[rows, np.maximum(path, 0)], along[:, 0]) < 0)
-    found = [Flip(a, b, float(1.0 - doubt[a:b].mean()), True) for a, b in spans(exchanged)]
-    unsure = ~exchanged & (doubt > _TOLD)
-    return found + [Flip(a, b, float(doubt[a:b].mean()), False) for a, b in spans(unsure)]
+    ends = seen.joints([0, track.skeleton.n_joints - 1])[:, 0]
+    along = track.joints_mm[:, -1] - track.joints_mm[:, 0]
+    exchanged = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
+    found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
+    unsure = ~exchanged & (track.p_flip > _TOLD)
+    return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]
 
 
 def spans(where: NDArray[np.bool_]) -> list[tuple[int, int]]:

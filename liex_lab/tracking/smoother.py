@@ -31,10 +31,10 @@ class Motion:
     turn_error: float = 2.4
     middle_jerk: float = 10.0
     turn_jerk: float = 60.0
-    scale_jerk: float = 0.05
+    scale_jerk: float = 1.0
     freedom: float = 6.0
     reject: float = 4.0
-    lasting: float = 0.75
+    lasting: float = 0.7
 
 
 MOTION = Motion()
