@@ -155,6 +155,11 @@ class Skeleton:
         return len(self.names)
 
     @property
+    def is_chain(self) -> bool:
+        """Whether each joint carries the next and only that, as along a spine."""
+        return bool(np.array_equal(self.parents, np.arange(-1, self.n_joints - 1)))
+
+    @property
     def dof(self) -> int:
         """Degrees of freedom: six for the base and one for each free axis of the other joints."""
         return _ROOT_DOF + int(self.axes[1:].sum())

@@ -14,6 +14,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
+from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
@@ -159,7 +161,7 @@ class PoseEstimator:
     def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
         size = size if self.model.method.session_size else 1.0
-        return self._estimates(self._look(depths, scene, size, parallel)[0], scene, size)
+        return self._estimates(self._look(depths, scene, size, parallel)[0], scene, size, parallel)
 
     def hypotheses(
         self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True
@@ -171,8 +173,8 @@ class PoseEstimator:
         size = size if self.model.method.session_size else 1.0
         found: list[Estimates] = []
         for sight in self._look(depths, scene, size, parallel):
-            best = self._estimates(sight, scene, size)
-            found += [best, self._estimates(sight.opposite(best.found), scene, size)]
+            best = self._estimates(sight, scene, size, parallel)
+            found += [best, self._estimates(sight.opposite(best.found), scene, size, parallel)]
         return tuple(found)
 
     def _look(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool) -> tuple[_Sight, _Sight]:
@@ -199,19 +201,28 @@ class PoseEstimator:
         rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
         return _Sight(crops, looks, rotations, positions, scores)
 
-    def _estimates(self, sight: _Sight, scene: Scene, size: float) -> Estimates:
+    def _estimates(self, sight: _Sight, scene: Scene, size: float, parallel: bool) -> Estimates:
         """The chosen poses of what was seen, in the camera frame."""
         method, crops = self.model.method, sight.crops
         usable = crops.found & np.isfinite(sight.scores).any(axis=1)
-        picked = choose(self.skeleton, method, self.model.calibration, size,
-                        sight.rotations[usable], sight.positions[usable], sight.scores[usable])  # fmt: skip
-        picked = with_expected_error(picked, self.model, crops.moments[usable], sight.looks[usable], size)
+        seen = sight[np.flatnonzero(usable)]
+        images = ImageSet(seen.crops.heights, seen.looks, seen.crops.moments)
+        picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
+        picked = with_expected_error(picked, self.model, images.moments, images.looks, size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         T_camera_view = SE3(
             np.broadcast_to(scene.view_rotation(method.camera_view), (len(usable), 3, 3)),
             np.stack([np.zeros(len(usable)), np.zeros(len(usable)), crops.distance], axis=-1),
         ).inverse()
         return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+
+    def pick(
+        self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
+    ) -> Chosen:
+        """One pose for each of n height maps out of its candidates, after the last correction."""
+        picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
+        with threads(parallel):
+            return corrected(picked, self.model, images, size)
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
