@@ -140,6 +140,14 @@ class Estimation(_Table):
     )
 
 
+class Tracking(_Table):
+    """[tracking]: from the frames' poses to a curve."""
+
+    bridge_s: NotNegative = Field(
+        0.5, description="a stretch without a measurement that is no longer than this is bridged and flagged so"
+    )
+
+
 class SessionFacts(_Table):
     """[session]: facts about the animal and the day, copied into every table."""
 
@@ -212,6 +220,7 @@ class Plan(_Table):
     arena: ArenaFacts = ArenaFacts()
     foreground: Foreground = Foreground()
     estimation: Estimation = Estimation()
+    tracking: Tracking = Tracking()
     session: SessionFacts = SessionFacts()
     behaviour: Behaviour = Behaviour()
 

@@ -131,7 +131,8 @@ def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
         recording, (animal.spine_min_mm, animal.spine_max_mm), foreground.n_background_frames,
         foreground.min_height_mm, estimator.skeleton.view,
     )  # fmt: skip
-    return FrameTracker.prepare(estimator, scene, sample, animal.spine_mm, plan.estimation.doubtful_above_mm)
+    limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
+    return FrameTracker.prepare(estimator, scene, sample, animal.spine_mm, limit, bridge_s)
 
 
 def build_provenance(

@@ -39,6 +39,7 @@ def measure_session(
     from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
     from liex_lab.sessions.writer import check_place
+    from liex_lab.tracking.observations import Observations
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
@@ -49,12 +50,17 @@ def measure_session(
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
+            seen = []
             for frames in opened.chunks(CHUNK):
                 began = time.perf_counter()
-                track = tracker.follow(frames)
+                seen.append(tracker.observe(frames))
                 timings["track"] += time.perf_counter() - began
-                writer.add(frames, track)
+                writer.add(frames)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
+            if seen:
+                began = time.perf_counter()
+                writer.take(tracker.track(Observations.join(seen)))
+                timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
             zones = [zone.name for zone in provenance.zones]
             behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)

@@ -13,7 +13,7 @@ from liex_lab.geometry import so3
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
 from liex_lab.sessions.tables import ROWS_PER_GROUP, Block, Words
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Flip, Track
 
 if TYPE_CHECKING:
     from liex_lab.recordings.times import Gap
@@ -60,7 +60,7 @@ class Rows:
             "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
             "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
             "spine_mm": track.spine_mm, "scale": track.scale,
-            "flag": track.flag,
+            "p_flip": track.p_flip, "flag": track.flag,
         }  # fmt: skip
 
     def poses(self) -> Iterator[Block]:
@@ -123,6 +123,22 @@ class Rows:
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
         kinds = (float, float, np.int64, np.int64, np.int64, str)
         return {**self._who, **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)}}
+
+    def flips(self, flips: Sequence[Flip]) -> Block:
+        """The table `flips`, in order of time."""
+        time, count = self.time_s, frame_count(self.frame_index)
+        stops = stop_times(time)
+        return {
+            **self._who,
+            "start_s": np.array([time[flip.start] for flip in flips]),
+            "stop_s": np.array([stops[flip.stop - 1] for flip in flips]),
+            "start_frame": np.array([count[flip.start] for flip in flips], np.int64),
+            "stop_frame": np.array([count[flip.stop] for flip in flips], np.int64),
+            "p_flip": np.array([flip.p_flip for flip in flips], float),
+            "applied": np.array([flip.applied for flip in flips], bool),
+            "source": np.array([flip.source for flip in flips], str),
+            "undone_at": np.array([flip.undone_at for flip in flips], str),
+        }
 
     def _camera_gaps(self) -> list[_Found]:
         """Where the recording's time is not a steady camera's, as rows of the table `gaps`."""

@@ -23,7 +23,7 @@ from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rows import Rows, median_step, stop_times
 from liex_lab.sessions.tables import Column
 from liex_lab.sessions.thumbnails import Keepsakes
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Flip, Track, Tracked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,6 +60,7 @@ class SessionWriter:
         self._index: list[int] = []
         self._times_ns: list[int] = []
         self._held = TrackBuffer(origin.skeleton, origin.n_frames or 1024)
+        self._flips: Sequence[Flip] = ()
         self._keepsakes = Keepsakes()
         self._done = False
         self._folder = path.with_name(f"{path.name}.part-{os.getpid()}")
@@ -125,6 +126,10 @@ class SessionWriter:
         _check_times(np.array(self._times_ns, np.int64), track)
         self._held = TrackBuffer(self.origin.skeleton, 0)
         self._held.append(track)
+
+    def take(self, tracked: Tracked) -> None:
+        """The track of all frames so far and what was found out about its flips, with all that it was made of."""
+        self.track, self._flips = tracked.track, tracked.flips
 
     @property
     def rows(self) -> Rows:
@@ -215,7 +220,7 @@ class SessionWriter:
         described = self.origin.table_metadata()
         own: dict[str, Any] = {
             "frames": [rows.frames()], "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
-            "flips": [tables.from_pandas(tables.FLIPS, tables.empty_table(tables.FLIPS))],
+            "flips": [rows.flips(self._flips)],
             "sessions": [self._session_row(rows)],
         }  # fmt: skip
         for name, blocks in own.items():
