@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from liex_lab.behaviour.bouts import ACTIONS
-from liex_lab.behaviour.summary_columns import ZONES, Vocabulary
+from liex_lab.behaviour.summary_columns import Vocabulary
 from liex_lab.sessions.tables import TABLES, Column
 
 FIRST = (
@@ -27,7 +27,7 @@ def all_columns() -> dict[str, Column]:
     """Every column that a session can have, of animals that walk and that swim, by `table.name`."""
     walking, swimming = (Vocabulary(ACTIONS, (), swims).columns for swims in (False, True))
     stored = [column for rows in TABLES.values() for column in rows]
-    return {f"{c.table}.{c.name}": c for c in (*stored, *swimming, *walking, *ZONES)}
+    return {f"{c.table}.{c.name}": c for c in (*stored, *swimming, *walking)}
 
 
 def first_columns() -> str:

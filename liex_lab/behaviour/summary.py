@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
+
 
 @dataclass(frozen=True)
 class Behaviour:
@@ -52,9 +54,8 @@ class Behaviour:
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """Every table by its name; that of the zones where there are zones."""
-        named = {name: getattr(self, name) for name in ("kinematics", "bouts", "summary", "transitions", "activity")}
-        return {**named, **({"zones": self.zones} if self.vocabulary.zones else {})}
+        """Every table by its name."""
+        return {name: getattr(self, name) for name in TABLES}
 
     def for_session(self) -> dict[str, Any]:
         """The arguments that hand all of it to a session: `writer.close(**behaviour.for_session())`."""

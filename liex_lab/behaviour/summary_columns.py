@@ -147,8 +147,7 @@ class Vocabulary:
     @property
     def columns(self) -> tuple[Column, ...]:
         """Every column of the behaviour tables."""
-        zones = ZONES if self.zones else ()
         return (
             *kinematics_columns(self.swims), *bout_columns(self.swims),
-            *summary_columns(self.words, self.zones, self.swims), *TRANSITIONS, *zones, *activity_columns(self.words),
+            *summary_columns(self.words, self.zones, self.swims), *TRANSITIONS, *ZONES, *activity_columns(self.words),
         )  # fmt: skip

@@ -89,7 +89,7 @@ def test_equal_input_gives_equal_tables_whatever_the_chunks(tmp_path):
     mouse = WalkingMouse(steady(2.0), rear_s=(0.5, 1.2), lost=(3,))
     first, second = write(tmp_path / "a.liex", mouse, chunk=7), write(tmp_path / "b.liex", mouse, chunk=60)
     names = sorted(path.name for path in first.path.iterdir() if path.suffix in (".parquet", ".csv", ".toml"))
-    assert len(names) == 12
+    assert len(names) == 13
     for name in [*names, "columns.json", "session.mcap"]:
         assert (first.path / name).read_bytes() == (second.path / name).read_bytes(), name
 
