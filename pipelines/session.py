@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_tracker
+from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_surroundings, build_tracker
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
@@ -62,7 +62,7 @@ def measure_session(
                 writer.take(tracker.track(Observations.join(seen)))
                 timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
-            zones = [zone.name for zone in provenance.zones]
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
+            around = build_surroundings(provenance)
+            behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps)
             session = writer.close(timings_s=timings, **behaviour.for_session())
     return session.path
