@@ -16,6 +16,7 @@ from liex_lab.study import Study
 
 if TYPE_CHECKING:
     from liex_lab.pipelines.study_state import Standing
+    from liex_lab.pipelines.verify import Finding
     from liex_lab.recordings.recording import Recording
 
 DEMO = "mouse_walk.mcap"
@@ -77,6 +78,24 @@ def run_study(
 
     return job(Study.load(study), run_session, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry,
                again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
+
+
+def verify_session(
+    session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
+) -> list[Finding]:
+    """Whether a session is what it was when it was written; with its recording, whether that gives the same again."""
+    from liex_lab.pipelines.verify import verify_session as job
+
+    return job(session, run_session, None if recording is None else str(recording), progress)
+
+
+def run_scale(
+    n_frames: int = 900, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
+) -> dict[str, Any]:
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
+    from liex_lab.pipelines.scale import evaluate_scale
+
+    return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
 
 
 def run_tables(

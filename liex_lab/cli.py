@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
-from liex_lab.cli_study import cohort
+from liex_lab.cli_study import cohort, scale, verify
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -34,6 +34,8 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
 app.command()(cohort)
+app.command()(verify)
+evaluate.command("scale")(scale)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
@@ -275,7 +277,7 @@ def show(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
-    command = [sys.executable, "-m", "rerun", str(replay), *(["--web-viewer"] if web else [])]
+    command = [sys.executable, "-m", "rerun", str(replay), "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
 
 

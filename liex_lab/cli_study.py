@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from liex_lab.progress import progress_bar
 
 if TYPE_CHECKING:
     from liex_lab.pipelines.study_state import Standing
@@ -50,6 +53,41 @@ def cohort(
     if failed and not dry_run:
         typer.echo(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
         raise typer.Exit(SOME_FAILED)
+
+
+def verify(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")],
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Measure this recording again and compare the tables.")
+    ] = None,
+) -> None:
+    """Check a session: its hashes, what it says of its origin and, with --recording, whether it comes out again."""
+    from liex_lab.api import verify_session
+
+    with progress_bar() as progress:
+        findings = verify_session(session, recording, progress=progress)
+    for finding in findings:
+        typer.echo(f"{finding.state:6}{finding.sentence}")
+    if any(finding.state == "wrong" for finding in findings):
+        raise typer.Exit(1)
+
+
+def scale(
+    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 900,
+    minutes: Annotated[
+        list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers here.")] = None,
+) -> None:
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
+    from liex_lab.api import run_scale
+
+    with progress_bar() as progress:
+        numbers = run_scale(n_frames, minutes or (1.0, 10.0), progress=progress)
+    text = json.dumps(numbers, indent=2)
+    if json_file is not None:
+        json_file.write_text(text + "\n", encoding="utf-8")
+    typer.echo(text)
 
 
 def _tell_study(standings: list[Standing], all_of_them: bool) -> int:

@@ -151,7 +151,11 @@ class Tracking(_Table):
 class SessionFacts(_Table):
     """[session]: facts about the animal and the day, copied into every table."""
 
-    name: str | None = Field(None, description="the session's id in every table; not set: the recording's name")
+    name: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+@-]{0,199}$",
+        description="the session's id in every table, and the name of its folder; not set: the recording's name",
+    )
     individual: str = Field("animal", description="name of the animal within this session")
     subject_id: str | None = Field(None, description="the animal's identity across the whole study")
     group: str | None = Field(None, description="experimental group of the animal")

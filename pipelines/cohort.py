@@ -39,6 +39,7 @@ def measure_cohort(
     run: RunSession,
     *,
     workers: int = 0,
+    threads: int = 0,
     scheduler: str | None = None,
     slurm: SlurmTable | None = None,
     told: Told = lambda *_: None,
@@ -46,12 +47,13 @@ def measure_cohort(
 ) -> list[dict[str, Any]]:
     """Measure the sessions; returns how each went. workers: processes on this machine, 0 one for every two cores.
 
-    scheduler: the address of a running Dask scheduler; slurm: how to ask a Slurm cluster for workers.
+    threads: cores for each, 0 an equal share; scheduler: the address of a running Dask scheduler; slurm: how to ask a
+    Slurm cluster for workers.
     """
     planned = {one.session.id: one.session for one in todo}
     if not planned:
         return []
-    with _client(len(planned), workers, scheduler, slurm) as client:
+    with _client(len(planned), workers, threads, scheduler, slurm) as client:
         client.subscribe_topic(TOPIC, lambda event: told(*event[1]))
         return list(_results(client, planned, run, finished))
 
@@ -107,7 +109,9 @@ def _on_worker(session: PlannedSession, run: RunSession, run_id: str) -> dict[st
 
 
 @contextmanager
-def _client(n_tasks: int, workers: int, scheduler: str | None, slurm: SlurmTable | None) -> Iterator[Client]:
+def _client(
+    n_tasks: int, workers: int, threads: int, scheduler: str | None, slurm: SlurmTable | None
+) -> Iterator[Client]:
     """A client of the cluster that was asked for."""
     import dask
     from distributed import Client
@@ -126,14 +130,14 @@ def _client(n_tasks: int, workers: int, scheduler: str | None, slurm: SlurmTable
                 ) from None
             return
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="liex-"))
-        cluster = slurm_cluster(slurm, scratch) if slurm else local_cluster(n_tasks, workers, scratch)
+        cluster = slurm_cluster(slurm, scratch) if slurm else local_cluster(n_tasks, workers, threads, scratch)
         stack.enter_context(cluster)
         if slurm:
             cluster.scale(min(slurm.jobs, n_tasks))  # a job is one worker
         yield stack.enter_context(Client(cluster, set_as_default=False))
 
 
-def local_cluster(n_tasks: int, workers: int, scratch: str) -> Cluster:
+def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
     """Worker processes on this machine, reached through this machine alone and with keys made for this run."""
     from distributed import LocalCluster, Security
 
@@ -142,7 +146,7 @@ def local_cluster(n_tasks: int, workers: int, scratch: str) -> Cluster:
     return LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
         memory_limit=0, local_directory=scratch, silence_logs=50, security=Security.temporary(),
-        env=worker_environment(max(1, cores // count)),
+        env=worker_environment(threads or max(1, cores // count)),
     )  # fmt: skip
 
 

@@ -38,29 +38,31 @@ def measure_session(
     """
     from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
-    from liex_lab.sessions.writer import check_place
+    from liex_lab.sessions.checkpoint import check_free, hash_once
+    from liex_lab.sessions.place import check_place, part_folder
     from liex_lab.tracking.observations import Observations
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
         folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
         check_place(folder, overwrite)
+        check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
         tracker = build_tracker(opened, plan)
+        hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
-            seen = []
-            for frames in opened.chunks(CHUNK):
+            writer.go_on(lambda row: opened.frame(row).depth)
+            for frames in opened.chunks(CHUNK, writer.n_frames):
                 began = time.perf_counter()
-                seen.append(tracker.observe(frames))
+                seen = tracker.observe(frames)
                 timings["track"] += time.perf_counter() - began
-                writer.add(frames)
+                writer.add(frames, seen=seen)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
-            if seen:
-                began = time.perf_counter()
-                writer.take(tracker.track(Observations.join(seen)))
-                timings["track"] += time.perf_counter() - began
+            began = time.perf_counter()
+            writer.take(tracker.track(writer.seen(Observations)))
+            timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
             around = build_surroundings(provenance)
             behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps)

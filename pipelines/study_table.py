@@ -10,7 +10,7 @@ from typing import Any
 from liex_lab.pipelines.study_state import Standing
 
 from liex_lab.sessions.failure import write_whole
-from liex_lab.sessions.tables import columns, dictionary, write_table
+from liex_lab.sessions.tables import columns, dictionary, harmless, write_table
 from liex_lab.study import Study
 
 STUDY_SESSIONS = columns(
@@ -59,13 +59,6 @@ def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
     entries = [entry for entry in dictionary(STUDY_SESSIONS) if entry["table"] == TABLE]
     write_whole(folder / f"{TABLE}_columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
     return folder / f"{TABLE}.csv"
-
-
-def harmless(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe before it."""
-    if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n"):
-        return f"'{value}"
-    return value
 
 
 def _row(study: Study, one: Standing) -> dict[str, Any]:

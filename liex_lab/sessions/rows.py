@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from liex_lab.geometry import so3
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
-from liex_lab.sessions.tables import ROWS_PER_GROUP, Block, Words
+from liex_lab.sessions.tables import FRAMES, ROWS_PER_GROUP, Block, Words, to_pandas
 from liex_lab.tracking.track import Flip, Track
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from liex_lab.recordings.times import Gap
 
 Array = NDArray[np.float64]
@@ -225,3 +227,11 @@ def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
         return []
     starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
     return [(int(a), int(b), labels[a]) for a, b in zip(starts, np.append(starts[1:], len(labels)), strict=True)]
+
+
+def rows_only(rows: Rows) -> pd.DataFrame:
+    """A kinematics table without any measure."""
+    return to_pandas(FRAMES[:5], {k: v for k, v in rows.frames().items() if k in _ROW_NAMES})
+
+
+_ROW_NAMES = {column.name for column in FRAMES[:5]}

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+_BEGINS_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 ROWS_PER_GROUP = 250_000  # a block of the widest table then takes some 30 MB
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
@@ -264,6 +265,16 @@ class Words:
 
     def __len__(self) -> int:
         return len(self.codes)
+
+
+def harmless(value: Any) -> Any:
+    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe before it."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
+
+
+def as_it_was(value: Any) -> Any:
+    """What `harmless` was given."""
+    return value[1:] if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA else value
 
 
 def to_pandas(schema: Sequence[Column], block: Block) -> pd.DataFrame:
