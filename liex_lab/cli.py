@@ -245,6 +245,22 @@ def evaluate_tables(
         typer.echo(path)
 
 
+@evaluate.command("tracking")
+def evaluate_tracking(
+    animal: AnimalName = "mouse",
+    sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
+    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
+    n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
+    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, sequence, model=model, n_frames=n_frames, progress=progress)
+    _tell_numbers(result, json_file)
+
+
 @evaluate.command("reference")
 def evaluate_reference(
     session: SessionPath,

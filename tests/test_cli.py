@@ -22,7 +22,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
 VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "show", "info"]
-MEASURES = ["pose", "speed", "sizes", "tables", "reference"]
+MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking"]
 
 
 def liex(

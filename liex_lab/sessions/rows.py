@@ -60,7 +60,7 @@ class Rows:
             "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
             "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
             "spine_mm": track.spine_mm, "scale": track.scale,
-            "p_flip": track.p_flip, "flag": track.flag,
+            "p_flip": track.p_flip, "bridged": track.bridged, "flag": track.flag,
         }  # fmt: skip
 
     def poses(self) -> Iterator[Block]:

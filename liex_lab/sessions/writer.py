@@ -149,7 +149,8 @@ class SessionWriter:
 
         n_frames, n_joints = len(self._index), self.origin.skeleton.n_joints
         codes = np.tile(np.arange(n_joints, dtype=np.int8), n_frames)
-        place = self.track.joints_mm.reshape(-1, 3)
+        # what was bridged was not measured
+        place = np.where(self.track.bridged[:, None, None], np.nan, self.track.joints_mm).reshape(-1, 3)
         return pd.DataFrame({
             "frame_index": np.repeat(np.array(self._index, np.int64), n_joints),
             "joint": pd.Categorical.from_codes(codes, pd.Index(self.origin.skeleton.names)),
