@@ -276,6 +276,21 @@ def evaluate_reference(
 
 
 @app.command()
+def flip(
+    session: SessionPath,
+    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
+    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
+    undo: Annotated[bool, typer.Option("--undo", help="Take back corrections within this span.")] = False,
+) -> None:
+    """Say that head and tail are exchanged in a span of a session; tables, replay and report follow."""
+    from liex_lab.api import flip_session
+
+    with progress_bar() as progress:
+        done = flip_session(session, start_s, stop_s, undo=undo, progress=progress)
+    _tell_session(done)
+
+
+@app.command()
 def show(
     session: SessionPath,
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser instead of a window.")] = False,

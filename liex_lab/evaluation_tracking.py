@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 
 TRACKING_PROTOCOL = (
     "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm. single: what each "
-    "frame says by itself; algorithm3: the paper's, 200 particles; online: the default tracker, each row told some frames "
-    "late (online_lag_frames); smoothed: the default tracker over the whole sequence. mean and p95: over the frames in "
-    "which the row has a pose, bridged ones included; lost_rate: share of frames without one. ratio_to_single and "
-    "p95_ratio_to_single: over the frames in which this row and the single frames both have a pose. "
-    "longest_flip_frames: most frames in a row whose base-to-tip direction is more than 90 degrees from the true one. "
-    "interval90_coverage: share of joint coordinates within 1.645 sd of the truth. recovery_frames: after the end of "
-    "an occlusion that hid more than half of the animal, frames until the error is below 0.12 of its length, the worst of "
-    "them. frames_per_s: on this machine, reading excluded."
+    "frame says by itself; algorithm3: the paper's, 200 particles; online: the default tracker, each row told some "
+    "frames late (online_lag_frames); smoothed: the default tracker over the whole sequence. mean and p95: over the "
+    "frames in which the row has a pose, bridged ones included; lost_rate: share of frames without one. "
+    "ratio_to_single and p95_ratio_to_single: over the frames in which this row and the single frames both have a "
+    "pose. longest_flip_frames: most frames in a row whose base-to-tip direction is more than 90 degrees from the "
+    "true one. interval90_coverage: share of joint coordinates within 1.645 sd of the truth. recovery_frames: after "
+    "the end of an occlusion that hid more than half of the animal, frames until the error is below 0.12 of its "
+    "length, the worst of them. frames_per_s: on this machine, reading excluded."
 )
 _NEAR = 0.12
 _Z90 = 1.645

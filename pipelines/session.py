@@ -13,7 +13,8 @@ from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
 CHUNK = 32  # frames in memory at a time
 
@@ -32,7 +33,6 @@ def measure_session(
 
     blueprint and report make the views that lie in the folder; see `Session.create`.
     """
-    from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
     from liex_lab.sessions.writer import check_place
     from liex_lab.tracking.observations import Observations
@@ -55,10 +55,18 @@ def measure_session(
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
             if seen:
                 began = time.perf_counter()
-                writer.take(tracker.track(Observations.join(seen)))
+                whole = Observations.join(seen)
+                writer.take(tracker.track(whole), whole, tracker.subject)
                 timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems)
-            zones = [zone.name for zone in provenance.zones]
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
-            session = writer.close(timings_s=timings, **behaviour.for_session())
+            session = conclude(writer, plan, timings)
     return session.path
+
+
+def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
+    """Measure the behaviour of a session whose track is known, and put the session in its place."""
+    from liex_lab.behaviour.summary import measure
+
+    zones = [zone.name for zone in writer.origin.zones]
+    behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
+    return writer.close(timings_s=timings, **behaviour.for_session())

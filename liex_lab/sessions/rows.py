@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.times)
 _Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
+LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -112,7 +113,7 @@ class Rows:
         time = self.time_s
         count = frame_count(self.frame_index)
         found = self._camera_gaps()
-        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", "no_depth", "tracker_lost"))
+        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", *LOST))
         stops = stop_times(time)
         for start, stop, reason in stretches(lost):
             if reason:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
+from liex_lab.sessions.evidence import write_evidence
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rows import Rows, median_step, stop_times
 from liex_lab.sessions.tables import Column
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
+    from liex_lab.tracking.curve import Subject
+    from liex_lab.tracking.observations import Observations
 
 BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json as known so far -> a Rerun blueprint
 ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in it
@@ -126,9 +129,14 @@ class SessionWriter:
         self._held = TrackBuffer(self.origin.skeleton, 0)
         self._held.append(track)
 
-    def take(self, tracked: Tracked) -> None:
-        """The track of all frames so far and what was found out about its flips, with all that it was made of."""
+    def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
+        """The track of all frames so far, what was found out about its flips, and what it was made of."""
         self.track, self._flips = tracked.track, tracked.flips
+        write_evidence(self._folder, seen, subject)
+
+    def keep(self, folder: Path) -> None:
+        """Put a copy of a folder into the session."""
+        shutil.copytree(folder, self._folder / folder.name)
 
     @property
     def rows(self) -> Rows:
