@@ -49,6 +49,22 @@ def run_session(
     )  # fmt: skip
 
 
+def flip_session(
+    session: str | Path, start_s: float, stop_s: float, *, undo: bool = False, progress: Progress = silent
+) -> Path:
+    """Exchange head and tail in a span of a session, or take that back; everything in the folder follows.
+
+    start_s, stop_s: seconds since the first frame, stop_s exclusive. The tables as they were tracked stay beside.
+    """
+    from liex_lab.dashboards.blueprint import replay_blueprint
+    from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.flip import flip_span
+
+    return flip_span(
+        session, start_s, stop_s, undo=undo, blueprint=replay_blueprint, report=write_report, progress=progress
+    )
+
+
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     """The bundled sample recording as a session; an earlier session of the demo is replaced."""
     from liex_lab.catalog import find_sample

@@ -249,6 +249,22 @@ def evaluate_tables(
         typer.echo(path)
 
 
+@evaluate.command("tracking")
+def evaluate_tracking(
+    animal: AnimalName = "mouse",
+    sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
+    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
+    n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
+    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, sequence, model=model, n_frames=n_frames, progress=progress)
+    _tell_numbers(result, json_file)
+
+
 @evaluate.command("reference")
 def evaluate_reference(
     session: SessionPath,
@@ -261,6 +277,21 @@ def evaluate_reference(
     from liex_lab.pipelines.evaluate import evaluate_reference as measure
 
     _tell_numbers(measure(session, reference), json_file)
+
+
+@app.command()
+def flip(
+    session: SessionPath,
+    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
+    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
+    undo: Annotated[bool, typer.Option("--undo", help="Take back corrections within this span.")] = False,
+) -> None:
+    """Say that head and tail are exchanged in a span of a session; tables, replay and report follow."""
+    from liex_lab.api import flip_session
+
+    with progress_bar() as progress:
+        done = flip_session(session, start_s, stop_s, undo=undo, progress=progress)
+    _tell_session(done)
 
 
 @app.command()

@@ -14,7 +14,8 @@ from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
 CHUNK = 32  # frames in memory at a time
 
@@ -36,7 +37,6 @@ def measure_session(
     notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
     lie in the folder, see `Session.create`.
     """
-    from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.place import check_place, part_folder
@@ -61,10 +61,18 @@ def measure_session(
                 writer.add(frames, seen=seen)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
             began = time.perf_counter()
-            writer.take(tracker.track(writer.seen(Observations)))
+            whole = writer.seen(Observations)
+            writer.take(tracker.track(whole), whole, tracker.subject)
             timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
-            around = build_surroundings(provenance)
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps)
-            session = writer.close(timings_s=timings, **behaviour.for_session())
+            session = conclude(writer, plan, timings)
     return session.path
+
+
+def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
+    """Measure the behaviour of a session whose track is known, and put the session in its place."""
+    from liex_lab.behaviour.summary import measure
+
+    around = build_surroundings(writer.origin)
+    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps)
+    return writer.close(timings_s=timings, **behaviour.for_session())

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from liex_lab.progress import Progress
     from liex_lab.recordings.recording import Recording
 
+LOGS = ("session.rrd", "session.mcap")
 Clock = Callable[[], float]
 
 
@@ -99,6 +100,28 @@ class Checkpoint:
         """The parts of a log in order, with the bytes of each that count; None for all of the present one."""
         sizes: list[int | None] = [*self.state.logs.get(log, [])[: self.n_parts - 1], None]
         return [(self.part(log, k), size) for k, size in enumerate(sizes)]
+
+    @property
+    def logs(self) -> dict[str, Path]:
+        """Each log's name in the finished session, and where it lies when it is joined."""
+        joined = "" if self.n_parts == 1 else "whole-"
+        return {log: self.folder / f"{joined}{log}" for log in LOGS}
+
+    def join_logs(self) -> None:
+        """Logs that were written in parts, for the work was interrupted, become one each."""
+        from liex_lab.sessions.joining import join_mcap, join_rrd
+
+        if self.n_parts > 1:
+            for (log, whole), join in zip(self.logs.items(), (join_rrd, join_mcap), strict=True):
+                join(self.parts(log), whole)
+
+    def drop_parts(self) -> None:
+        """The joined logs take the place of their parts, from which the work could have gone on until now."""
+        if self.n_parts > 1:
+            for log, whole in self.logs.items():
+                for path, _ in self.parts(log)[1:]:
+                    path.unlink()
+                whole.replace(self.folder / log)
 
     def tidy(self, folder: Path) -> None:
         """Remove what is no part of the finished session from where it is now, and let go of it."""

@@ -87,9 +87,9 @@ class McapWriter:
     def finish(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]) -> None:
         """Skeleton, transforms, actions and notes of the whole track; closes the file."""
         track = rows.track
-        quaternions = so3.quaternion(np.where(track.observed[:, None, None], track.root_rotation, np.eye(3)))
+        quaternions = so3.quaternion(np.where(track.posed[:, None, None], track.root_rotation, np.eye(3)))
         for i, time_ns in enumerate(track.times_ns.tolist()):
-            seen = bool(track.observed[i])
+            seen = bool(track.posed[i])
             joints_m = track.joints_mm[i] / 1000.0
             self._scene.log(self._scene_update(time_ns, joints_m, seen), log_time=time_ns)
             self._poses.log(_joint_poses(time_ns, joints_m, seen), log_time=time_ns)

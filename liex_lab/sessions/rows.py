@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.times)
 _Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
+LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -62,7 +63,7 @@ class Rows:
             "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
             "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
             "spine_mm": track.spine_mm, "scale": track.scale,
-            "p_flip": track.p_flip, "flag": track.flag,
+            "p_flip": track.p_flip, "bridged": track.bridged, "flag": track.flag,
         }  # fmt: skip
 
     def poses(self) -> Iterator[Block]:
@@ -114,7 +115,7 @@ class Rows:
         time = self.time_s
         count = frame_count(self.frame_index)
         found = self._camera_gaps()
-        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", "no_depth", "tracker_lost"))
+        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", *LOST))
         stops = stop_times(time)
         for start, stop, reason in stretches(lost):
             if reason:

@@ -169,7 +169,7 @@ class ReplayWriter:
             self._stream.log(f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True)
         for start in range(0, track.n_frames, _BLOCK):
             part = slice(start, start + _BLOCK)
-            when, seen = _timeline(index[part], elapsed[part]), track.observed[part]
+            when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
             self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
@@ -192,7 +192,7 @@ class ReplayWriter:
     def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frame of the body's base; while the animal is lost it stays where it was seen last."""
         track = rows.track
-        seen = track.observed
+        seen = track.posed
         if not seen.any():
             return
         self._stream.log(ROOT, rr.TransformAxes3D(0.02), static=True)

@@ -20,7 +20,8 @@ from liex_lab.errors import SessionError
 from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
-from liex_lab.sessions.checkpoint import Checkpoint
+from liex_lab.sessions.checkpoint import LOGS, Checkpoint
+from liex_lab.sessions.evidence import write_evidence
 from liex_lab.sessions.place import check_place, file_facts, part_folder
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rows import Rows, median_step, rows_only, stop_times
@@ -33,8 +34,9 @@ if TYPE_CHECKING:
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
+    from liex_lab.tracking.curve import Subject
+    from liex_lab.tracking.observations import Observations
 
-_LOGS = ("session.rrd", "session.mcap")
 _INDEX, _TIMES = "frame_index", "frame_time_ns"
 Kept = TypeVar("Kept")
 
@@ -74,7 +76,7 @@ class SessionWriter:
         self._index: list[int] = before.get(_INDEX, np.zeros(0, np.int64)).tolist()
         self._times_ns: list[int] = before.get(_TIMES, np.zeros(0, np.int64)).tolist()
         self._logging: list[Future[None]] = []
-        self._loggers = ThreadPoolExecutor(len(_LOGS))
+        self._loggers = ThreadPoolExecutor(len(LOGS))
         try:
             self._open_logs(blueprint)
         except BaseException:
@@ -87,7 +89,7 @@ class SessionWriter:
         from liex_lab.sessions.rrd import ReplayWriter
 
         made = blueprint(self._document) if blueprint else None
-        replay, messages = (self._checkpoint.part(log, self._checkpoint.n_parts - 1) for log in _LOGS)
+        replay, messages = (self._checkpoint.part(log, self._checkpoint.n_parts - 1) for log in LOGS)
         self._replay = ReplayWriter(replay, self.origin, made)
         self._mcap = McapWriter(messages, self.origin)
         if self._times_ns:
@@ -164,7 +166,7 @@ class SessionWriter:
     def _take_down(self) -> None:
         """A checkpoint: everything so far need not be done again. Only what `seen` was given for can go on."""
         self._settle()
-        sizes = dict(zip(_LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
+        sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
         if len(self._checkpoint.seen) == len(self._index):
             self._checkpoint.save(len(self._index), self._checkpoint.seconds_before + self._elapsed, sizes)
 
@@ -179,9 +181,14 @@ class SessionWriter:
         _check_times(np.array(self._times_ns, np.int64), track)
         self._held = TrackBuffer.of(track)
 
-    def take(self, tracked: Tracked) -> None:
-        """The track of all frames so far and what was found out about its flips, with all that it was made of."""
+    def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
+        """The track of all frames so far, what was found out about its flips, and what it was made of."""
         self.track, self._flips = tracked.track, tracked.flips
+        write_evidence(self._folder, seen, subject)
+
+    def keep(self, folder: Path) -> None:
+        """Put a copy of a folder into the session."""
+        shutil.copytree(folder, self._folder / folder.name)
 
     @property
     def rows(self) -> Rows:
@@ -202,7 +209,8 @@ class SessionWriter:
 
         n_frames, n_joints = len(self._index), self.origin.skeleton.n_joints
         codes = np.tile(np.arange(n_joints, dtype=np.int8), n_frames)
-        place = self.track.joints_mm.reshape(-1, 3)
+        # what was bridged was not measured
+        place = np.where(self.track.bridged[:, None, None], np.nan, self.track.joints_mm).reshape(-1, 3)
         return pd.DataFrame({
             "frame_index": np.repeat(np.array(self._index, np.int64), n_joints),
             "joint": pd.Categorical.from_codes(codes, pd.Index(self.origin.skeleton.names)),
@@ -259,12 +267,12 @@ class SessionWriter:
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems)
         self._mcap.finish(rows, bouts, words, problems)
-        self._join_logs()
+        self._checkpoint.join_logs()
         self.note(actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {}))
         self._document["thumbnails"] = self._keepsakes.save(self._folder, rows, self.origin.camera)
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
-        self._document.update(self._account(rows, dict(timings_s or {})), files=file_facts(self._folder, self._logs))
+        self._document.update(self._account(rows, dict(timings_s or {})), files=file_facts(self._folder, self._checkpoint.logs))
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         try:
@@ -296,30 +304,6 @@ class SessionWriter:
                 tables.write_table(self._folder / f"{name}.parquet", schema, [block], described)
         text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
         (self._folder / "columns.json").write_text(text + "\n", encoding="utf-8")
-
-    @property
-    def _logs(self) -> dict[str, Path]:
-        """Each log's name in the finished session, and where it lies now."""
-        joined = "" if self._checkpoint.n_parts == 1 else "whole-"
-        return {log: self._folder / f"{joined}{log}" for log in _LOGS}
-
-    def _join_logs(self) -> None:
-        """Logs that were written in parts, for the work was interrupted, become one."""
-        from liex_lab.sessions.joining import join_mcap, join_rrd
-
-        if self._checkpoint.n_parts == 1:
-            return
-        for log, join in zip(_LOGS, (join_rrd, join_mcap), strict=True):
-            join(self._checkpoint.parts(log), self._logs[log])
-
-    def _drop_parts(self) -> None:
-        """The joined logs take the place of their parts, from which the work could have gone on until now."""
-        if self._checkpoint.n_parts == 1:
-            return
-        for log in _LOGS:
-            for path, _ in self._checkpoint.parts(log)[1:]:
-                path.unlink()
-            self._logs[log].replace(self._folder / log)
 
     @property
     def _elapsed(self) -> float:
@@ -366,7 +350,7 @@ class SessionWriter:
         if self.path.exists():
             shutil.rmtree(old, ignore_errors=True)
             self.path.rename(old)
-        self._drop_parts()
+        self._checkpoint.drop_parts()
         try:
             self._folder.rename(self.path)
         except OSError:

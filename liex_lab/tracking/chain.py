@@ -53,15 +53,21 @@ class Chain:
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
         self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend])
 
-    def path(self, seen: Observations) -> NDArray[np.int64]:
-        """(n,) the hypothesis of each frame that lies on the curve, or NONE."""
+    def path(self, seen: Observations, told: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """(n,) the hypothesis of each frame that lies on the curve, or NONE.
+
+        told (m,): of the first m frames it is known already.
+        """
         n, h = seen.score.shape
+        emission = self._emission(seen)
+        if told is not None:
+            emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
         idle = np.concatenate([[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))])
         cost, parent = np.full((n, h), np.inf), np.full((n, h, 2), NONE, np.int64)
         live = np.zeros((_BEAM, 2), np.int64)
         n_live = kernels.extend_all(
-            0, n, live, 0, seen.seconds, seen.joints(self._joints), seen.error_mm, self._emission(seen), idle,
-            self._levels, self._length, self._tuning.ceiling, cost, parent,
+            0, n, live, 0, seen.seconds, seen.joints(self._joints), seen.error_mm, emission, idle, self._levels,
+            self._length, self._tuning.ceiling, cost, parent,
         )  # fmt: skip
         path = np.full(n, NONE, np.int64)
         if n_live:

@@ -115,13 +115,16 @@ def _admitted(
 
 
 def to_track(
-    subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array
-) -> Track:
-    """A curve as rows of a track: measured, bridged over a short time, or missing."""
-    skeleton, n = subject.skeleton, len(seen)
+    subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array, ahead: bool = False
+) -> Track:  # fmt: skip
+    """A curve as rows of a track: measured, bridged over a short time, or missing.
+
+    ahead: the curve also goes on for a short time after the last measurement.
+    """
+    skeleton = subject.skeleton
     track = Track.empty(skeleton, seen.times_ns)
     measured = curve.used & (path >= 0)
-    bridged = ~measured & short_gaps(seen.seconds, measured, subject.bridge_s)
+    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
     there = measured | bridged
     pose, camera = curve.pose, subject.camera
     in_camera = subject.T_arena_camera.inverse() @ curve.joints[there]
@@ -138,14 +141,14 @@ def to_track(
     track.predicted_error_mm[there] = curve.error_mm[there]
     track.p_flip[there] = doubt[there]
     _add_sight(track, seen, path, measured)
-    flag = np.where(curve.error_mm > subject.doubtful_mm, "doubtful", "")
-    track.flag[there] = np.where(bridged, "bridged", flag)[there]
-    track.flag[~there & ~seen.has_depth] = "no_depth"
-    assert len(track.flag) == n
+    track.bridged[:] = bridged
+    track.flag[measured] = np.where(curve.error_mm > subject.doubtful_mm, "doubtful", "")[measured]
+    track.flag[~measured & ~seen.has_depth] = "no_depth"
     return track
 
 
-_ERROR_PER_SD = 1.4  # a mean distance in space over the standard deviation along one axis; of a Gaussian it is 1.6, and errors have heavier tails
+# a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
+_ERROR_PER_SD = 1.4
 
 
 def _add_sight(
@@ -168,8 +171,12 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
 
 
-def short_gaps(seconds: Array, measured: NDArray[np.bool_], bridge_s: float) -> NDArray[np.bool_]:
-    """(n,) True in frames between two measured ones that are no farther apart than that."""
+def short_gaps(
+    seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
+) -> NDArray[np.bool_]:  # fmt: skip
+    """(n,) True in frames between two measured ones that are no farther apart than that; ahead: and so long after the
+    last one.
+    """
     rows = np.flatnonzero(measured)
     if not len(rows):
         return np.zeros(len(measured), np.bool_)
@@ -177,7 +184,10 @@ def short_gaps(seconds: Array, measured: NDArray[np.bool_], bridge_s: float) -> 
     after = np.searchsorted(rows, t)
     inside = (after > 0) & (after < len(rows))
     before, after = rows[np.maximum(after - 1, 0)], rows[np.minimum(after, len(rows) - 1)]
-    return inside & (seconds[after] - seconds[before] <= bridge_s)
+    short = inside & (seconds[after] - seconds[before] <= bridge_s)
+    if ahead:
+        short[rows[-1] + 1 :] = seconds[rows[-1] + 1 :] - seconds[rows[-1]] <= bridge_s
+    return short & ~measured
 
 
 def _flips(seen: Observations, track: Track) -> list[Flip]:

@@ -1,7 +1,7 @@
 """Algorithm 3 of Lie-X to the letter: a particle filter whose base joints wander and whose other joints are regressed.
 
-What the paper leaves open is stated in `Wander` and in METHOD-like brevity below. It keeps its row in the tables; the
-default tracker is `curve`.
+What the paper leaves open is stated in `Wander` and in `ParticleFilter`. It keeps its row in the tables; the default
+tracker is `curve`.
 """
 
 from __future__ import annotations

@@ -13,11 +13,10 @@ from liex_lab.geometry import SE3
 Array = NDArray[np.float64]
 
 FLAGS = {
-    "bridged": "nothing was measured here, but shortly before and after; the pose is what lies between",
     "": "a pose was measured and is trusted",
     "doubtful": "a pose was measured, but its predicted error is large for this animal",
-    "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN",
-    "no_depth": "the frame holds no depth at all; the row is NaN",
+    "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged",
+    "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
 }
 
 
@@ -31,7 +30,8 @@ class Track:
     skeleton's bones; predicted_error_mm (n,) mean joint error expected by the learned metric; residual_mm (n,) median
     distance between the rendered body and the observed depth; n_foreground_px (n,); centroid_mm (n, 3) centre of the
     animal as seen from above and its mean height, arena frame; centroid_px (n, 2); p_flip (n,): probability that head
-    and tail are exchanged; flag (n,) a word of `FLAGS`.
+    and tail are exchanged; bridged (n,): nothing was measured, but shortly before and after, and the pose is what lies
+    between; flag (n,) a word of `FLAGS`.
     """
 
     skeleton: Skeleton
@@ -51,6 +51,7 @@ class Track:
     centroid_mm: Array
     centroid_px: Array
     p_flip: Array
+    bridged: NDArray[np.bool_]
     flag: NDArray[np.str_]
 
     @staticmethod
@@ -63,7 +64,7 @@ class Track:
             nan((n, j), np.nan), nan((n, 3, 3), np.nan), nan((n, 3), np.nan), nan((n, 6), np.nan),
             nan((n, j, 3), np.nan), nan((n, j, 3), np.nan), nan(n, np.nan), nan(n, np.nan), nan(n, np.nan),
             np.zeros(n, np.int64), nan((n, 3), np.nan), nan((n, 2), np.nan), nan(n, np.nan),
-            np.full(n, flag, dtype="<U12"),
+            np.zeros(n, np.bool_), np.full(n, flag, dtype="<U12"),
         )  # fmt: skip
 
     @staticmethod
@@ -72,15 +73,25 @@ class Track:
         columns = [f.name for f in fields(Track) if f.name != "skeleton"]
         return Track(parts[0].skeleton, *(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
+    def __getitem__(self, rows: slice) -> Track:
+        """Some consecutive frames."""
+        columns = [f.name for f in fields(Track) if f.name != "skeleton"]
+        return Track(self.skeleton, *(getattr(self, name)[rows] for name in columns))
+
     @property
     def n_frames(self) -> int:
         """Frames of the recording, measured or not."""
         return len(self.times_ns)
 
     @property
-    def observed(self) -> NDArray[np.bool_]:
+    def posed(self) -> NDArray[np.bool_]:
         """(n,) True where there is a pose, measured or bridged."""
         return np.isfinite(self.joints_mm[:, 0, 0])
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(n,) True where a pose was measured."""
+        return self.posed & ~self.bridged
 
     @property
     def root(self) -> SE3:

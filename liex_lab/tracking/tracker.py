@@ -89,7 +89,11 @@ class FrameTracker:
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:
         """The track of consecutive frames, each by itself."""
-        return single_frames(self.subject, self.observe(frames))
+        return self.follow_again(self.observe(frames))
+
+    def follow_again(self, seen: Observations) -> Track:
+        """The same from what was seen of them."""
+        return single_frames(self.subject, seen)
 
     def track(self, seen: Observations, corrections: Sequence[Flip] = ()) -> Tracked:
         """The track of a whole recording."""

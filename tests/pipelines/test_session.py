@@ -81,9 +81,18 @@ def test_every_delivered_frame_is_a_row_of_every_table(session, times_ns):
 
 def test_no_frame_is_lost_without_a_flag(session):
     lost = np.isnan(joints_of(session)).any(axis=(1, 2))
-    assert np.flatnonzero(lost).tolist() == [BLANK]
+    assert not lost.any()
+    assert np.flatnonzero(session.frames["bridged"]).tolist() == [BLANK]
     assert session.frames["flag"][BLANK] == "no_depth"
-    assert not session.frames["flag"][~lost].isin(["no_depth", "not_found"]).any()
+    assert not session.frames["flag"].drop(BLANK).isin(["no_depth", "not_found"]).any()
+    assert np.isnan(session.kinematics["speed_mm_s"][BLANK]), "what was bridged was not measured"
+
+
+def test_nothing_is_bridged_where_the_plan_forbids_it(folder, tmp_path):
+    plan = Plan.load("mouse").with_settings(["tracking.bridge_s=0.0"])
+    session = Session.open(run_session(folder, plan, tmp_path))
+    assert np.flatnonzero(np.isnan(joints_of(session)).any(axis=(1, 2))).tolist() == [BLANK]
+    assert not session.frames["bridged"].any()
 
 
 def test_joints_are_near_the_truth(session, mouse):
