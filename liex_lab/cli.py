@@ -245,6 +245,22 @@ def evaluate_tables(
         typer.echo(path)
 
 
+@evaluate.command("statistics")
+def evaluate_statistics(
+    n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
+    effect: Annotated[
+        float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
+    ] = 1.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How often the comparison of groups is wrong on studies without an effect, and how often it finds one."""
+    from liex_lab.pipelines.evaluate_statistics import evaluate_statistics as measure
+
+    with progress_bar() as progress:
+        result = measure(n_studies, effect, progress=progress)
+    _tell_numbers(result, json_file)
+
+
 @evaluate.command("reference")
 def evaluate_reference(
     session: SessionPath,
