@@ -294,6 +294,22 @@ def show(
 
 
 @app.command()
+def export(
+    session: SessionPath,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap or csv.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="The folder for it; the session's own if not named.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under this name.")] = False,
+) -> None:
+    """Write a session for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, or every table as CSV."""
+    from liex_lab.exchange import export as job
+    from liex_lab.sessions import Session
+
+    typer.echo(f"export: {job(Session.open(session), to, out, overwrite=overwrite)}")
+
+
+@app.command()
 def info(
     plan: Annotated[str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")] = None,
 ) -> None:
