@@ -52,10 +52,13 @@ def _behaviour(word: str, meaning: str, place: int) -> dict[str, Any]:
 def _observation(session: Session, subject: str) -> dict[str, Any]:
     """The recording as a media file that BORIS need not find, and two rows per bout."""
     frames, name = session.metadata["frames"], session.metadata["input"]["name"]
-    rows = []
-    for bout in session.bouts.itertuples():
-        for time, frame in ((bout.start_s, bout.start_frame), (bout.stop_s, bout.stop_frame)):
-            rows.append([round(float(time), 6), subject, str(bout.action), "", "", int(frame)])
+    bouts = session.bouts
+    times, indices = bouts[["start_s", "stop_s"]].to_numpy(float), bouts[["start_frame", "stop_frame"]].to_numpy(int)
+    rows = [
+        [round(float(time), 6), subject, str(action), "", "", int(index)]
+        for action, two_times, two_indices in zip(bouts["action"], times, indices, strict=True)
+        for time, index in zip(two_times, two_indices, strict=True)
+    ]
     rate = frames["fps_median"] or 0.0
     return {
         "file": {_MEDIA: [name]}, "type": "MEDIA", "date": _date(session), "description": "", "time offset": 0.0,

@@ -126,14 +126,15 @@ def _add_intervals(made: NWBFile, session: Session) -> None:
     actions = TimeIntervals(name="actions", description="the ethogram: half-open intervals")
     actions.add_column("label", "the action's name")
     actions.add_column("score", "how well the bout fits its action, 0 to 1")
-    for bout in session.bouts.itertuples():
-        actions.add_row(start_time=float(bout.start_s), stop_time=float(bout.stop_s), label=str(bout.action),
-                        score=float(bout.score), check_ragged=False)  # fmt: skip
+    bouts, missing = session.bouts, session.gaps
+    spans, scores = bouts[["start_s", "stop_s"]].to_numpy(float).tolist(), bouts["score"].to_numpy(float).tolist()
+    for (start, stop), action, score in zip(spans, bouts["action"], scores, strict=True):
+        actions.add_row(start_time=start, stop_time=stop, label=str(action), score=score, check_ragged=False)
     gaps = TimeIntervals(name="gaps", description="frames that are missing or without a pose")
     gaps.add_column("reason", "why")
-    for gap in session.gaps.itertuples():
-        gaps.add_row(start_time=float(gap.start_s), stop_time=float(gap.stop_s), reason=str(gap.reason),
-                     check_ragged=False)  # fmt: skip
+    for (start, stop), reason in zip(missing[["start_s", "stop_s"]].to_numpy(float).tolist(), missing["reason"],
+                                     strict=True):  # fmt: skip
+        gaps.add_row(start_time=start, stop_time=stop, reason=str(reason), check_ragged=False)
     for table in (actions, gaps):
         if len(table):
             made.add_time_intervals(table)

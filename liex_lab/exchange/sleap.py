@@ -28,7 +28,7 @@ def write(session: Session, path: Path) -> None:
     arrays = {
         "tracks": poses.uv_px.transpose(2, 1, 0)[None],
         "point_scores": poses.score.T[None],
-        "track_occupancy": seen.any(axis=1).astype(np.uint8)[:, None],
+        "track_occupancy": seen.any(axis=1, keepdims=True).astype(np.uint8),
         "instance_scores": mean_score[None],
         "tracking_scores": np.where(seen.any(axis=1), 1.0, np.nan)[None],
         "time_s": poses.time_s,
