@@ -50,4 +50,5 @@ def around_onsets(kinematics: pd.DataFrame, bouts: pd.DataFrame, action: str, co
     enough = np.isfinite(found).sum(axis=0) >= _FEWEST
     quartiles = np.full((3, _STEPS), np.nan)
     quartiles[:, enough] = np.nanpercentile(found[:, enough], [25.0, 50.0, 75.0], axis=0)
-    return Around(grid, *quartiles, len(own)) if enough.any() else None
+    low, median, high = quartiles
+    return Around(grid, low, median, high, len(own)) if enough.any() else None
