@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 WIDTH, LEFT, RIGHT = 920, 64, 22  # shared by all figures over time, so that their axes stand below each other
 ARENA = "the arena"  # the outline that needs no name
+_MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
 ACTION_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933")
 _VIRIDIS = np.array(
@@ -128,7 +129,7 @@ def trajectory(
     for name, corners in outlines:
         places = " ".join(f"{float(across(x)):.1f},{float(up(y)):.1f}" for x, y in corners)
         parts.append(f'<polygon class="outline" points="{places}"><title>{escape(name)}</title></polygon>')
-    keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), 4000)).astype(int))
+    keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), _MAX_PLACES)).astype(int))
     x, y, t = across(x_mm)[keep], up(y_mm)[keep], time_s[keep]
     span = max(float(t[-1] - t[0]), 1e-9)
     for piece in np.array_split(np.arange(len(keep)), min(64, max(1, len(keep) // 2))):
