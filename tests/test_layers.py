@@ -70,7 +70,7 @@ def test_only_the_command_line_and_the_front_door_know_the_jobs() -> None:
 
 
 HEAVY = {"numba", "pandas", "rerun", "sklearn", "scipy", "cv2", "pyarrow", "mcap", "foxglove", "tifffile", "open3d",
-         "matplotlib", "torch", "dask", "distributed"}  # fmt: skip
+         "matplotlib", "torch", "statsmodels", "dask", "distributed"}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,8 @@ class SessionWriter:
         self._document["thumbnails"] = self._keepsakes.save(self._folder, rows, self.origin.camera)
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
-        self._document.update(self._account(rows, dict(timings_s or {})), files=file_facts(self._folder, self._checkpoint.logs))
+        self._document["files"] = file_facts(self._folder, self._checkpoint.logs)
+        self._document.update(self._account(rows, dict(timings_s or {})))
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         try:
