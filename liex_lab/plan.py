@@ -249,7 +249,7 @@ class Plan(_Table):
         """The plan in a TOML text; `origin` names the file in errors."""
         try:
             table = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise PlanError(
                 f"{origin} should be a TOML file, but: {error}; compare it with `liex info --plan`"
             ) from None
@@ -331,7 +331,7 @@ def _value(dotted: str, text: str) -> Any:
     """The value that a person typed after --set: as TOML, or as the plain word it is."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
     annotation = _settings().get(dotted)
     takes_text = str in (get_args(annotation) or (annotation,))

@@ -43,7 +43,7 @@ class SlurmTable(BaseModel):
         try:
             table: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
             return SlurmTable.model_validate(table)
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
         except ValidationError as error:
             first = error.errors(include_url=False)[0]

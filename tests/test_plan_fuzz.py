@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
+from liex_lab.recordings.zones import read_zones
+from liex_lab.study import Study
 
 _WHOLE = Plan().model_dump()
 _WORDS = st.sampled_from(
@@ -60,6 +63,11 @@ def test_a_session_name_stays_in_its_folder(name: str) -> None:
         Plan.from_table({"session": {"name": name}})
 
 
-def test_a_deeply_nested_file_is_refused() -> None:
-    with pytest.raises((LiexError, tomllib.TOMLDecodeError)):
-        Plan.from_toml("a = " + "[" * 5000 + "]" * 5000)
+def test_a_deeply_nested_file_is_refused(tmp_path: Path) -> None:
+    deep = "a = " + "[" * 5000 + "]" * 5000
+    (tmp_path / "deep.toml").write_text(deep)
+    for read in (Plan.load, Study.load, read_zones, Skeleton.load):
+        with pytest.raises(LiexError, match="TOML"):
+            read(tmp_path / "deep.toml")
+    with pytest.raises(LiexError):
+        Plan().with_settings([f"camera.{deep}"])
