@@ -152,14 +152,14 @@ def _tables(session: Session) -> list[Path]:
 
 
 def _same_rows(path: Path, other: Path) -> bool:
-    """Whether two tables hold the same, to the last bit; what is said about them may differ."""
-    import pyarrow.parquet as pq
+    """Whether two tables hold the same numbers; what is said about them, such as versions, may differ."""
+    import pandas as pd
 
     if not other.is_file():
         return False
-    if path.suffix == ".csv":
-        return path.read_bytes() == other.read_bytes()
-    return bool(pq.read_table(path).replace_schema_metadata().equals(pq.read_table(other).replace_schema_metadata()))
+    if path.read_bytes() == other.read_bytes():
+        return True
+    return path.suffix == ".parquet" and pd.read_parquet(path).equals(pd.read_parquet(other))  # empty equals empty
 
 
 def _versions(session: Session, other: Session) -> str:
