@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
@@ -62,6 +62,25 @@ def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     from liex_lab.catalog import find_sample
 
     return run_session(find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress)
+
+
+def evaluate_tracking(
+    animal: str = "mouse",
+    sequence: str = "hard",
+    *,
+    model: str | Path | None = None,
+    n_frames: int | None = None,
+    figure: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error over time."""
+    from functools import partial
+
+    from liex_lab.dashboards.tracking_figure import draw_tracking
+    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+
+    draw = None if figure is None else partial(draw_tracking, path=figure)
+    return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
 
 
 def run_tables(

@@ -251,13 +251,14 @@ def evaluate_tracking(
     sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
     model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
     n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
-    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+    from liex_lab.api import evaluate_tracking as measure
 
     with progress_bar() as progress:
-        result = measure(animal, sequence, model=model, n_frames=n_frames, progress=progress)
+        result = measure(animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress)
     _tell_numbers(result, json_file)
 
 

@@ -47,13 +47,13 @@ def evaluate_tracking(
     rows: Sequence[str] = ROWS,
     seeds: Sequence[int] = (),
     n_frames: int | None = None,
-    draw: Callable[[Measured, dict[str, Any]], object] | None = None,
+    draw: Callable[[TestSequence, dict[str, Followed]], object] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The figures of a fixed sequence; `liex evaluate tracking`.
 
     rows: only some of `ROWS`; seeds: other sequences of the same kind, whose frames are taken together; draw: is given
-    what was measured and the figures, to make a picture of them.
+    the first sequence and what the rows made of it, for a picture.
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.sequences import tracking_sequence
@@ -74,7 +74,7 @@ def evaluate_tracking(
         "online_lag_frames": ONLINE_LAG, "protocol": TRACKING_PROTOCOL,
     }  # fmt: skip
     if draw is not None:
-        draw(measured[0], result)
+        draw(measured[0].sequence, measured[0].rows)
     return result
 
 
