@@ -11,8 +11,13 @@ from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from liex_lab.behaviour.bouts import MouseRules
+    from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.recordings.crops import Foreground
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
@@ -56,15 +61,25 @@ def build_estimator(plan: Plan) -> PoseEstimator:
 
 def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     """The tracker of a recording: its scene learned, the animal's size and girth found."""
-    from liex_lab.recordings.foreground import Scene
     from liex_lab.tracking.tracker import FrameTracker
 
     estimator = build_estimator(plan)
+    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, plan.estimation.doubtful_above_mm)
+
+
+def build_scene(
+    recording: Recording, plan: Plan, skeleton: Skeleton, n_frames: int
+) -> tuple[Foreground, NDArray[np.float32]]:
+    """What tells the animal from the rest of the pictures, and the sample (n, H, W) mm that it was learned from."""
+    from liex_lab.body.skeleton import FOREGROUNDS
+    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.nearest import NearestScene
+
     animal, foreground = plan.animal, plan.foreground
-    scene, sample = Scene.learn(
-        recording, (animal.spine_min_mm, animal.spine_max_mm), foreground.n_background_frames, foreground.min_height_mm
-    )
-    return FrameTracker.prepare(estimator, scene, sample, animal.spine_mm, plan.estimation.doubtful_above_mm)
+    if skeleton.view.foreground == FOREGROUNDS[1]:
+        return NearestScene.learn(recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm))
+    return Scene.learn(recording, (animal.spine_min_mm, animal.spine_max_mm), n_frames, foreground.min_height_mm)
 
 
 def build_provenance(
@@ -88,6 +103,10 @@ def build_provenance(
 
 def build_rules(plan: Plan) -> MouseRules:
     """The thresholds of the behaviours."""
+    import numpy as np
+    from numpy.typing import NDArray
+
     from liex_lab.behaviour.bouts import MouseRules
+    from liex_lab.body.skeleton import Skeleton
 
     return MouseRules(**plan.behaviour.model_dump())

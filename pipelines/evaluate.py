@@ -41,14 +41,13 @@ def pose_errors(
     estimator: PoseEstimator, sessions: Sequence[SyntheticSession], plan: Plan, progress: Progress
 ) -> PoseErrors:
     """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
-    from liex_lab.recordings.foreground import Scene
+    from liex_lab.pipelines.build import build_scene
 
     model, parts = estimator.model, []
     quantiles = np.array(model.calibration.quantiles)
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
-        sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
-        scene, frames = Scene.learn(recording, sizes, len(recording), plan.foreground.min_height_mm)
+        scene, frames = build_scene(recording, plan, estimator.skeleton, len(recording))
         estimates = estimator.estimate(frames, scene, estimator.find_size(frames, scene))
         joints = estimates.chosen.pose.joints(estimator.skeleton)
         parts.append(
@@ -117,17 +116,17 @@ def _best_seconds(job: Callable[[], Any]) -> float:
 def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
     """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate speed`."""
     import numba
+    from liex_lab.pipelines.build import build_scene
 
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.scoring import choose
-    from liex_lab.recordings.foreground import Scene
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
     recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
     plan = Plan.load(animal)
     default, paper = estimator_of(animal, "default"), estimator_of(animal, "paper", progress)
-    scene, sample = Scene.learn(recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm))
+    scene, sample = build_scene(recording, plan, default.skeleton, len(recording))
     size = default.find_size(sample, scene)
     frames = sample[np.arange(_SPEED_FRAMES) % len(sample)]
     cores = min(2, numba.config.NUMBA_NUM_THREADS)

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from liex_lab.estimation.method import Method
     from liex_lab.estimation.model import Model
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.foreground import Crops
     from liex_lab.recordings.windows import TrainingWindows
 
 Array = NDArray[np.float64]
@@ -81,11 +81,14 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     """Algorithm 2, the learned metric, and its calibration on images that no tree has seen."""
     from liex_lab.body.skeleton import PRESETS
     from liex_lab.estimation.calibration import calibrate
+    from liex_lab.estimation.initial import typical_turns
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric
 
     rng = np.random.default_rng(recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
+    if method.n_typical:
+        method = replace(method, typical=typical_turns(*_bases(data), method.n_typical))
     steps = len(skeleton.solved) * method.rounds + 2
 
     def tell(share: float, what: str) -> None:
@@ -106,6 +109,11 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)
         model = calibrate(model, unseen, rng)
     return model
+
+
+def _bases(data: TrainingSet) -> tuple[Array, Array]:
+    """Moments (m, 8) and true base rotations (m, 3, 3) of the images that show the animal."""
+    return data.images.moments[data.animal], data.truth.rotations[data.animal, 0]
 
 
 def rendered_set(
@@ -132,38 +140,45 @@ def rendered_set(
 
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
     """Training images of what the foreground found in the windows, with the truth in their view frames."""
+    from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.nearest import NearestWindows
 
     size = windows.spine_mm / skeleton.length
-    cut = Windows(windows.depth, windows.background, windows.intrinsics, windows.origin.astype(float), windows.floor)
     shown = size if method.session_size else np.ones(len(size))
-    parts = [cut_rank(skeleton, method, windows, cut, shown, rank) for rank in (0, 1)]
+    origin = windows.origin.astype(float)
+    parts = []
+    for rank in (0, 1):
+        if skeleton.view.foreground == FOREGROUNDS[1]:
+            held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
+            crops, looks = held.extract(shown, method.camera_view, rank)
+        else:
+            cut = Windows(windows.depth, windows.background, windows.intrinsics, origin, windows.floor)
+            crops, looks = cut.extract(shown, AREA_MM2 * size**2, camera_view=method.camera_view, rank=rank)
+        parts.append(with_truth(skeleton, windows, crops, looks))
     return TrainingSet.join(parts)
 
 
-def cut_rank(
-    skeleton: Skeleton, method: Method, windows: TrainingWindows, cut: Windows, shown: Array, rank: int
-) -> TrainingSet:
-    """Training images of the blobs that come first (rank 0) or second in likeness to the animal's area."""
+def with_truth(skeleton: Skeleton, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
+    """Training images of blobs that were cut from the windows, with the truth in their view frames."""
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.geometry import SE3
+    from liex_lab.recordings.crops import view_of
 
-    size = windows.spine_mm / skeleton.length
-    crops, looks = cut.extract(shown, AREA_MM2 * size**2, camera_view=method.camera_view, rank=rank)
-    rotation = looks[:, 4:13].reshape(-1, 3, 3)
-    T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
+    T_view_camera = view_of(looks)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
-    frames = pose.frames(skeleton)
-    off = np.linalg.norm(crops.moments[:, 3:5] - frames.translation.mean(axis=1)[:, :2], axis=1)
+    rotations = pose.frames(skeleton).rotation
+    joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
+    off = np.linalg.norm(crops.moments[:, 3:5] - joints.mean(axis=1)[:, :2], axis=1)
     animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
     good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
     return TrainingSet(
         ImageSet(crops.heights[good], looks[good], crops.moments[good]),
-        Truth(frames.rotation[good], frames.translation[good], pose.scale[good]),
-        size[good],
+        Truth(rotations[good], joints[good], pose.scale[good]),
+        (windows.spine_mm / skeleton.length)[good],
         animal[good],
     )
 

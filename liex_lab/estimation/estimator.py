@@ -19,7 +19,7 @@ from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
 from liex_lab.estimation.training import base_at_front
 from liex_lab.geometry import SE3
-from liex_lab.recordings.foreground import Crops, Scene
+from liex_lab.recordings.crops import Crops, Foreground, view_of
 from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
@@ -31,11 +31,14 @@ _MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weig
 
 @dataclass(frozen=True)
 class Estimates:
-    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as `Chosen`; found (n,)."""
+    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as `Chosen`; found (n,); looks
+    (n, 17): how the crops were cut.
+    """
 
     chosen: Chosen
     found: NDArray[np.bool_]
     crops: Crops
+    looks: Array
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,9 @@ class PoseEstimator:
         n, k = len(looks), self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
-            crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start
-        )
+            crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
+            np.array(method.typical).reshape(-1, 3),
+        )  # fmt: skip
         rotations = np.zeros((n, k, skeleton.n_joints, 3, 3))
         positions = np.zeros((n, k, skeleton.n_joints, 3))
         rotations[:, :, 0], positions[:, :, 0] = base_rotation, base_position
@@ -107,7 +111,7 @@ class PoseEstimator:
             )  # fmt: skip
         return rotations, positions, scales, scores
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Estimates:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
         method = self.model.method
         size = size if method.session_size else 1.0
@@ -131,14 +135,10 @@ class PoseEstimator:
                         rotations[usable], positions[usable], scores[usable])  # fmt: skip
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        T_camera_view = SE3(
-            np.broadcast_to(scene.view_rotation(method.camera_view), (len(looks), 3, 3)),
-            np.stack([np.zeros(len(looks)), np.zeros(len(looks)), crops.distance], axis=-1),
-        ).inverse()
-        return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+        return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops, looks)
 
     def _is_animal(
-        self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array
     ) -> NDArray[np.bool_]:
         """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
 
@@ -149,7 +149,7 @@ class PoseEstimator:
             return likeness[1] < likeness[0]
         return second + likeness[1] < first + likeness[0]
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm of the recording.
 
         The area seen from above gives the first guess; the model then measures the spine in every frame, the median of

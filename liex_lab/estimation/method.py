@@ -42,6 +42,8 @@ class Method:
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
+    n_typical: int = 0  # usual orientations that the starts begin with, for an animal that turns any side to the camera
+    typical: tuple[tuple[float, ...], ...] = ()  # these: rotation vectors in the frame of the long axis
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card."""
@@ -53,6 +55,7 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
+        plain["typical"] = tuple(tuple(turn) for turn in plain.get("typical", ()))
         return Method(**plain)
 
 

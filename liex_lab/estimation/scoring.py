@@ -48,8 +48,8 @@ def choose(
 
     rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k` candidates with the
     lowest predicted error that lie near the best one are averaged with weights exp(-(score - best) / tau) (METHOD
-    lesson 3); each bone then turns by the smallest rotation onto its mean direction and the scale follows from the
-    total length.
+    lesson 3). In a chain each bone then turns by the smallest rotation onto its mean direction, and the scale follows
+    from the total length; a tree is averaged joint by joint, see `mean_pose`.
     """
     order = np.argsort(scores, axis=1, kind="stable")[:, : method.top_k]
     score = np.take_along_axis(scores, order, axis=1)
@@ -59,8 +59,11 @@ def choose(
     weight = np.where(near, np.exp(-(score - score[:, :1]) / method.top_tau), 0.0)
     weight = weight / weight.sum(axis=1, keepdims=True)
     mean = np.einsum("nk,nkjd->njd", weight, joints)
-    up = np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2])
-    pose = Pose.from_joints(skeleton, mean, up)
+    if skeleton.is_chain:
+        pose = Pose.from_joints(skeleton, mean, np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2]))
+    else:
+        pose = mean_pose(skeleton, turned, joints, weight)
+        mean = pose.joints(skeleton)
     off = np.linalg.norm(joints - mean[:, None], axis=-1)
     variance = np.einsum("nk,nkj->nj", weight, off**2)
     mean_score = np.sum(weight * score, axis=1)
@@ -72,6 +75,27 @@ def choose(
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     doubts = _doubts(positions, scores, mean, score, size)
     return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts)
+
+
+def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
+    """The weighted mean of poses of a tree, on the group: n means over k poses each.
+
+    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the chordal mean rotation and
+    the mean place; every other joint the mean of its turns relative to its parent about the axes that are free, so
+    bones keep their lengths and hinges their axes; the scale is the mean scale.
+    """
+    root = SE3(
+        so3.nearest_rotation(np.einsum("nk,nkab->nab", weight, turned[:, :, 0])),
+        np.einsum("nk,nkd->nd", weight, joints[:, :, 0]),
+    )
+    moving = np.array(skeleton.solved[1:])
+    parents = skeleton.parents[moving]
+    local = np.swapaxes(turned[:, :, parents] @ skeleton.rest[moving], -1, -2) @ turned[:, :, moving]
+    angles = np.zeros((len(turned), skeleton.n_joints, 3))
+    angles[:, moving] = np.einsum("nk,nkjd->njd", weight, so3.log(local)) * skeleton.axes[moving]
+    bones = np.linalg.norm(joints[:, :, 1:] - joints[:, :, skeleton.parents[1:]], axis=-1).sum(axis=2)
+    scale = np.einsum("nk,nk->n", weight, bones) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
+    return Pose(root, angles, scale)
 
 
 def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float) -> Array:

@@ -62,8 +62,9 @@ def start_candidates(data: TrainingSet, skeleton: Skeleton, method: Method, rng:
     else:
         size = np.ones((m, k))
     rotation, position, scale = start_poses(
-        data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start
-    )
+        data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start,
+        np.array(method.typical).reshape(-1, 3),
+    )  # fmt: skip
     image = np.repeat(np.arange(m, dtype=np.int32), k)
     return Candidates.start(
         skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), size.ravel()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.camera import Camera
+from liex_lab.geometry import SE3
 from liex_lab.recordings import _crops as kernels
 from liex_lab.recordings.arena import Floor
 
@@ -49,6 +51,38 @@ class Crops:
     def found(self) -> NDArray[np.bool_]:
         """(n,) True where an animal is in view."""
         return self.n_px > 0
+
+
+class Foreground(Protocol):
+    """What finds the animal in the pictures of one camera: `foreground.Scene`, or `nearest.NearestScene`.
+
+    floor: where heights of a recording's results are measured from; area_mm2: the animal's usual area.
+    """
+
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def floor(self) -> Floor: ...
+    @property
+    def area_mm2(self) -> float: ...
+
+    def extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0
+    ) -> Crops:
+        """The animal of each frame (n, H, W) mm, or (rank 1) what may be it as well."""
+
+    def looks(self, crops: Crops, camera_view: bool = False) -> Array:
+        """How each height map was cut (n, 17)."""
+
+    def misfit(self, crops: Crops) -> Array:
+        """How unlike the animal each crop (n) is."""
+
+
+def view_of(looks: Array) -> SE3:
+    """T_view_camera (n) of looks (n, 17)."""
+    translation = np.zeros((len(looks), 3))
+    translation[:, 2] = looks[:, 13]
+    return SE3(looks[:, 4:13].reshape(-1, 3, 3), translation)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
-from liex_lab.geometry import SE3
 from liex_lab.recordings import _nearest as kernels
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.background import sample_frames
@@ -139,10 +138,3 @@ def sight_rotations(p_camera: Array) -> Array:
     for rotation, (x, y, z) in zip(rotations, p_camera, strict=True):
         kernels.sight_rotation(x / z, y / z, rotation)
     return rotations
-
-
-def view_of(looks: Array) -> SE3:
-    """T_view_camera (n) of looks (n, 17)."""
-    translation = np.zeros((len(looks), 3))
-    translation[:, 2] = looks[:, 13]
-    return SE3(looks[:, 4:13].reshape(-1, 3, 3), translation)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings import synthetic, walking, windows
+from liex_lab.recordings.hand_world import HandWorld, find_reference
 from liex_lab.recordings.synthetic import SyntheticSession
 from liex_lab.recordings.windows import TrainingWindows
 
@@ -66,4 +67,6 @@ def world_of(skeleton: Skeleton) -> World:
     """The world of an animal."""
     if skeleton.name == "mouse":
         return MouseWorld(skeleton)
+    if skeleton.name == "hand":
+        return HandWorld(skeleton, find_reference())
     raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")

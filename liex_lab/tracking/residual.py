@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
-from liex_lab.recordings.foreground import CROP, Crops, Scene
+from liex_lab.recordings.crops import CROP, Crops, Foreground
 
 Array = NDArray[np.float64]
 
@@ -26,29 +26,31 @@ class BodyResidual:
     surface: Surface
     girth: float = 1.0
 
-    def of(self, pose_arena: Pose, crops: Crops, scene: Scene) -> Array:
+    def of(self, pose_arena: Pose, crops: Crops, scene: Foreground, looks: Array | None = None) -> Array:
         """Median absolute difference (n,) mm between body and reading over the pixels that both cover; NaN without.
 
-        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth.
+        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth; looks
+        (n, 17): how they were cut, None as `scene.looks` says.
         """
         n = len(pose_arena.scale)
         if n == 0:
             return np.zeros(0)
         rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
         out = np.empty(n)
-        floor = scene.floor
-        _compare(rendered, crops.heights, crops.origin, crops.step, floor.inverse_depth, floor.distance_mm, out)
+        _compare(rendered, crops.heights, scene.looks(crops) if looks is None else looks, out)
         return out
 
     @staticmethod
-    def fit(surface: Surface, pose_arena: Pose, crops: Crops, scene: Scene) -> BodyResidual:
+    def fit(
+        surface: Surface, pose_arena: Pose, crops: Crops, scene: Foreground, looks: Array | None = None
+    ) -> BodyResidual:
         """The girth with which the default body explains these frames best."""
-        cost = [np.nanmedian(BodyResidual(surface, float(g)).of(pose_arena, crops, scene)) for g in _GIRTHS]
+        cost = [np.nanmedian(BodyResidual(surface, float(g)).of(pose_arena, crops, scene, looks)) for g in _GIRTHS]
         return BodyResidual(surface, float(_GIRTHS[int(np.argmin(cost))]))
 
 
 def render_crops(
-    surface: Surface, pose_arena: Pose, girth: float, crops: Crops, scene: Scene
+    surface: Surface, pose_arena: Pose, girth: float, crops: Crops, scene: Foreground
 ) -> NDArray[np.float32]:
     """The body's depth (n, CROP, CROP) mm on the pixels of the height maps, 0 where it is not."""
     camera = scene.camera
@@ -64,18 +66,22 @@ def render_crops(
 
 
 @njit(cache=True, parallel=True)
-def _compare(rendered, heights, origin, step, plane, distance, out):
+def _compare(rendered, heights, looks, out):
     """Median |rendered - observed| depth of each frame over pixels where both are, into out (n,)."""
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
+        fx, fy, cx, cy, distance, step = looks[i, 0], looks[i, 1], looks[i, 2], looks[i, 3], looks[i, 13], looks[i, 16]
+        # the plane that heights are measured from: 1 / z = a u + b v + c; its normal is the view's z axis reversed
+        a, b = -looks[i, 10] / fx / distance, -looks[i, 11] / fy / distance
+        c0 = -looks[i, 12] / distance - a * cx - b * cy
         off = np.empty(size * size)
         n = 0
         for r in range(size):
-            v = origin[i, 1] + step[i] * r
+            v = looks[i, 15] + step * r
             for c in range(size):
                 if rendered[i, r, c] > 0 and heights[i, r, c] > 0:
-                    u = origin[i, 0] + step[i] * c
-                    observed = (1.0 - heights[i, r, c] / 16.0 / distance) / (plane[0] * u + plane[1] * v + plane[2])
+                    u = looks[i, 14] + step * c
+                    observed = (1.0 - heights[i, r, c] / 16.0 / distance) / (a * u + b * v + c0)
                     off[n] = abs(rendered[i, r, c] - observed)
                     n += 1
         out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan

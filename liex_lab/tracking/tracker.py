@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground, view_of
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Track
@@ -26,7 +26,7 @@ class FrameTracker:
     """
 
     estimator: PoseEstimator
-    scene: Scene
+    scene: Foreground
     size: float
     size_origin: str
     body: BodyResidual
@@ -35,7 +35,7 @@ class FrameTracker:
     @staticmethod
     def prepare(
         estimator: PoseEstimator,
-        scene: Scene,
+        scene: Foreground,
         sample: NDArray[np.float32],
         spine_mm: float | None = None,
         doubtful_mm: float | None = None,
@@ -51,7 +51,7 @@ class FrameTracker:
             raise EstimationError("no animal was found in the sampled frames; check the depth unit and the plan")
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
         crops, used = estimates.crops, estimates.found
-        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene)
+        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, estimates.looks[used])
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
         return FrameTracker(estimator, scene, size, "plan" if spine_mm else "recording", body, limit)
 
@@ -81,10 +81,12 @@ class FrameTracker:
         track.predicted_error_mm[:] = chosen.error_mm
         track.n_foreground_px[:] = estimates.crops.n_px
         moments = estimates.crops.moments[seen]
-        T_camera_arena = self.scene.floor.T_arena_camera.inverse()
-        track.centroid_mm[seen] = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
-        track.centroid_px[seen] = self.scene.camera.project(T_camera_arena @ track.centroid_mm[seen])
-        track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene)
+        T_camera_view = view_of(estimates.looks[seen]).inverse()
+        middle = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
+        middle = np.einsum("nij,nj->ni", T_camera_view.rotation, middle) + T_camera_view.translation
+        track.centroid_mm[seen] = self.scene.floor.T_arena_camera @ middle
+        track.centroid_px[seen] = self.scene.camera.project(middle)
+        track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene, estimates.looks[seen])
         track.flag[seen] = np.where(chosen.error_mm[seen] > self.doubtful_mm, "doubtful", "")
         track.flag[~seen & ~(depths > 0).any(axis=(1, 2))] = "no_depth"
         return track
