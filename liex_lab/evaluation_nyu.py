@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 NYU_PROTOCOL = (
     "Error of a frame: mean over the labelled points of the 3D distance to the true point, mm; mean over frames. 14: "
     "all points; 13: without the palm. Root estimated: the answer as it is. Root given: the answer moved so that its "
-    "palm lies on the true palm, as the published answer of Lie-X was; its mean over 14 then holds an error of zero, so "
-    "compare it with others over 13, or with theirs moved alike."
+    "palm lies on the true palm, as the published answer of Lie-X was; its mean over 14 then holds an error of zero, "
+    "so compare it with others over 13, or with theirs moved alike."
 )
 _MAX_BELOW_MM = (10, 20, 30, 40, 50, 60, 80)
 _MEAN_BELOW_MM = (5, 10, 15, 20, 30, 40)
@@ -23,7 +23,7 @@ _MEAN_BELOW_MM = (5, 10, 15, 20, 30, 40)
 
 def nyu_errors(answer: Array, truth: Array) -> dict[str, Any]:
     """The figures of an answer against the truth, points (n, 14, 3) mm; rows with NaN count as lost."""
-    seen = np.isfinite(answer).all(axis=(1, 2))
+    seen = np.isfinite(answer).reshape(len(answer), -1).all(axis=1)
     if not seen.any():
         return {"n_frames": len(truth), "lost_rate": 1.0}
     answer, truth = answer[seen], truth[seen]

@@ -103,10 +103,6 @@ def build_provenance(
 
 def build_rules(plan: Plan) -> MouseRules:
     """The thresholds of the behaviours."""
-    import numpy as np
-    from numpy.typing import NDArray
-
     from liex_lab.behaviour.bouts import MouseRules
-    from liex_lab.body.skeleton import Skeleton
 
     return MouseRules(**plan.behaviour.model_dump())

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,9 +53,7 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
     return _OWN.get((skeleton.name, variant), RECIPES[variant])
 
 
-def train_model(
-    animal: str, variant: str, out: str | Path, *, workers: int = 0, progress: Progress = silent
-) -> Path:
+def train_model(animal: str, variant: str, out: str | Path, *, workers: int = 0, progress: Progress = silent) -> Path:
     """Train an animal's model and write it, and its card, to `out` (.npz); returns the path."""
     import numba
 
@@ -81,14 +79,11 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     """Algorithm 2, the learned metric, and its calibration on images that no tree has seen."""
     from liex_lab.body.skeleton import PRESETS
     from liex_lab.estimation.calibration import calibrate
-    from liex_lab.estimation.initial import typical_turns
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric
 
     rng = np.random.default_rng(recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
-    if method.n_typical:
-        method = replace(method, typical=typical_turns(*_bases(data), method.n_typical))
     steps = len(skeleton.solved) * method.rounds + 2
 
     def tell(share: float, what: str) -> None:
@@ -109,11 +104,6 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)
         model = calibrate(model, unseen, rng)
     return model
-
-
-def _bases(data: TrainingSet) -> tuple[Array, Array]:
-    """Moments (m, 8) and true base rotations (m, 3, 3) of the images that show the animal."""
-    return data.images.moments[data.animal], data.truth.rotations[data.animal, 0]
 
 
 def rendered_set(

@@ -83,7 +83,9 @@ def _parsed(table: Any, skeleton: Skeleton) -> tuple[list[int], list[list[float]
     offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
     radii = table.get("radii_mm", [])
     if not (_numbers(offsets[0], 3) and _numbers(offsets[1], 3) and _numbers(radii, 2) and min(radii) > 0):
-        raise LiexError(f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, got {table}")
+        raise LiexError(
+            f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, got {table}"
+        )
     return [skeleton.names.index(name) for name in names], offsets, radii
 
 

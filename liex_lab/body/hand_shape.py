@@ -59,8 +59,8 @@ class HandShape:
 def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> HandShape:
     """Draw the hands of n people of a family.
 
-    'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds hands that no model is trained on:
-    short and plump ones, and long and slender ones.
+    'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds hands that no model is trained
+    on: short and plump ones, and long and slender ones.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
@@ -132,4 +132,3 @@ def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm:
     radii[:, 3] = 1.3 * arm[:, 1:2]
     tubes = Capsules(np.array([[0, _ELBOW], [0, _ELBOW], [0, _ELBOW], [_ELBOW, _SHOULDER]]), offsets, radii)
     return tubes.vertices(np.repeat(frame[:, None], 3, axis=1), joints, scale, scale)
-

@@ -37,8 +37,8 @@ class View:
     frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
     behind_mm (at home size) behind its mean depth, for one that swims or is held up. smooth_mm: readings this near to
     one another, at home size, are averaged. area: the smallest and the largest area seen from above, of the squared
-    length. foreground: 'background', it stands out from a scene that is otherwise still, or 'nearest', nothing is nearer
-    to the camera.
+    length. foreground: 'background', it stands out from a scene that is otherwise still, or 'nearest', nothing is
+    nearer to the camera.
     """
 
     frame: str = VIEWS[0]

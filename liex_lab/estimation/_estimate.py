@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from liex_lab.estimation._explain import N_FIT, explain_pose
 from liex_lab.estimation._kernels import (
     N_SCALARS,
     correct_base,
@@ -69,7 +70,8 @@ def predict_many(
 @njit(cache=True)
 def estimate_one(
     heights, look, moments, size, parents, offsets, rest, axes, solved, n_rounds, reach, levers, bandwidth,
-    nodes, roots, leaves, leaf_bases, widths, metric_nodes, metric_roots, metric_leaves,
+    explains, unit_mm, ball_joints, ball_offsets, ball_share, ball_radius, nodes, roots, leaves, leaf_bases, widths,
+    metric_nodes, metric_roots, metric_leaves,
     rotations, positions, scales, scores,
 ):  # fmt: skip
     """K candidates of one frame: rotations (K, J, 3, 3), positions (K, J, 3), scales (K,) in place; scores (K,)."""
@@ -84,7 +86,7 @@ def estimate_one(
         for k in range(n):
             if joint > 0:
                 place_joint(joint, parents, offsets, rest, scales[k], rotations[k], positions[k])
-        for _ in range(n_rounds):
+        for _ in range(n_rounds[0] if joint == 0 else n_rounds[1]):
             for k in range(n):
                 fill_view(rotations[k, joint], positions[k, joint], look, size, reach, views[k, 0])
                 fill_scalars(rotations[k, joint], positions[k, joint], scales[k], moments, size, scalars[k])
@@ -100,12 +102,16 @@ def estimate_one(
                 scales[k] = correct_base(rotations[k, 0], positions[k, 0], scales[k], values[k], size)
             forest += 1
     all_views = np.empty((n, n_joints, VIEW), np.float32)
+    facts = np.empty((n, N_SCALARS + (N_FIT if explains else 0)), np.float32)
     for k in range(n):
         place_rest(solved, parents, offsets, rest, scales[k], rotations[k], positions[k])
         for joint in range(n_joints):
             fill_view(rotations[k, joint], positions[k, joint], look, size, reach, all_views[k, joint])
-        fill_scalars(rotations[k, 0], positions[k, 0], scales[k], moments, size, scalars[k])
-    predict_many(metric_nodes, metric_roots, metric_leaves, 0, 1, heights, inverse_size, all_views, scalars, 0.0,
+        fill_scalars(rotations[k, 0], positions[k, 0], scales[k], moments, size, facts[k])
+        if explains:
+            explain_pose(heights, look, rotations[k], positions[k], scales[k], size, unit_mm, ball_joints,
+                         ball_offsets, ball_share, ball_radius, facts[k, N_SCALARS:])  # fmt: skip
+    predict_many(metric_nodes, metric_roots, metric_leaves, 0, 1, heights, inverse_size, all_views, facts, 0.0,
                  scratch, values)  # fmt: skip
     for k in range(n):
         scores[k] = values[k, 0]
@@ -114,13 +120,15 @@ def estimate_one(
 @njit(cache=True, parallel=True)
 def estimate_all(
     heights, looks, moments, found, size, parents, offsets, rest, axes, solved, n_rounds, reach, levers, bandwidth,
-    nodes, roots, leaves, leaf_bases, widths, metric_nodes, metric_roots, metric_leaves,
+    explains, unit_mm, ball_joints, ball_offsets, ball_share, ball_radius, nodes, roots, leaves, leaf_bases, widths,
+    metric_nodes, metric_roots, metric_leaves,
     rotations, positions, scales, scores,
 ):  # fmt: skip
     for i in prange(heights.shape[0]):
         if found[i]:
             estimate_one(
                 heights[i], looks[i], moments[i], size, parents, offsets, rest, axes, solved, n_rounds, reach, levers,
-                bandwidth, nodes, roots, leaves, leaf_bases, widths, metric_nodes, metric_roots, metric_leaves,
+                bandwidth, explains, unit_mm, ball_joints, ball_offsets, ball_share, ball_radius, nodes, roots, leaves,
+                leaf_bases, widths, metric_nodes, metric_roots, metric_leaves,
                 rotations[i], positions[i], scales[i], scores[i],
             )  # fmt: skip

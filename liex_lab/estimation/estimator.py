@@ -14,8 +14,10 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
+from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
+from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
 from liex_lab.estimation.training import base_at_front
 from liex_lab.geometry import SE3
@@ -81,8 +83,18 @@ class PoseEstimator:
         )  # fmt: skip
 
     @cached_property
+    def _balls(self) -> tuple[float, NDArray[np.int64], Array, Array, Array]:
+        """The body that candidates are held against the picture with, as kernels take it; nothing where none is."""
+        if not self.model.method.explains:
+            return 1.0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0)
+        b = self.model.cascade.balls
+        return b.unit_mm, b.joints, b.offsets, b.share, b.radius
+
+    @cached_property
     def _starts(self) -> Array:
         k = self.n_candidates or self.model.method.n_candidates
+        if self.model.cascade.proposals is not None:
+            k = N_WAYS * self.model.cascade.proposals.n_trees
         return draw_starts(np.random.default_rng(_START_SEED), 1, k)
 
     def candidates(
@@ -96,8 +108,11 @@ class PoseEstimator:
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
             crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
-            np.array(method.typical).reshape(-1, 3),
+            method.home_turn,
         )  # fmt: skip
+        if self.model.cascade.proposals is not None:
+            images = ImageSet(crops.heights, looks, crops.moments)
+            base_rotation, base_position = propose(self.model.cascade.proposals, images, sizes[:, 0], method)
         rotations = np.zeros((n, k, skeleton.n_joints, 3, 3))
         positions = np.zeros((n, k, skeleton.n_joints, 3))
         rotations[:, :, 0], positions[:, :, 0] = base_rotation, base_position
@@ -105,8 +120,10 @@ class PoseEstimator:
         with threads(parallel):
             kernels.estimate_all(
                 crops.heights, looks, crops.moments, crops.found, size, skeleton.parents, skeleton.offsets,
-                skeleton.rest, skeleton.axes, np.array(skeleton.solved), method.rounds, method.reach_mm,
+                skeleton.rest, skeleton.axes, np.array(skeleton.solved),
+                np.array([method.rounds_of(0), method.rounds]), method.reach_mm,
                 np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
+                method.explains, *self._balls,
                 *self._packed, rotations, positions, scales, scores,
             )  # fmt: skip
         return rotations, positions, scales, scores

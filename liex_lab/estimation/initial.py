@@ -23,62 +23,38 @@ def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> A
 
 def start_poses(
     moments: Array, starts: Array, size: Array, home_length: float, base_at_front: bool, axis_start: bool,
-    typical: Array | None = None,
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n animals.
 
     moments (n, 8) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of the animal over home.
     axis_start: along the animal's long axis, every other start the other way round, the more spread out the rounder
     the animal looks (METHOD lesson 8). Otherwise the paper's start: any heading in (-pi, pi), the base at the centroid
-    and at the animal's mean height, bones scaled by 0.9 to 1.1. typical (P, 3): rotation vectors of usual orientations
-    in the frame of the long axis, for an animal that may turn any side to the camera: starts begin with one after the
-    other of them, at the centre of the animal.
+    and at the animal's mean height, bones scaled by 0.9 to 1.1. home_turn: rotation vector by which the home pose lies
+    otherwise than seen from above, as a palm that is shown.
     """
-    turns = np.zeros((0, 3)) if typical is None else np.asarray(typical, float)
     n, k = size.shape
     starts = np.broadcast_to(starts, (n, k, 4))
     centre = moments[:, None, 3:5]
     position = np.empty((n, k, 3))
-    middle = (moments[:, 2] / np.maximum(moments[:, 1], 1.0))[:, None]
     if axis_start:
         roundness = moments[:, 7] / np.maximum(moments[:, 6], 1e-6)
         spread = _JITTER[0] + _JITTER[1] * roundness**2
         heading = moments[:, None, 5] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
         scale = size.copy()
-        position[..., :2], position[..., 2] = centre, middle
-    if axis_start and not len(turns):
         behind = _BEHIND * home_length * scale * (-1.0 if base_at_front else 1.0)
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         position[..., :2] = centre - behind[..., None] * direction + 2.0 * scale[..., None] * starts[..., 1:3]
         position[..., 2] = _HIGH * home_length * scale
-    elif not axis_start:
+    else:
         heading = np.pi * starts[..., 3]
         scale = size * (1.0 + 0.1 * np.clip(starts[..., 1] / 2.0, -1.0, 1.0))
-        position[..., :2], position[..., 2] = centre, middle
+        position[..., :2] = centre
+        position[..., 2] = (moments[:, 2] / np.maximum(moments[:, 1], 1.0))[:, None]
     rotation = np.zeros((n, k, 3, 3))
     rotation[..., 0, 0], rotation[..., 0, 1] = np.cos(heading), -np.sin(heading)
     rotation[..., 1, 0], rotation[..., 1, 1] = np.sin(heading), np.cos(heading)
     rotation[..., 2, 2] = 1.0
-    if len(turns):
-        # each two starts that point opposite ways share an orientation; images begin with different ones
-        first = np.floor(0.5 * (starts[:, :1, 3] + 1.0) * len(turns)).astype(np.int64)
-        rotation = rotation @ so3.exp(turns)[(first + np.arange(k) // 2) % len(turns)]
+    if any(home_turn):
+        rotation = rotation @ so3.exp(np.array(home_turn))
     return rotation, position, scale
-
-
-def typical_turns(moments: Array, rotations: Array, n_turns: int) -> tuple[tuple[float, ...], ...]:
-    """The usual orientations of bases (n, 3, 3) in the frames of animals' long axes, as rotation vectors.
-
-    moments (n, 8) as in `Crops`. Which way an axis points is open; the base's x axis decides.
-    """
-    from sklearn.cluster import KMeans
-
-    heading = moments[:, 5].copy()
-    ahead = rotations[:, 0, 0] * np.cos(heading) + rotations[:, 1, 0] * np.sin(heading)
-    heading[ahead < 0] += np.pi
-    back = np.zeros((len(heading), 3))
-    back[:, 2] = -heading
-    relative = so3.exp(back) @ rotations
-    centres = KMeans(n_turns, n_init=4, random_state=0).fit(relative.reshape(-1, 9)).cluster_centers_
-    turns = so3.log(so3.nearest_rotation(centres.reshape(-1, 3, 3)))
-    return tuple(tuple(float(x) for x in turn) for turn in turns.round(4))

@@ -42,8 +42,15 @@ class Method:
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
-    n_typical: int = 0  # usual orientations that the starts begin with, for an animal that turns any side to the camera
-    typical: tuple[tuple[float, ...], ...] = ()  # these: rotation vectors in the frame of the long axis
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotation vector by which starts are turned out of the home pose
+    proposals: GrowthPlan | None = None  # trees that say where a start may be, for an animal of any orientation
+    proposal_reach_mm: float = 0.0  # offsets of their features reach this far from the animal's centre
+    base_rounds: int = 0  # rounds of the base joint where they are not as many as the others'; 0: as many
+    explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
+
+    def rounds_of(self, joint: int) -> int:
+        """Rounds of a joint."""
+        return self.base_rounds or self.rounds if joint == 0 else self.rounds
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card."""
@@ -55,7 +62,9 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
-        plain["typical"] = tuple(tuple(turn) for turn in plain.get("typical", ()))
+        plain["home_turn"] = tuple(plain.get("home_turn", (0.0, 0.0, 0.0)))
+        if plain.get("proposals") is not None:
+            plain["proposals"] = GrowthPlan(**plain["proposals"])
         return Method(**plain)
 
 

@@ -82,7 +82,9 @@ class Model:
         }
         arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)}
         forests = [forest for rounds in self.cascade.forests for forest in rounds]
-        for k, forest in enumerate([*forests, self.metric, *([self.expectation] if self.expectation else [])]):
+        first = [self.cascade.proposals] if self.cascade.proposals else []
+        last = [self.expectation] if self.expectation else []
+        for k, forest in enumerate([*first, *forests, self.metric, *last]):
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
@@ -116,11 +118,13 @@ class Model:
         except _DAMAGE as error:
             raise ModelError(f"{path} is not a whole model file ({error}); train it again or copy it anew") from None
         skeleton = Skeleton.from_table(table, str(path))
-        n = method.rounds
-        n_regressors = n * len(skeleton.solved)
+        rounds = [method.rounds_of(joint) for joint in skeleton.solved]
+        n_regressors = sum(rounds)
+        proposals = forests.pop(0) if method.proposals is not None and forests else None
         if len(forests) not in (n_regressors + 1, n_regressors + 2):
             raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
-        cascade = Cascade(skeleton, method, [forests[k * n : (k + 1) * n] for k in range(len(skeleton.solved))])
+        stops = np.cumsum(rounds).tolist()
+        cascade = Cascade(skeleton, method, [forests[b - n : b] for n, b in zip(rounds, stops, strict=True)], proposals)
         expectation = forests[n_regressors + 1] if len(forests) > n_regressors + 1 else None
         return Model(cascade, forests[n_regressors], expectation, table, calibration, card)
 

@@ -80,8 +80,8 @@ def choose(
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
     """The weighted mean of poses of a tree, on the group: n means over k poses each.
 
-    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the chordal mean rotation and
-    the mean place; every other joint the mean of its turns relative to its parent about the axes that are free, so
+    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the chordal mean rotation
+    and the mean place; every other joint the mean of its turns relative to its parent about the axes that are free, so
     bones keep their lengths and hinges their axes; the scale is the mean scale.
     """
     root = SE3(

@@ -158,7 +158,8 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
     """The ends of a walked surface, where it stops after having stuck out by `least_mm`: rows of tips (MAX_TIPS, 4).
 
     From the far end of the walk inwards, islands appear and grow together; the lower of two islands that meet has stuck
-    out by the difference (its persistence). A row is depth, less for what sticks out far, block row, block column, depth. Returns how many there are now.
+    out by the difference (its persistence). A row is depth, less for what sticks out far, block row, block column,
+    depth. Returns how many there are now.
     """
     parent = np.arange(n)
     for k in range(n - 1, -1, -1):
@@ -341,7 +342,7 @@ def box_of(labels, mark, box):
 
 @njit(cache=True)
 def sight_rotation(x, y, rotation):
-    """T_view_camera's rotation (3, 3) for the line of sight along (x, y, 1): z towards the camera, x as the camera's."""
+    """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as the camera's."""
     length = np.sqrt(x * x + y * y + 1.0)
     up = np.array([-x / length, -y / length, -1.0 / length])
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]
@@ -356,7 +357,7 @@ def sight_rotation(x, y, rotation):
 
 @njit(cache=True)
 def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw):
-    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 without a reading."""
+    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 not read."""
     size = raw.shape[0]
     for r in range(size):
         v = origin[1] + step * r

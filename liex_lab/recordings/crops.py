@@ -54,17 +54,19 @@ class Crops:
 
 
 class Foreground(Protocol):
-    """What finds the animal in the pictures of one camera: `foreground.Scene`, or `nearest.NearestScene`.
-
-    floor: where heights of a recording's results are measured from; area_mm2: the animal's usual area.
-    """
+    """What finds the animal in the pictures of one camera: `foreground.Scene`, or `nearest.NearestScene`."""
 
     @property
-    def camera(self) -> Camera: ...
+    def camera(self) -> Camera:
+        """The camera that looks."""
+
     @property
-    def floor(self) -> Floor: ...
+    def floor(self) -> Floor:
+        """Where heights of a recording's results are measured from."""
+
     @property
-    def area_mm2(self) -> float: ...
+    def area_mm2(self) -> float:
+        """The animal's usual area seen by the camera."""
 
     def extract(
         self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0

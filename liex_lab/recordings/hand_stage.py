@@ -7,11 +7,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body._skin import CAPSULE_RINGS, CAPSULE_SEGMENTS, joined_faces
 from liex_lab.body.capsules import Capsules
 from liex_lab.body.hand_shape import N_ARM_CAPSULES, HandShape, arm_vertices, forearms
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body._skin import CAPSULE_RINGS, CAPSULE_SEGMENTS, joined_faces
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _hand_stage as kernels
 from liex_lab.recordings._sensors import NORMAL

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.hand_shape import HandShape, draw_hands
-from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
@@ -78,7 +77,9 @@ class HandSession(Recording):
         intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n, 4)).copy()
         size = np.broadcast_to(np.array([c.width, c.height]), (n, 2)).copy()
         faces = stage.hand_faces(self.skeleton)
-        return part.pictures(faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)).astype(np.float32)
+        return part.pictures(faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)).astype(
+            np.float32
+        )
 
     def chunks(self, n_frames: int) -> Iterator[list[DepthFrame]]:
         """All frames in lists of `n_frames`, each list made on all threads."""
@@ -258,6 +259,6 @@ def _draw_cameras(
         rows, c = kind == k, sensor.camera
         drawn = sensor.draw(rng, m, np.zeros(m), noise, erosion_px)
         parameters = np.where(rows[:, None], drawn, parameters) if parameters.size else drawn
-        whole = np.concatenate([focal * [c.fx, c.fy], axis + [c.cx, c.cy]], axis=1) / coarse
+        whole = np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
         intrinsics[rows], picture[rows] = whole[rows], (c.width // coarse, max(c.height // coarse, _LEAST_PX))
     return kind, intrinsics, picture, parameters

@@ -51,7 +51,7 @@ class NearestScene:
         if not crops.found.any():
             raise EstimationError(
                 f"no hand was found in {len(sample)} frames spread over the recording: nothing of a hand's size lies "
-                f"between {range_mm[0]:g} and {range_mm[1]:g} mm; check the depth unit and foreground.near_mm and far_mm"
+                f"between {range_mm[0]:g} and {range_mm[1]:g} mm; check the depth unit, foreground.near_mm and far_mm"
             )
         seen = crops.moments[crops.found]
         floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), float(np.median(crops.distance[crops.found])), camera)
