@@ -61,6 +61,13 @@ class Camera(Lens):
         z = np.asarray(depth, float)
         return np.stack([(u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z * np.ones_like(u)], axis=-1)
 
+    def every(self, stride: int) -> Camera:
+        """The camera whose picture is every `stride`-th row and column of this one's."""
+        if stride == 1:
+            return self
+        fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
+        return Camera(fx, fy, cx, cy, -(-self.width // stride), -(-self.height // stride), self.source)
+
     @property
     def matrix(self) -> Array:
         """The intrinsic matrix K (3, 3)."""
@@ -73,4 +80,5 @@ class Camera(Lens):
 
 KINECT_V2 = Camera(365.0, 365.0, 255.5, 211.5, 512, 424, source="typical Kinect v2")
 PRIMESENSE = Camera(575.8, 575.8, 319.5, 239.5, 640, 480, source="typical PrimeSense")
+RAYTRIX_R5 = Camera(2363.0, 2363.0, 511.5, 511.5, 1024, 1024, source="typical Raytrix R5")
 PRIMESENSE_QVGA = Camera(287.9, 287.9, 159.5, 119.5, 320, 240, source="typical PrimeSense at 320 x 240")

@@ -36,7 +36,7 @@ class Recipe:
     """
 
     seed: int = 20
-    n_images: int = 40_960
+    n_images: int = 65_536
     n_calibration: int = 6_144
     degraded_share: float = 0.5
     sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
@@ -80,7 +80,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     from liex_lab.body.skeleton import PRESETS
     from liex_lab.estimation.calibration import calibrate
     from liex_lab.estimation.model import Calibration, Model
-    from liex_lab.estimation.training import train_cascade, train_metric
+    from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
 
     rng = np.random.default_rng(recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
@@ -92,13 +92,14 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     cascade, candidates = train_cascade(data, skeleton, method, rng, tell)
     progress(steps - 2, steps, "growing forests: the learned metric")
     metric = train_metric(data, cascade, candidates, rng)
+    pruner = train_pruner(data, cascade, candidates, rng)
     table = tomllib.loads((PRESETS / f"{skeleton.name}.toml").read_text(encoding="utf-8"))
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
         "images": "rendered from a seed; no recording of an animal was used",
     }  # fmt: skip
-    model = Model(cascade, metric, None, table, Calibration(area_mm2=area), card)
+    model = Model(cascade, metric, None, table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
         unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)

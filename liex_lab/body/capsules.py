@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,12 +22,28 @@ class Capsules:
     """C tapered capsules that move with a skeleton; one body, or a batch (n) of them. Lengths in mm at scale 1.
 
     joints (C, 2): which joints carry the two ends; offsets (..., C, 2, 3): where the ends lie in these joints' frames;
-    radii (..., C, 2) at the ends. The first J - 1 capsules are the skeleton's bones, in order.
+    radii (..., C, 2) at the ends; fur (...) as in `BodyShape`. The first J - 1 capsules are the skeleton's bones, in
+    order.
     """
 
     joints: NDArray[np.int64]
     offsets: Array
     radii: Array
+    fur: Array = field(default_factory=lambda: np.array(0.0))
+
+    def __len__(self) -> int:
+        return len(self.fur)
+
+    def __getitem__(self, index: int | slice | NDArray[np.int64]) -> Capsules:
+        """One body, or some, out of a batch."""
+        return replace(self, offsets=self.offsets[index], radii=self.radii[index], fur=self.fur[index])
+
+    def broadcast(self, n: int) -> Capsules:
+        """A batch (n,) of this one body, or this batch."""
+        if self.fur.ndim == 1 and len(self.fur) == n:
+            return self
+        offsets, radii, fur = (np.broadcast_to(a, (n, *a.shape)).copy() for a in (self.offsets, self.radii, self.fur))
+        return replace(self, offsets=offsets, radii=radii, fur=fur)
 
     @staticmethod
     def of(skeleton: Skeleton) -> Capsules:
@@ -63,11 +79,9 @@ class Capsules:
 
         scale (n,) multiplies the offsets, girth (n,) the radii.
         """
-        n, n_capsules = len(positions), len(self.joints)
-        out = np.empty((n, self.n_vertices, 3))
-        offsets = np.broadcast_to(self.offsets, (n, n_capsules, 2, 3))
-        radii = np.broadcast_to(self.radii, (n, n_capsules, 2))
-        _skin.skin_capsules(rotations, positions, scale, girth, self.joints, offsets, radii, out)
+        body = self.broadcast(len(positions))
+        out = np.empty((len(positions), self.n_vertices, 3))
+        _skin.skin_capsules(rotations, positions, scale, girth, self.joints, body.offsets, body.radii, out)
         return out
 
 

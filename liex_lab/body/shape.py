@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 FAMILIES = ("train", "augmented", "other")
 _WILD_SHARE = 0.6
+_HULL_SHARE = 0.5  # of the wild ones
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class BodyShape:
     def default(skeleton: Skeleton) -> BodyShape:
         """The animal that the skeleton's [surface] table describes."""
         table = skeleton.surface
+        if (skeleton.parents[1:] != np.arange(skeleton.n_joints - 1)).any():
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' has stations, but its joints are not one chain, each the parent "
+                "of the next; give radii_mm instead"
+            )
         try:
             width, height = np.array(table["half_width_mm"], float), np.array(table["half_height_mm"], float)
             blobs = [
@@ -89,6 +95,10 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
         width, height = _foreign(rng, default, stations, n)
     else:
         width, height = _varied(rng, default, stations, wild[:, None])
+    if family == "augmented":
+        free = wild & (rng.random(n) < _HULL_SHARE)
+        hull_width, hull_height = _hulls(rng, default, stations, n)
+        width, height = np.where(free[:, None], hull_width, width), np.where(free[:, None], hull_height, height)
     names = [pair["name"] for pair in skeleton.surface.get("pairs", []) for _ in range(2)]
     blobs = np.broadcast_to(default.blobs, (n, *default.blobs.shape)).copy()
     for b in range(len(names)):
@@ -99,7 +109,7 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
         blobs[:, b, 2] *= height[:, k] / default.half_height[k]
     for name in sorted(set(names)):
         rows = [b for b, other in enumerate(names) if other == name]
-        _vary_pair(rng, blobs, rows, name, family, np.where(wild, 1.6, 1.2))
+        _vary_pair(rng, blobs, rows, name, family, np.where(wild, 1.8, 1.2))
     length = skeleton.length * rng.uniform(0.55, 0.95, n) * (rng.random(n) < 0.75)
     tail = np.stack([length, rng.uniform(1.4, 2.6, n), rng.uniform(0.5, 1.1, n)], axis=-1)
     return BodyShape(width, height, rng.uniform(1.9, 2.7, n), blobs, tail, rng.random(n))
@@ -150,6 +160,27 @@ def _varied(
     width = width * girth * draw(0.90, 1.10) * (1.0 + belly) * neck * head
     height = height * girth * draw(0.88, 1.12) * (1.0 + 0.5 * belly) * np.sqrt(neck) * head * hunch
     return width, height
+
+
+def _hulls(rng: np.random.Generator, default: BodyShape, stations: Array, n: int) -> tuple[Array, Array]:
+    """Half widths and heights (n, R) of bodies that owe the default profile nothing: any smooth closed outline whose
+    rear is broader than its snout, with a waist, a neck, both or neither.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    u = (stations - stations[0]) / (stations[-1] - stations[0])
+    knots = np.array([0.0, 0.06, 0.18, 0.32, 0.46, 0.60, 0.72, 0.82, 0.92, 1.0])
+    low = np.array([0.0, 0.30, 0.65, 0.80, 0.75, 0.60, 0.45, 0.35, 0.18, 0.0])
+    high = np.array([0.0, 0.75, 1.00, 1.05, 1.05, 1.05, 1.00, 0.85, 0.55, 0.0])
+    # one draw for the whole body and one for each place: fat noses go with fat necks, but not always
+    whole = rng.random((n, 1))
+    share = np.clip(0.6 * whole + 0.4 * rng.random((n, len(knots))), 0.0, 1.0)
+    # square roots are drawn through the knots, so that both ends close round as an ellipse does
+    outline = np.maximum(PchipInterpolator(knots, (low + share * (high - low)) ** 2, axis=1)(u), 0.0) ** 0.5
+    outline /= outline.max(axis=1, keepdims=True)
+    width = default.half_width.max() * np.exp(rng.uniform(np.log(0.65), np.log(1.4), (n, 1))) * outline
+    ratio = default.half_height.max() / default.half_width.max() * rng.uniform(0.75, 1.2, (n, 1))
+    return width, width * ratio * _waves(rng, stations, n, 0.05)
 
 
 def _reread(stations: Array, snout: Array, rump: Array) -> Array:

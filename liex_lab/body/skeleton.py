@@ -71,6 +71,9 @@ class View:
         return View(frame, lengths["behind_mm"], lengths["smooth_mm"], (float(area[0]), float(area[1])), foreground)
 
 
+MOUSE_VIEW = View()
+
+
 @dataclass(frozen=True)
 class Skeleton:
     """Joints of an animal in its home pose: straight, seen from above, base joint at the origin.

@@ -21,6 +21,7 @@ from liex_lab.geometry import SE3
 from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
+Body = BodyShape | Capsules
 Window = tuple[int, int, int, int]
 
 
@@ -69,7 +70,7 @@ class Surface:
     def vertices(
         self,
         pose: Pose,
-        shape: BodyShape | None = None,
+        shape: Body | None = None,
         girth: Array | float | None = None,
         bends: Array | None = None,
         parallel: bool = True,
@@ -87,12 +88,13 @@ class Surface:
         size = np.broadcast_to(pose.scale if girth is None else girth, batch).astype(float).reshape(n)
         rotations = np.ascontiguousarray(frames.rotation).reshape(n, self.skeleton.n_joints, 3, 3)
         if self.capsules is not None:
+            flesh = shape if isinstance(shape, Capsules) else self.capsules
             scale = np.broadcast_to(pose.scale, batch).astype(float).reshape(n)
             with threads(parallel):
-                return self.capsules.vertices(rotations, joints, scale, size).reshape(*batch, -1, 3)
+                return flesh.vertices(rotations, joints, scale, size).reshape(*batch, -1, 3)
         assert self.shape is not None
         out = np.empty((n, self.n_vertices, 3))
-        body = (self.shape.bare() if shape is None else shape).broadcast(n)
+        body = (shape if isinstance(shape, BodyShape) else self.shape.bare()).broadcast(n)
         turns = np.zeros((n, _skin.TAIL_RINGS)) if bends is None else np.asarray(bends, float)
         skin = _skin.skin_tubes_parallel if parallel and n > 16 else _skin.skin_tubes
         skin(joints, rotations, size, self.stations, body.half_width, body.half_height, body.power, body.blobs,

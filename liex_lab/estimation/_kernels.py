@@ -51,8 +51,11 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     scalars[6] = _MM_UNIT * position[2] / size
     scalars[7] = _LOG_UNIT * rotation[2, 0]
     scalars[8] = _LOG_UNIT * rotation[2, 1]
-    turn = moments[5] - np.arctan2(rotation[1, 0], rotation[0, 0])
-    scalars[9] = _LOG_UNIT * np.sin(2.0 * turn) * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
+    # the sine of twice the angle from the joint's heading to the long axis, without asking for the heading's angle
+    c, s = rotation[0, 0], rotation[1, 0]
+    norm = max(c * c + s * s, 1e-12)
+    twice = np.sin(2.0 * moments[5]) * (c * c - s * s) - np.cos(2.0 * moments[5]) * 2.0 * s * c
+    scalars[9] = _LOG_UNIT * twice / norm * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
     scalars[10] = _LOG_UNIT * np.log(scale / size)
 
 

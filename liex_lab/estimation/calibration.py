@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
-from liex_lab.estimation.scoring import choose, clue_samples
+from liex_lab.estimation.scoring import LEAST_MM, choose, clue_samples
 from liex_lab.estimation.training import TrainingSet, quantised
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
@@ -17,7 +17,7 @@ from liex_lab.recordings.foreground import Crops
 
 Array = NDArray[np.float64]
 
-_CAP_MM = 25.0  # at home size; a lost pose must not decide what an ordinary score means
+_CAP_MM = 25.0  # at the reference length; a lost pose must not decide what an ordinary score means
 _SIZE_SD = 0.05  # how far off (log) the size of a session is, once it has been estimated over many frames
 _DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
 _GROUP = 50  # images share a size guess, as the frames of a recording do
@@ -61,9 +61,9 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
         scores_of.append(picked.score)
         spreads.append(picked.spread)
         joint_errors.append(off / size)
-        clues.append(clue_samples(picked, moments, looks, size).scalars)
+        clues.append(clue_samples(picked, skeleton, moments, looks, size).scalars)
     scalars = np.concatenate(clues)
-    blank = clue_samples(picked, moments, looks, size)
+    blank = clue_samples(picked, skeleton, moments, looks, size)
     n = len(scalars)
     samples = Samples(
         blank.heights, np.zeros(n, np.int32), np.ones(n, np.float32),
@@ -89,14 +89,14 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     """
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
-    target = np.minimum(error, _CAP_MM)[:, None].astype(np.float32)
+    target = np.minimum(error, _CAP_MM * model.skeleton.relative_size)[:, None].astype(np.float32)
     n = len(error)
     fold, predicted = rng.permutation(n) % _FOLDS, np.empty(n)
     for k in range(_FOLDS):
         seen, unseen = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
         forest = boost_forest(_rows(trial.clues, seen), target[seen], _EXPECTATION, _SHRINKAGE, rng)
         predicted[unseen] = predict(forest, _rows(trial.clues, unseen))[:, 0]
-    predicted = np.maximum(predicted, 0.1)
+    predicted = np.maximum(predicted, LEAST_MM * model.skeleton.relative_size)
     low, high = np.quantile(error / predicted, [0.05, 0.95])
     expectation = quantised(boost_forest(_rows(trial.clues, np.arange(n)), target, _EXPECTATION, _SHRINKAGE, rng))
     design = np.stack([np.ones(n), trial.score, trial.spread], axis=1)

@@ -20,6 +20,7 @@ from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
 from liex_lab.estimation.training import base_at_front
+from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
 from liex_lab.recordings.crops import Crops, Foreground, view_of
 from liex_lab.threads import threads
@@ -28,7 +29,8 @@ Array = NDArray[np.float64]
 
 _START_SEED = 20170125
 _SIZE_PASSES = 8  # of estimating the size with the size just found; each goes about a third of the way
-_MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error
+_MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error, at
+# the reference length
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class PoseEstimator:
 
     model: Model
     n_candidates: int = 0  # 0: as the model's method says
+    unpruned: bool = False  # all candidates run the whole chain
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
@@ -61,34 +64,33 @@ class PoseEstimator:
         return self.model.skeleton
 
     @cached_property
-    def _packed(self) -> tuple[NDArray[np.generic], ...]:
-        """All regressors in one node array: nodes, roots (F, T), leaves, leaf base (F,) and width (F,) of each."""
-        forests = [forest for rounds in self.model.cascade.forests for forest in rounds]
-        nodes, roots, leaves, bases, widths = [], [], [], [], []
-        n_nodes = n_leaves = 0
-        for forest in forests:
-            shifted = forest.nodes.copy()
-            shifted[shifted[:, 2] >= 0, 2] += n_nodes
-            nodes.append(shifted)
-            roots.append(forest.roots + n_nodes)
-            leaves.append(forest.leaves.ravel())
-            bases.append(n_leaves)
-            widths.append(forest.leaves.shape[1])
-            n_nodes += len(forest.nodes)
-            n_leaves += forest.leaves.size
-        metric = self.model.metric
-        return (
-            np.concatenate(nodes), np.stack(roots), np.concatenate(leaves), np.array(bases), np.array(widths),
-            metric.nodes, metric.roots, metric.leaves.ravel(),
+    def _packed(self) -> tuple[kernels.Trees, kernels.Trees, kernels.Trees]:
+        """Regressors, pruner and metric as the kernels want them."""
+        model = self.model
+        regressors = [forest for rounds in model.cascade.forests for forest in rounds]
+        return _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
+
+    @cached_property
+    def _chain(self) -> kernels.Chain:
+        s = self.skeleton
+        return kernels.Chain(s.parents, s.offsets, s.rest, s.axes, np.array(s.solved))
+
+    def _tuning(self, n_starts: int) -> kernels.Tuning:
+        method = self.model.method
+        keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
+        return kernels.Tuning(
+            method.rounds_of(0), method.rounds, method.reach_mm,
+            np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
+            min(keep or n_starts, n_starts),
         )  # fmt: skip
 
     @cached_property
-    def _balls(self) -> tuple[float, NDArray[np.int64], Array, Array, Array]:
-        """The body that candidates are held against the picture with, as kernels take it; nothing where none is."""
+    def _body(self) -> kernels.Body:
+        """The body that candidates are held against the picture with."""
         if not self.model.method.explains:
-            return 1.0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0)
+            return kernels.Body(1.0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
         b = self.model.cascade.balls
-        return b.unit_mm, b.joints, b.offsets, b.share, b.radius
+        return kernels.Body(b.unit_mm, b.joints, b.offsets, b.share, b.radius)
 
     @cached_property
     def _starts(self) -> Array:
@@ -100,33 +102,30 @@ class PoseEstimator:
     def candidates(
         self, crops: Crops, looks: Array, size: float, parallel: bool = True
     ) -> tuple[Array, Array, Array, Array]:
-        """All candidates of n frames in their view frames: rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scales
-        (n, K), and the metric's scores (n, K), mm at home size.
+        """The candidates of n frames that outlive the base joint, in their view frames: rotations (n, K, J, 3, 3),
+        positions (n, K, J, 3) mm, scales (n, K), and the metric's scores (n, K), mm at home size.
         """
         method, skeleton = self.model.method, self.skeleton
         n, k = len(looks), self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
             crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
-            method.home_turn,
+            method.camera_view, method.home_turn,
         )  # fmt: skip
         if self.model.cascade.proposals is not None:
             images = ImageSet(crops.heights, looks, crops.moments)
             base_rotation, base_position = propose(self.model.cascade.proposals, images, sizes[:, 0], method)
-        rotations = np.zeros((n, k, skeleton.n_joints, 3, 3))
-        positions = np.zeros((n, k, skeleton.n_joints, 3))
-        rotations[:, :, 0], positions[:, :, 0] = base_rotation, base_position
-        scores = np.full((n, k), np.inf)
+        tuning = self._tuning(k)
+        starts = np.ascontiguousarray(base_rotation[:, :, None]), base_position[:, :, None].copy(), scales
+        rotations = np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3))
+        positions = np.zeros((n, tuning.keep, skeleton.n_joints, 3))
+        poses = rotations, positions, np.zeros((n, tuning.keep)), np.full((n, tuning.keep), np.inf)
         with threads(parallel):
             kernels.estimate_all(
-                crops.heights, looks, crops.moments, crops.found, size, skeleton.parents, skeleton.offsets,
-                skeleton.rest, skeleton.axes, np.array(skeleton.solved),
-                np.array([method.rounds_of(0), method.rounds]), method.reach_mm,
-                np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
-                method.explains, *self._balls,
-                *self._packed, rotations, positions, scales, scores,
+                crops.heights, looks, crops.moments, np.flatnonzero(crops.found), size, self._chain, *self._packed,
+                tuning, self._body, starts, poses,
             )  # fmt: skip
-        return rotations, positions, scales, scores
+        return poses
 
     def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
@@ -161,7 +160,8 @@ class PoseEstimator:
 
         Told by area and volume and, where the metric has learned what is no animal, by its scores first, second (n,).
         """
-        likeness = [_MM_PER_MISFIT * scene.misfit(scene.extract(depths, size, rank=rank)) for rank in (0, 1)]
+        weight = _MM_PER_MISFIT * self.skeleton.relative_size
+        likeness = [weight * scene.misfit(scene.extract(depths, size, rank=rank)) for rank in (0, 1)]
         if not self.model.method.metric_on_own:
             return likeness[1] < likeness[0]
         return second + likeness[1] < first + likeness[0]
@@ -188,6 +188,22 @@ class PoseEstimator:
     def size_from_area(self, area_mm2: float) -> float:
         """A first guess of the size from the animal's usual area."""
         return float(np.sqrt(area_mm2 / self.model.calibration.area_mm2))
+
+
+def _pack(forests: list[Forest]) -> kernels.Trees:
+    """Forests of equally many trees in one node array; their leaves, of different widths, in one row of numbers."""
+    nodes, roots, n_nodes = [], [], 0
+    for forest in forests:
+        shifted = forest.nodes.copy()
+        shifted[shifted[:, 2] >= 0, 2] += n_nodes
+        nodes.append(shifted)
+        roots.append(forest.roots + n_nodes)
+        n_nodes += len(forest.nodes)
+    sizes = np.array([forest.leaves.size for forest in forests])
+    return kernels.Trees(
+        np.concatenate(nodes), np.stack(roots), np.concatenate([forest.leaves.ravel() for forest in forests]),
+        np.cumsum(sizes) - sizes, np.array([forest.leaves.shape[1] for forest in forests]),
+    )  # fmt: skip
 
 
 def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Chosen:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import REFERENCE_MM
 from liex_lab.geometry import so3
 
 Array = NDArray[np.float64]
 
 _BEHIND = 0.42  # of the body length: the base starts this far from the centroid, towards the end it belongs to
 _HIGH = 0.2  # of the body length: the base starts this high above the floor
+_LOW = 0.05  # of the body length: the base of an animal in the camera view starts this far below its mean height
 _JITTER = (0.12, 0.7)  # rad: spread of the headings of a long thin animal, and what a round one adds
+_JITTER_MM = 2.0  # of the places, for an animal of the reference length
 
 
 def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> Array:
@@ -23,34 +26,37 @@ def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> A
 
 def start_poses(
     moments: Array, starts: Array, size: Array, home_length: float, base_at_front: bool, axis_start: bool,
-    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
+    camera_view: bool = False, home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n animals.
 
     moments (n, 8) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of the animal over home.
     axis_start: along the animal's long axis, every other start the other way round, the more spread out the rounder
     the animal looks (METHOD lesson 8). Otherwise the paper's start: any heading in (-pi, pi), the base at the centroid
-    and at the animal's mean height, bones scaled by 0.9 to 1.1. home_turn: rotation vector by which the home pose lies
-    otherwise than seen from above, as a palm that is shown.
+    and at the animal's mean height, bones scaled by 0.9 to 1.1. camera_view: heights are not those above a floor.
+    home_turn: rotation vector by which the home pose lies otherwise than seen from above, as a palm that is shown.
     """
     n, k = size.shape
     starts = np.broadcast_to(starts, (n, k, 4))
     centre = moments[:, None, 3:5]
     position = np.empty((n, k, 3))
+    mean_height = (moments[:, 2] / np.maximum(moments[:, 1], 1.0))[:, None]
     if axis_start:
+        jitter = _JITTER_MM * round(home_length / REFERENCE_MM, 6)
         roundness = moments[:, 7] / np.maximum(moments[:, 6], 1e-6)
         spread = _JITTER[0] + _JITTER[1] * roundness**2
         heading = moments[:, None, 5] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
         scale = size.copy()
         behind = _BEHIND * home_length * scale * (-1.0 if base_at_front else 1.0)
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        position[..., :2] = centre - behind[..., None] * direction + 2.0 * scale[..., None] * starts[..., 1:3]
-        position[..., 2] = _HIGH * home_length * scale
+        position[..., :2] = centre - behind[..., None] * direction + jitter * scale[..., None] * starts[..., 1:3]
+        high = _HIGH * home_length * scale
+        position[..., 2] = mean_height - _LOW * home_length * scale if camera_view else high
     else:
         heading = np.pi * starts[..., 3]
         scale = size * (1.0 + 0.1 * np.clip(starts[..., 1] / 2.0, -1.0, 1.0))
         position[..., :2] = centre
-        position[..., 2] = (moments[:, 2] / np.maximum(moments[:, 1], 1.0))[:, None]
+        position[..., 2] = mean_height
     rotation = np.zeros((n, k, 3, 3))
     rotation[..., 0, 0], rotation[..., 0, 1] = np.cos(heading), -np.sin(heading)
     rotation[..., 1, 0], rotation[..., 1, 1] = np.sin(heading), np.cos(heading)

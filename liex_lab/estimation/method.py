@@ -42,6 +42,8 @@ class Method:
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
+    survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
+    pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
     home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotation vector by which starts are turned out of the home pose
     proposals: GrowthPlan | None = None  # trees that say where a start may be, for an animal of any orientation
     proposal_reach_mm: float = 0.0  # offsets of their features reach this far from the animal's centre
@@ -62,6 +64,8 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
+        if plain.get("pruner"):
+            plain["pruner"] = GrowthPlan(**plain["pruner"])
         plain["home_turn"] = tuple(plain.get("home_turn", (0.0, 0.0, 0.0)))
         if plain.get("proposals") is not None:
             plain["proposals"] = GrowthPlan(**plain["proposals"])
@@ -72,13 +76,14 @@ _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
     "default": Method(
-        variant="default", rounds=5, n_candidates=10, training_candidates=8,
+        variant="default", rounds=5, n_candidates=16, training_candidates=8,
         regressors=GrowthPlan(12, 18, 22, 100, 0.3, 0.15, 0.3, 0.63),
         metric=GrowthPlan(80, 9, 50, 100, 0.45, 0.1, 0.3, 0.5),
         reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
         keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
         metric_shrinkage=0.15, mean_shift_mm=0.0,
         top_k=10, top_tau=1.0, top_radius_mm=15.0,
+        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
     ),
     "paper": Method(
         variant="paper", rounds=3, n_candidates=40, training_candidates=6,
@@ -91,13 +96,26 @@ METHODS = {
 }  # fmt: skip
 
 
+# a hand may turn any side to the camera, and its fingers' bones are short beside their distance from the base
+_HAND: dict[str, Any] = {
+    "camera_view": False, "rounds": 3, "base_rounds": 6, "n_candidates": 24, "training_candidates": 6,
+    "regressors": GrowthPlan(10, 16, 12, 60, 0.3, 0.15, 0.4, 0.63),
+    "metric": GrowthPlan(60, 9, 40, 100, 0.35, 0.3, 0.4, 0.5),
+    "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63), "proposal_reach_mm": 100.0, "explains": True,
+    "reach_mm": 60.0, "base_lever_mm": 65.0, "joint_lever_mm": 40.0, "scale_lever_mm": 60.0, "keep_turned": 1.3,
+    "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0, "survivors": 0, "pruner": None,
+}  # fmt: skip
+
+
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("fish", "paper"): {
         "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
     },
+    ("hand", "default"): _HAND,
     ("hand", "paper"): {
         "n_candidates": 20, "reach_mm": 50.0, "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        "home_turn": (3.1416, 0.0, 0.0),  # the palm is shown
     },
 }  # fmt: skip
 _LENGTHS = (

@@ -20,7 +20,8 @@ from liex_lab.estimation.cascade import Cascade
 from liex_lab.estimation.method import Method
 from liex_lab.forests.forest import Forest
 
-SCHEMA = 1
+SCHEMA = 2
+_FORESTS = ("metric", "expectation", "pruner", "proposals")  # that follow the regressors, as far as a model has them
 _DAMAGE = (
     OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
     lzma.LZMAError,
@@ -51,7 +52,8 @@ class Calibration:
 class Model:
     """Everything an estimator needs.
 
-    expectation turns what is known of a chosen pose into its expected error; card says how the model was made.
+    expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
+    is the small metric that sees the base joint only.
     """
 
     cascade: Cascade
@@ -60,6 +62,7 @@ class Model:
     skeleton_table: dict[str, Any]
     calibration: Calibration = field(default_factory=Calibration)
     card: dict[str, Any] = field(default_factory=dict)
+    pruner: Forest | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -71,20 +74,26 @@ class Model:
         """The variant of the method."""
         return self.cascade.method
 
+    @property
+    def proposals(self) -> Forest | None:
+        """What says where starts may be."""
+        return self.cascade.proposals
+
     def to_bytes(self) -> bytes:
         """The model file's content; equal models give equal bytes."""
+        extra = [name for name in _FORESTS if getattr(self, name) is not None]
         head = {
             "schema": SCHEMA,
             "method": self.method.to_dict(),
             "skeleton": self.skeleton_table,
             "calibration": vars(self.calibration),
             "card": self.card,
+            "forests": extra,
         }
         arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)}
         forests = [forest for rounds in self.cascade.forests for forest in rounds]
-        first = [self.cascade.proposals] if self.cascade.proposals else []
-        last = [self.expectation] if self.expectation else []
-        for k, forest in enumerate([*first, *forests, self.metric, *last]):
+        forests += [getattr(self, name) for name in extra]
+        for k, forest in enumerate(forests):
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
@@ -120,13 +129,14 @@ class Model:
         skeleton = Skeleton.from_table(table, str(path))
         rounds = [method.rounds_of(joint) for joint in skeleton.solved]
         n_regressors = sum(rounds)
-        proposals = forests.pop(0) if method.proposals is not None and forests else None
-        if len(forests) not in (n_regressors + 1, n_regressors + 2):
+        extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
+        if len(forests) != n_regressors + len(extra) or "metric" not in extra:
             raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
+        named = dict(zip(extra, forests[n_regressors:], strict=True))
         stops = np.cumsum(rounds).tolist()
-        cascade = Cascade(skeleton, method, [forests[b - n : b] for n, b in zip(rounds, stops, strict=True)], proposals)
-        expectation = forests[n_regressors + 1] if len(forests) > n_regressors + 1 else None
-        return Model(cascade, forests[n_regressors], expectation, table, calibration, card)
+        each = [forests[stop - n : stop] for n, stop in zip(rounds, stops, strict=True)]
+        cascade = Cascade(skeleton, method, each, named.get("proposals"))
+        return Model(cascade, named["metric"], named.get("expectation"), table, calibration, card, named.get("pruner"))
 
     def digest(self) -> str:
         """SHA-256 of the model file."""

@@ -17,7 +17,9 @@ from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
 
-_NO_OPPOSITE_MM = 40.0  # stands for the score of the opposite direction where no candidate points there
+# at the reference length: the least error that is ever expected, and what stands for the score of the opposite
+# direction where no candidate points there
+LEAST_MM, _NO_OPPOSITE_MM = 0.1, 40.0
 
 
 @dataclass(frozen=True)
@@ -69,11 +71,11 @@ def choose(
     mean_score = np.sum(weight * score, axis=1)
     spread = np.sqrt(variance.mean(axis=1)) / size
     expected = calibration.offset + calibration.slope * mean_score + calibration.spread_slope * spread
-    expected = np.maximum(expected, 0.1) * size
+    expected = np.maximum(expected, LEAST_MM * skeleton.relative_size) * size
     share = np.array(calibration.joint_share or (1.0,) * skeleton.n_joints)
     sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
-    doubts = _doubts(positions, scores, mean, score, size)
+    doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
     return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts)
 
 
@@ -98,11 +100,11 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
     return Pose(root, angles, scale)
 
 
-def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float) -> Array:
+def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float) -> Array:
     """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good scores (n, k)."""
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
-    opposite = np.where(backwards, scores, _NO_OPPOSITE_MM).min(axis=1)
+    opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
     off = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
     return np.stack([scores.min(axis=1), opposite, good.std(axis=1), off], axis=1)
 
@@ -112,25 +114,28 @@ def with_expected_error(chosen: Chosen, model: Model, moments: Array, looks: Arr
     if model.expectation is None or not len(chosen.score):
         return chosen
     n = len(chosen.score)
-    samples = clue_samples(chosen, moments, looks, size)
-    error = np.maximum(predict(model.expectation, samples)[:n, 0].astype(float), 0.1) * size
+    samples = clue_samples(chosen, model.skeleton, moments, looks, size)
+    least = LEAST_MM * model.skeleton.relative_size
+    error = np.maximum(predict(model.expectation, samples)[:n, 0].astype(float), least) * size
     scale = error / chosen.error_mm
     return replace(chosen, error_mm=error, sd_mm=chosen.sd_mm * scale[:, None])
 
 
-def clue_samples(chosen: Chosen, moments: Array, looks: Array, size: float) -> Samples:
+def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Array, size: float) -> Samples:
     """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
 
-    Scores and doubts; the posture; how large, round and high the animal looks; how many millimetres a pixel covers.
+    Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high
+    the animal looks; how many millimetres a pixel covers.
     """
     pose = chosen.pose
-    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / size
+    unit, whole = skeleton.relative_size, size * skeleton.relative_size
+    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / whole
     clues = np.stack(
         [
-            chosen.score, chosen.spread, *chosen.doubts.T, 10 * pose.root.rotation[:, 2, 0],
+            chosen.score / unit, chosen.spread / unit, *chosen.doubts.T / unit, 10 * pose.root.rotation[:, 2, 0],
             10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
             5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
-            moments[:, 6] / size, moments[:, 7] / size, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
+            moments[:, 6] / whole, moments[:, 7] / whole, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
         ],
         axis=1,
     )  # fmt: skip

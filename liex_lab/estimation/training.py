@@ -20,7 +20,10 @@ from liex_lab.geometry import SE3, so3
 Array = NDArray[np.float64]
 Tell = Callable[[float, str], None]  # share done, what is being done
 
-_ERROR_CAP_MM = 30.0  # a pose worse than this is simply wrong; how wrong is not worth learning
+# at the reference length: a pose worse than this is simply wrong; how wrong is not worth learning
+_ERROR_CAP_MM = 30.0
+_FEW_JOINTS = 3
+_PRUNER_SHRINKAGE = 0.3
 _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 
 
@@ -90,7 +93,7 @@ def start_candidates(
         size = np.ones((m, k))
     rotation, position, scale = start_poses(
         data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start,
-        method.home_turn,
+        method.camera_view, method.home_turn,
     )  # fmt: skip
     if seen is not None:
         bases, places = propose(seen.forest, data.images, data.size, method)
@@ -150,14 +153,17 @@ def perturbed_truth(data: TrainingSet, cascade: Cascade, rng: np.random.Generato
     image = np.repeat(np.flatnonzero(data.animal).astype(np.int32), n_each)
     size = np.ones(len(image)) if not cascade.method.session_size else data.size[image]
     strength = rng.uniform(0.0, 1.0, len(image))[:, None]
-    twist = rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, 8.0, 8.0, 8.0]) * strength
+    off = 8.0 * skeleton.relative_size
+    twist = rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, off, off, off]) * strength
     base = SE3(data.truth.rotations[image, 0], data.truth.positions[image, 0]) @ SE3.exp(twist)
     candidates = Candidates.start(skeleton, image, base.rotation, base.translation, data.truth.scale[image], size)
+    # a long chain bends no more as a whole than a short one
+    bent = 0.35 * np.sqrt(min(1.0, _FEW_JOINTS / max(1, len(skeleton.solved) - 1)))
     for joint in range(1, j):
         cascade.place(candidates, joint)
         parent = skeleton.parents[joint]
         true = np.swapaxes(data.truth.rotations[image, parent], 1, 2) @ data.truth.rotations[image, joint]
-        turn = 0.35 * strength * rng.standard_normal((len(image), 3)) * skeleton.axes[joint]
+        turn = bent * strength * rng.standard_normal((len(image), 3)) * skeleton.axes[joint]
         candidates.rotations[:, joint] = candidates.rotations[:, parent] @ true @ so3.exp(turn)
     return candidates
 
@@ -169,9 +175,24 @@ def train_metric(data: TrainingSet, cascade: Cascade, candidates: Candidates, rn
     """
     if not cascade.method.metric_on_own:
         candidates = perturbed_truth(data, cascade, rng)
-    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM)
+    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
     samples = cascade.metric_samples(data.images, candidates)
     labels, method = error[:, None].astype(np.float32), cascade.method
     if method.metric_shrinkage > 0:
         return quantised(boost_forest(samples, labels, method.metric, method.metric_shrinkage, rng))
     return quantised(grow_forest(samples, labels, np.ones(len(candidates), np.bool_), method.metric, rng)[0])
+
+
+def train_pruner(
+    data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
+) -> Forest | None:
+    """The small metric that tells from the base joint alone how far off the whole pose will be (METHOD lesson 9).
+
+    The base has not moved since its own rounds, so the cascade's final candidates are its examples, too.
+    """
+    plan = cascade.method.pruner
+    if plan is None:
+        return None
+    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
+    samples = cascade.samples(data.images, candidates, [0])
+    return quantised(boost_forest(samples, error[:, None].astype(np.float32), plan, _PRUNER_SHRINKAGE, rng))

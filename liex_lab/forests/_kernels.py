@@ -27,10 +27,14 @@ VIEW = 9
 
 @njit(cache=True, inline="always")
 def probe(heights, view, a, b, c):
-    """Height in the map (S, S) under offset (a, b, c); a probe outside reads the border, which is background."""
+    """Height in the map (S, S) under offset (a, b, c); a probe outside reads the border, which is background.
+
+    In float32, and in this order, as `_walk` has it: a forest then sees the same wherever it is asked.
+    """
     limit = heights.shape[0] - 1
-    column = int(view[0] + view[2] * a + view[3] * b + view[4] * c + 0.5)
-    row = int(view[1] + view[5] * a + view[6] * b + view[7] * c + 0.5)
+    x, y, z, half = np.float32(a), np.float32(b), np.float32(c), np.float32(0.5)
+    column = int(((view[0] + half) + view[2] * x) + view[3] * y + view[4] * z)
+    row = int(((view[1] + half) + view[5] * x) + view[6] * y + view[7] * z)
     column = min(max(column, 0), limit)
     row = min(max(row, 0), limit)
     return heights[row, column]
@@ -79,9 +83,7 @@ def pack_offsets(u, v, threshold):
         | ((np.int32(u[2]) & 0xFF) << 16)
         | ((np.int32(v[0]) & 0xFF) << 24)
     )
-    word1 = (
-        (np.int32(v[1]) & 0xFF) | ((np.int32(v[2]) & 0xFF) << 8) | ((np.int32(threshold) & 0xFFFF) << 16)
-    )
+    word1 = (np.int32(v[1]) & 0xFF) | ((np.int32(v[2]) & 0xFF) << 8) | ((np.int32(threshold) & 0xFFFF) << 16)
     return np.int32(word0), np.int32(word1)
 
 
@@ -99,29 +101,3 @@ def next_random(state):
 def random_below(state, n):
     """A random integer of 0 .. n - 1."""
     return np.int64((next_random(state) >> np.uint64(33)) % np.uint64(n))
-
-
-@njit(cache=True)
-def descend_many(nodes, root, heights, inverse_size, views, scalars, at, active, leaf):
-    """The leaf of each of K samples of one height map in one tree: all take one step together.
-
-    The reads of different samples overlap, which one sample after the other cannot (METHOD 2.7). views (K, V, 9),
-    scalars (K, n); at and active (K,) int64 are scratch; leaf (K,) int64 gets the answers.
-    """
-    n = views.shape[0]
-    for k in range(n):
-        at[k] = root
-        active[k] = k
-    while n > 0:
-        i = 0
-        while i < n:
-            k = active[i]
-            node = nodes[at[k]]
-            if node[2] < 0:
-                leaf[k] = -node[2] - 1
-                n -= 1
-                active[i] = active[n]
-                continue
-            value = response(heights, inverse_size, views[k], scalars[k], node[0], node[1], node[3])
-            at[k] = node[2] + (value >= (node[1] >> 16))
-            i += 1

@@ -14,8 +14,8 @@ from liex_lab.recordings.times import Gap
 __all__ = ["DepthFrame", "Gap", "Recording", "open_recording"]
 
 _READS = (
-    "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz) "
-    "or an MCAP file with Foxglove depth pictures"
+    "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz), "
+    "a PrimeSense recording (.oni) or an MCAP file with Foxglove depth pictures"
 )
 _ARCHIVES = (".tar.gz", ".tgz", ".tar")
 _PICTURES = (".png", ".tif", ".tiff")
@@ -31,9 +31,7 @@ _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG picture
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".avi", ".mov", ".webm"), _EIGHT_BIT),
-    **dict.fromkeys(
-        (".oni", ".bag", ".db3", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET
-    ),
+    **dict.fromkeys((".bag", ".db3", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
 
 
@@ -94,6 +92,10 @@ def _open(path: Path, camera: Lens | None, fps: float | None, topic: str | None,
         from liex_lab.recordings.mcap import open_mcap
 
         return open_mcap(path, camera, fps, progress, topic)
+    if name.endswith(".oni"):
+        from liex_lab.recordings.primesense import open_oni
+
+        return open_oni(path, camera, fps, progress)
     why = _NOT_READ.get(path.suffix.lower())
     raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")
 
@@ -120,7 +122,7 @@ def _open_folder(
         from liex_lab.recordings.images import open_images
 
         return open_images(folder, camera, fps, progress)
-    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap"))]
+    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap", ".oni"))]
     if len(files) == 1:
         return _open(folder / files[0], camera, fps, topic, progress)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]

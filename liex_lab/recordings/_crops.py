@@ -7,7 +7,6 @@ from numba import njit, prange
 
 from liex_lab.recordings import _segment as segment
 
-BEHIND_MM = 120.0  # the camera view's background lies this far behind the animal's mean depth
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
@@ -53,10 +52,13 @@ def choose_blob(blobs, n_blobs, area, mm2_per_px, rank):
 
 @njit(cache=True)
 def extract_one(
-    depth, limit, on_floor, area, rank, size, intrinsics, plane, rotation, camera_view, heights, origin, n_steps, n_px,
-    moments, distance, n_blobs, k,
+    depth, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
+    n_px, moments, distance, n_blobs, k,
 ):  # fmt: skip
-    """Find the animal in one frame and fill row k of the batch; distance[k] comes in as the floor's."""
+    """Find the animal in one frame and fill row k of the batch; distance[k] comes in as the floor's.
+
+    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth.
+    """
     labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
     blobs = np.empty((segment.MAX_BLOBS, 7))
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
@@ -67,20 +69,20 @@ def extract_one(
     blob = blobs[slot]
     mean_depth = blob[5] / blob[0]
     view_plane = plane
-    if camera_view:
-        distance[k] = mean_depth + BEHIND_MM
+    if behind_mm > 0.0:
+        distance[k] = mean_depth + behind_mm
         view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
-    cut_crop(depth, limit, labels, slot, blob, mean_depth, size, intrinsics, view_plane, distance[k], rotation,
+    cut_crop(depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, view_plane, distance[k], rotation,
              heights, origin, n_steps, moments, k)  # fmt: skip
     n_px[k] = int(blob[0])
 
 
 @njit(cache=True)
 def cut_crop(
-    depth, limit, labels, slot, blob, mean_depth, size, intrinsics, plane, distance, rotation, heights, origin,
+    depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, distance, rotation, heights, origin,
     n_steps, moments, k,
 ):  # fmt: skip
-    """The blob's height map, smoothed over about 2 mm of a home-sized animal, and its moments, into row k."""
+    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k."""
     crop = heights.shape[1]
     v0, v1 = blob[1] * segment.BLOCK, (blob[2] + 1) * segment.BLOCK
     u0, u1 = blob[3] * segment.BLOCK, (blob[4] + 1) * segment.BLOCK
@@ -91,27 +93,27 @@ def cut_crop(
     n_steps[k] = step
     raw = np.empty((crop, crop), np.float32)
     segment.cut_heights(depth, limit, labels, slot, plane, distance, origin[k], step, raw)
-    segment.keep_largest(raw, np.empty((crop, crop), np.int32), np.empty((crop * crop, 2), np.int32))
+    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
-    radius = min(3, max(1, int(2.0 * size / mm_per_px + 0.5)))
+    radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])
     segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance, moments[k])
 
 
 @njit(cache=True, parallel=True)
 def extract_all(
-    depths, limit, on_floor, area, rank, size, intrinsics, plane, rotation, camera_view, heights, origin, n_steps, n_px,
-    moments, distance, n_blobs,
+    depths, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
+    n_px, moments, distance, n_blobs,
 ):  # fmt: skip
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], limit, on_floor, area, rank, size, intrinsics, plane, rotation, camera_view,
+        extract_one(depths[k], limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm,
                     heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
 
 
 @njit(cache=True, parallel=True)
 def extract_windows(
-    depths, background, margin, area, rank, size, intrinsics, plane, rotation, camera_view, heights, origin, n_steps,
-    n_px, moments, distance, n_blobs,
+    depths, background, margin, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs,
 ):  # fmt: skip
     for k in prange(depths.shape[0]):
         limit, everywhere = np.empty(depths.shape[1:], np.float32), np.ones(depths.shape[1:], np.bool_)
@@ -122,5 +124,5 @@ def extract_windows(
                     inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
                     behind = 1.0 / inverse if inverse > 1e-6 else 0.0
                 limit[v, u] = max(behind - margin, 0.0)
-        extract_one(depths[k], limit, everywhere, area[k], rank, size[k], intrinsics[k], plane[k], rotation[k],
-                    camera_view, heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+        extract_one(depths[k], limit, everywhere, area[k], rank, smooth_mm[k], intrinsics[k], plane[k], rotation[k],
+                    behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Kernels of the sensor models: what a PrimeSense or a Kinect v2 makes of an ideal depth picture.
+"""Kernels of the sensor models: what a PrimeSense, a Kinect v2 or a light field makes of an ideal depth picture.
 
 Every random number comes from a small generator whose state (1,) uint64 belongs to one picture, so a picture depends on
 its seed alone, never on threads or on order. Arguments that all kernels share: depth (H, W) mm, 0 = nothing in range;
@@ -12,13 +12,15 @@ from numba import njit
 
 NOTHING, STILL, ANIMAL, OBJECT = 0, 1, 2, 3
 
-PRIMESENSE_KIND, KINECT_V2_KIND = 0, 1
+PRIMESENSE_KIND, KINECT_V2_KIND, LIGHT_FIELD_KIND = 0, 1, 2
 BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
 SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
 
 # columns of a row of sensor parameters
 KIND, NOISE, EROSION, FUR, BIAS, HOLES, DARK, SIDE, SMOOTH, WHITE, LUMPS, EDGE_DROP, GRID, JITTER, FLYING = range(15)
-N_PARAMETERS = 15
+UNIT, BACKGROUND, OUTLIERS = 15, 16, 17  # mm a step of the picture; error of a learned background; outliers' rarity
+N_PARAMETERS = 18
+_TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
 
 _TABLE_BITS = 13
 _SHIFT = 64 - _TABLE_BITS
@@ -237,10 +239,53 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
 
 
 @njit(cache=True)
+def light_field(depth, what, p, state, table, out):
+    """A plenoptic camera: out (H, W) uint16 in steps of p[UNIT] mm, 0 = unread.
+
+    Depth comes from matched texture. Range noise is large and mostly smooth; outlines lie some pixels off, often
+    outwards; where the surface bears no texture (DARK of the animal's, HOLES of the rest) there is no reading, or
+    (FLYING > 0.5) what lies around was drawn over it; patches are matched wrongly, the rarer the larger OUTLIERS.
+    """
+    height, width = depth.shape
+    fields = np.empty((6, height, width), np.float32)
+    fine, coarse, blank, wrong, move_u, move_v = fields[0], fields[1], fields[2], fields[3], fields[4], fields[5]
+    smooth_field(state, table, p[GRID], fine)
+    smooth_field(state, table, 4.0 * p[GRID], coarse)
+    smooth_field(state, table, 2.0 * p[GRID], blank)
+    smooth_field(state, table, 1.0 * p[GRID], wrong)
+    smooth_field(state, table, 1.5 * p[GRID], move_u)
+    smooth_field(state, table, 1.5 * p[GRID], move_v)
+    strength = p[NOISE]
+    for v in range(height):
+        for u in range(width):
+            row = min(max(v + int(round(p[JITTER] * move_v[v, u])), 0), height - 1)
+            column = min(max(u + int(round(p[JITTER] * move_u[v, u])), 0), width - 1)
+            z, here = depth[row, column], depth[v, u]
+            if p[SIDE] > 0.0 and here > 0.0 and here < z:  # a near surface grows outwards only
+                z = here
+            if z <= 0.0:
+                out[v, u] = 0
+                continue
+            spread = strength * (z / _TYPICAL_MM) ** 2
+            animal = what[row, column] == ANIMAL
+            if blank[v, u] + 0.3 * fine[v, u] < (p[DARK] if animal else p[HOLES]):
+                if p[FLYING] < 0.5:
+                    out[v, u] = 0
+                    continue
+                z += 1.5 * spread * p[SMOOTH] * coarse[v, u]
+            if abs(wrong[v, u]) > p[OUTLIERS] - 0.25 * (strength - 1.0):
+                z += 12.0 * wrong[v, u] * (0.3 + uniform(state))
+            z += spread * (p[SMOOTH] * (0.7 * fine[v, u] + 0.7 * coarse[v, u]) + p[WHITE] * normal(state, table))
+            out[v, u] = int(z / p[UNIT] + 0.5) if z > 0.0 else 0
+
+
+@njit(cache=True)
 def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
     """One picture through its sensor: depth and what are consumed, `field` (H, W) float32 is scratch space."""
     soften(depth, what, p, state, table, field)
     if int(p[KIND]) == PRIMESENSE_KIND:
         primesense(depth, what, p, focal, state, table, out)
+    elif int(p[KIND]) == LIGHT_FIELD_KIND:
+        light_field(depth, what, p, state, table, out)
     else:
         kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from liex_lab.body._render import draw
-from liex_lab.recordings._sensors import ANIMAL, NOTHING, OBJECT, STILL, normal, sense, smooth_field
+from liex_lab.recordings._sensors import ANIMAL, BACKGROUND, NOTHING, OBJECT, STILL, UNIT, normal, sense, smooth_field
 
 # columns of a wall: its outward normal in the floor (2), distance from the arena's origin, height, depth of the
 # rounding that multiple reflections leave at its foot and how far that reaches, all mm; distance 0 is no wall
@@ -98,8 +98,8 @@ def _window(
     for r in range(shape[0]):
         for c in range(shape[1]):
             # a background is learned from many frames: nearly free of noise, a little off in patches
-            error = 0.4 * field[r, c] + 0.3 * normal(state, table)
-            background_out[r, c] = int(depth[r, c] + error + 0.5) if depth[r, c] > 0.0 else 0
+            error = sensor[BACKGROUND] * (0.4 * field[r, c] + 0.3 * normal(state, table))
+            background_out[r, c] = int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
     rotation = np.ascontiguousarray(R_arena_camera.T)
     translation = -height * rotation[:, 2]
     u0, v0 = float(origin[0]), float(origin[1])

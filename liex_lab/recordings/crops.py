@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.camera import Camera
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _crops as kernels
@@ -93,14 +94,15 @@ class Windows:
 
     depth, background (n, H, W) mm, 0 = unread; intrinsics (n, 4) fx fy cx cy, pixels of the whole picture; origin
     (n, 2) picture pixel of each window's first; inverse_depth (n, 3): 1 / z of the floor = a u + b v + c in pixels of
-    the whole picture.
+    the whole picture; view: how such animals are looked at.
     """
 
-    depth: NDArray[np.uint16]
-    background: NDArray[np.uint16]
+    depth: NDArray[np.uint16] | NDArray[np.float32]
+    background: NDArray[np.uint16] | NDArray[np.float32]
     intrinsics: Array
     origin: Array
     inverse_depth: Array
+    view: View = MOUSE_VIEW
 
     def floor(self, k: int) -> Floor:
         """The floor of window k."""
@@ -111,7 +113,7 @@ class Windows:
         self, size: Array, area_mm2: Array, min_height_mm: float = 7.0, camera_view: bool = False, rank: int = 0
     ) -> tuple[Crops, Array]:
         """The blobs of each window whose areas are nearest to area_mm2 (n,), by rank, and their looks (n, 17); see
-        `Scene.extract` and `Scene.looks`.
+        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home.
         """
         n = len(self.depth)
         crops = Crops(
@@ -128,9 +130,9 @@ class Windows:
             crops.distance[k] = floor.distance_mm
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
         kernels.extract_windows(
-            self.depth, self.background, np.float32(min_height_mm), area_mm2, rank, size, intrinsics, plane, rotation,
-            camera_view, crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance,
-            crops.n_blobs,
+            self.depth, self.background, np.float32(min_height_mm), area_mm2, rank, self.view.smooth_mm * size,
+            intrinsics, plane, rotation, (self.view.behind_mm if camera_view else 0.0) * size, crops.heights,
+            crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
         )  # fmt: skip
         looks = np.concatenate(
             [intrinsics, rotation.reshape(n, 9), crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
 from liex_lab.recordings import _crops as kernels
-from liex_lab.recordings._crops import BEHIND_MM
 from liex_lab.recordings._segment import MAX_BLOBS
 from liex_lab.recordings.arena import Floor, find_floor
-from liex_lab.recordings.background import floor_region, learn_background, sample_frames
+from liex_lab.recordings.background import floor_region, learn_background, sample_frames, stride_for
 from liex_lab.recordings.crops import CROP, Crops, Windows
 from liex_lab.recordings.recording import Recording
 from liex_lab.threads import threads
 
-__all__ = ["BEHIND_MM", "CROP", "Crops", "Scene", "Windows", "floor_region", "learn_background", "sample_frames"]
+__all__ = ["CROP", "Crops", "Scene", "Windows", "floor_region", "learn_background", "sample_frames"]
 
 Array = NDArray[np.float64]
 
 _SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
 _AREA_SD, _VOLUME_SD = 0.25, 0.2  # of the logarithms, from posture to posture of one animal
 _TOUCH_SHARE = 0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
-_PLAUSIBLE_AREA = (0.12, 1.3)  # of the squared spine: area seen from above, reared up to spread out
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,9 @@ class Scene:
 
     background (H, W) mm; limit (H, W) mm: a reading below it is in front of the background; on_floor (H, W): the floor,
     under which nothing lies, as far as the picture shows it: an animal stands on it with at least a part of its body;
-    area_mm2 and volume_mm3: the animal's usual area seen from above and volume under its back, 0 while unknown.
+    area_mm2 and volume_mm3: the animal's usual area seen from above and volume under its back, 0 while unknown; view:
+    how such animals are looked at; stride: only every so many-th row and column of the picture is looked at, and H, W
+    count those.
     """
 
     camera: Camera
@@ -44,6 +46,20 @@ class Scene:
     on_floor: NDArray[np.bool_]
     area_mm2: float = 0.0
     volume_mm3: float = 0.0
+    view: View = MOUSE_VIEW
+    stride: int = 1
+
+    @cached_property
+    def grid(self) -> Camera:
+        """The camera whose pixels are those that are looked at."""
+        return self.camera.every(self.stride)
+
+    @cached_property
+    def _grid_floor(self) -> Floor:
+        """The floor as that camera sees it."""
+        if self.stride == 1:
+            return self.floor
+        return Floor.from_plane(self.floor.normal, self.floor.distance_mm, self.grid)
 
     @staticmethod
     def from_floor(camera: Camera, floor: Floor, min_height_mm: float = 7.0) -> Scene:
@@ -54,25 +70,29 @@ class Scene:
 
     @staticmethod
     def learn(
-        recording: Recording, spine_mm: tuple[float, float], n_frames: int = 96, min_height_mm: float = 7.0
-    ) -> tuple[Scene, NDArray[np.float32]]:
+        recording: Recording, spine_mm: tuple[float, float], n_frames: int = 96, min_height_mm: float = 7.0,
+        view: View = MOUSE_VIEW,
+    ) -> tuple[Scene, NDArray[np.float32]]:  # fmt: skip
         """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was learned.
 
         The background of a pixel is the farthest depth that keeps coming back, which survives an animal that covers it
         most of the time; where the animal never leaves its place the floor plane takes over. spine_mm: the smallest and
         the largest animal to expect.
         """
-        sample = sample_frames(recording, n_frames)
+        stride = stride_for(recording, spine_mm[0])
+        sample = sample_frames(recording, n_frames, stride)
         background, spread, near = learn_background(sample)
-        floor = find_floor(background, recording.camera)
-        bare = floor.depth(recording.width, recording.height)
+        grid = recording.camera.every(stride)
+        seen = find_floor(background, grid)
+        floor = seen if stride == 1 else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
+        bare = seen.depth(grid.width, grid.height)
         on_floor = floor_region(background, bare)
         background = np.where((background == 0) & on_floor, bare, background)
         # the rims and walls around the floor flicker between near and far: there, nearer than ever is what counts
         behind = np.where(on_floor, background, near)
         margin = np.maximum(np.float32(min_height_mm), np.float32(_SPREADS) * spread)
         limit = np.maximum(behind - margin, 0).astype(np.float32)
-        scene = Scene(recording.camera, floor, background, limit, on_floor)
+        scene = Scene(recording.camera, floor, background, limit, on_floor, view=view, stride=stride)
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit).astype(np.float32)
@@ -85,7 +105,7 @@ class Scene:
         if share == 0.0:
             raise EstimationError(
                 f"no animal was found in {len(sample)} frames spread over the recording: nothing between "
-                f"{_PLAUSIBLE_AREA[0] * spine_mm[0] ** 2:.0f} and {_PLAUSIBLE_AREA[1] * spine_mm[1] ** 2:.0f} mm^2 "
+                f"{view.area[0] * spine_mm[0] ** 2:.0f} and {view.area[1] * spine_mm[1] ** 2:.0f} mm^2 "
                 "stands on the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in the plan"
             )
         scene = replace(scene, area_mm2=area)
@@ -101,14 +121,15 @@ class Scene:
         """
         import cv2
 
-        bare = self.floor.depth(self.camera.width, self.camera.height)
+        bare = self._grid_floor.depth(self.grid.width, self.grid.height)
         lump = self.on_floor & (self.background > 0) & (bare - self.background > min_height_mm)
         n, labels, stats, _ = cv2.connectedComponentsWithStats(lump.astype(np.uint8))
         crops = replace(self, area_mm2=area).extract(sample, 1.0)
         moving = np.zeros((int(crops.found.sum()), *lump.shape), np.bool_)
         for k, i in enumerate(np.flatnonzero(crops.found)):
             rows, columns = np.nonzero(crops.heights[i])
-            moving[k, crops.origin[i, 1] + crops.step[i] * rows, crops.origin[i, 0] + crops.step[i] * columns] = True
+            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
+            moving[k, v + step * rows, u + step * columns] = True
         best, best_area = self, area
         for k in range(1, n):
             part = labels == k
@@ -131,8 +152,8 @@ class Scene:
         One object of constant size is in (nearly) every frame, the animal; other things come and go or differ.
         """
         areas = np.zeros((len(depths), MAX_BLOBS))
-        kernels.blob_areas(depths, self.limit, self.on_floor, 1.0 / (self.camera.fx * self.camera.fy), areas)
-        low, high = _PLAUSIBLE_AREA[0] * spine_mm[0] ** 2, _PLAUSIBLE_AREA[1] * spine_mm[1] ** 2
+        kernels.blob_areas(depths, self.limit, self.on_floor, 1.0 / (self.grid.fx * self.grid.fy), areas)
+        low, high = self.view.area[0] * spine_mm[0] ** 2, self.view.area[1] * spine_mm[1] ** 2
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
             return 0.0, 0.0
@@ -154,6 +175,8 @@ class Scene:
     def misfit(self, crops: Crops) -> Array:
         """How unlike the animal each crop (n) is in area and volume: the square of a number of standard deviations."""
         area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)
+        if self.view.frame != VIEWS[0]:  # what is below an animal that swims or is held up is not its own
+            return (np.log(area / self.area_mm2) / _AREA_SD) ** 2
         return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (np.log(volume / self.volume_mm3) / _VOLUME_SD) ** 2
 
     def view_rotation(self, camera_view: bool) -> Array:
@@ -175,21 +198,27 @@ class Scene:
     ) -> Crops:
         """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home length.
 
-        rank: 0 takes the blob whose area is nearest to the animal's, 1 the next one, which may be the animal after all.
-        camera_view: heights are measured along the optical axis from BEHIND_MM behind the animal's mean depth, as the
-        paper's features see them; otherwise above the floor.
+        depths: whole pictures, or a sample of them with the scene's own stride. rank: 0 takes the blob whose area is
+        nearest to the animal's, 1 the next one, which may be the animal after all. camera_view: heights are measured
+        along the optical axis from the view's behind_mm behind the animal's mean depth, as the paper's features see
+        them; otherwise above the floor.
         """
         n = len(depths)
+        if depths.shape[1:] != self.limit.shape:
+            depths = depths[:, :: self.stride, :: self.stride]
         crops = Crops(
             np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
             np.zeros(n, np.int64), np.zeros((n, 8)), np.full(n, self.floor.distance_mm), np.zeros(n, np.int64),
         )  # fmt: skip
-        camera, floor = self.camera, self.floor
+        grid = self.grid
         with threads(parallel):
             kernels.extract_all(
-                depths, self.limit, self.on_floor, self.area_mm2, rank, size,
-                np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-                floor.inverse_depth, self.view_rotation(camera_view), camera_view,
+                depths, self.limit, self.on_floor, self.area_mm2, rank, self.view.smooth_mm * size,
+                np.array([grid.fx, grid.fy, grid.cx, grid.cy]), self._grid_floor.inverse_depth,
+                self.view_rotation(camera_view), self.view.behind_mm * size if camera_view else 0.0,
                 crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
             )  # fmt: skip
+        if self.stride > 1:  # told in pixels of the picture
+            for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
+                values *= self.stride * factor
         return crops

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera
+from liex_lab.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, RAYTRIX_R5, Camera
 from liex_lab.recordings import _sensors as k
 
 Array = NDArray[np.float64]
@@ -15,11 +15,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensor:
-    """A kind of depth sensor: its camera and how it errs."""
+    """A kind of depth sensor: its camera and how it errs.
+
+    unit_mm: of its depth; stride: its pictures are so large that only every so many-th pixel is looked at.
+    """
 
     name: str
     camera: Camera
     kind: int
+    unit_mm: float = 1.0
+    stride: int = 1
+
+    def coarse(self, parameters: Array) -> Array:
+        """Parameters (n, N_PARAMETERS) of this sensor's units for pictures of every `stride`-th pixel."""
+        coarse = parameters.copy()
+        coarse[:, [k.GRID, k.JITTER]] /= self.stride
+        return coarse
 
     def draw(self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0) -> Array:
         """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given fur (n,).
@@ -27,6 +38,7 @@ class Sensor:
         noise multiplies random errors and the rate of holes; erosion_px strips pixels off the animal's outline.
         """
         p = np.zeros((n, k.N_PARAMETERS))
+        p[:, k.UNIT], p[:, k.BACKGROUND] = self.unit_mm, 1.0
         p[:, k.KIND], p[:, k.NOISE], p[:, k.EROSION], p[:, k.FUR] = self.kind, noise, erosion_px, fur
         p[:, k.HOLES] = 10 ** rng.uniform(-4.5, -3.0, n)
         dark = rng.random(n) < 0.4
@@ -39,6 +51,8 @@ class Sensor:
             p[:, k.EDGE_DROP] = rng.uniform(0.05, 0.5, n)
             p[:, k.GRID] = rng.uniform(3.0, 5.5, n)
             p[:, k.JITTER] = rng.uniform(0.3, 0.9, n)
+        elif self.kind == k.LIGHT_FIELD_KIND:
+            _draw_light_field(rng, p)
         else:
             p[:, k.SMOOTH] = rng.uniform(0.4, 1.3, n)  # of (1 + z^2) / 2 mm, z in metres
             p[:, k.WHITE] = rng.uniform(0.3, 1.1, n)
@@ -50,11 +64,28 @@ class Sensor:
         return p
 
 
+def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
+    """The habits of n plenoptic cameras into p (n, N_PARAMETERS)."""
+    n = len(p)
+    p[:, k.SMOOTH] = rng.uniform(0.3, 1.0, n)  # mm at 250 mm
+    p[:, k.WHITE] = rng.uniform(0.1, 0.4, n)
+    p[:, k.LUMPS] = rng.uniform(0.05, 0.25, n)
+    p[:, k.GRID] = rng.uniform(5.0, 11.0, n)  # the footprint of a few micro lenses, pixels
+    p[:, k.JITTER] = rng.uniform(0.5, 2.5, n)
+    p[:, k.BACKGROUND], p[:, k.BIAS] = 0.5, 0.0
+    p[:, k.OUTLIERS] = rng.uniform(2.7, 3.6, n)  # standard deviations of a field
+    # quantiles of a field: from a few per cent to a third of the smooth skin bears no texture, less of the rest
+    p[:, k.DARK] = rng.uniform(-2.6, -0.45, n)
+    p[:, k.HOLES] = rng.uniform(-4.0, -1.2, n)
+    p[:, k.FLYING] = rng.random(n) < 0.5  # whether the maker's software fills what is unread
+
+
 PRIMESENSE_SENSOR = Sensor("PrimeSense", PRIMESENSE, k.PRIMESENSE_KIND)
 KINECT_V2_SENSOR = Sensor("Kinect v2", KINECT_V2, k.KINECT_V2_KIND)
 PRIMESENSE_QVGA_SENSOR = Sensor("PrimeSense QVGA", PRIMESENSE_QVGA, k.PRIMESENSE_KIND)
+RAYTRIX_R5_SENSOR = Sensor("Raytrix R5", RAYTRIX_R5, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2)
 SENSORS = (PRIMESENSE_SENSOR, KINECT_V2_SENSOR)  # those that sessions and training windows are drawn from
 BY_NAME = {
     sensor.name.lower().replace(" ", "-"): sensor
-    for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR)
+    for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR, RAYTRIX_R5_SENSOR)
 }

@@ -15,12 +15,30 @@ from liex_lab.recordings.things import THING_FACES, draw_thing
 Array = NDArray[np.float64]
 
 ROUND, BOX = "round", "box"
-CAMERA_HEIGHT_MM = (500.0, 1000.0)
-MAX_TILT_RAD = np.radians(10.0)
 _EDGE_PX = 6.0  # an animal stays this far inside the picture
 _WALL_MM = 3.0  # and its trunk this far from walls
 _CLUTTER_MM = 12.0  # and from what stands around
 _TRIES = 64
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What surrounds an animal, as a rule: lengths in mm.
+
+    camera_mm: heights of cameras above the floor, tilted by up to tilt_rad; walls_mm: heights of walls, and a share
+    `open_share` of the places has none; clutter: what stands around; scale: of corners, unevenness, distances and
+    estimation errors, over those of a mouse's arena.
+    """
+
+    camera_mm: tuple[float, float] = (500.0, 1000.0)
+    tilt_rad: float = float(np.radians(10.0))
+    walls_mm: tuple[float, float] = (80.0, 400.0)
+    open_share: float = 0.1
+    clutter: tuple[str, ...] = ("block", "ball")
+    scale: float = 1.0
+
+
+ARENA = Setting()
 
 
 @dataclass(frozen=True)
@@ -43,34 +61,35 @@ class Stage:
     still: NDArray[np.float32]
 
     @staticmethod
-    def draw(rng: np.random.Generator, camera: Camera, spine_mm: float) -> Stage:
+    def draw(rng: np.random.Generator, camera: Camera, spine_mm: float, setting: Setting = ARENA) -> Stage:
         """A random arena, large enough for the animal, its floor's centre in view."""
-        T = draw_views(rng, 1)
+        T = draw_views(rng, 1, setting)
         T_arena_camera = SE3(T.rotation[0], T.translation[0])
         height = float(T_arena_camera.translation[2])
         view = height * np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2.0
         kind = str(rng.choice([ROUND, BOX]))
-        least = 1.6 * spine_mm
+        least, most = 1.6 * spine_mm, 420.0 * max(setting.scale, 1.0)
         if kind == ROUND:
-            half = np.full(2, max(least, rng.uniform(0.75, 1.15) * min(view[1], 420.0)))
+            half = np.full(2, max(least, rng.uniform(0.75, 1.15) * min(view[1], most)))
         else:
-            half = np.maximum(least, rng.uniform(0.7, 1.1, 2) * np.minimum(view, 420.0))
+            half = np.maximum(least, rng.uniform(0.7, 1.1, 2) * np.minimum(view, most))
         middle = np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0])
         centre = floor_point(camera, T_arena_camera, middle) + rng.uniform(-0.15, 0.15, 2) * half
-        yaw, wall_mm = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(80.0, min(400.0, 0.7 * height)))
-        if rng.random() < 0.1:
+        low, high = setting.walls_mm
+        yaw, wall_mm = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(low, min(high, 0.7 * height)))
+        if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
         stage = Stage(
             camera, T_arena_camera, kind, centre, half, yaw, wall_mm, np.zeros((0, 2)), np.zeros((0, 0), np.float32)
         )
-        return stage._furnished(rng, spine_mm)
+        return stage._furnished(rng, spine_mm, setting)
 
-    def _furnished(self, rng: np.random.Generator, spine_mm: float) -> Stage:
+    def _furnished(self, rng: np.random.Generator, spine_mm: float, setting: Setting) -> Stage:
         """The same with its still picture, and in a third of them a thing or two near the wall."""
-        still = self._ideal_depth(rng)
+        still = self._ideal_depth(rng, setting.scale)
         T_camera_arena, outline = self.T_arena_camera.inverse(), []
         for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
-            mesh = draw_thing(rng, str(rng.choice(["block", "ball"])), 0.8 * spine_mm)
+            mesh = draw_thing(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
             way = rng.uniform(-np.pi, np.pi)
             local = 0.8 * self.half * [np.cos(way), np.sin(way)]
             mesh[:, :2] += self.centre + self._turned(local, self.yaw)
@@ -94,7 +113,7 @@ class Stage:
             return self.half[0] - np.hypot(local[..., 0], local[..., 1])
         return np.min(self.half - np.abs(local), axis=-1)
 
-    def _ideal_depth(self, rng: np.random.Generator) -> NDArray[np.float32]:
+    def _ideal_depth(self, rng: np.random.Generator, scale: float) -> NDArray[np.float32]:
         """Depth (H, W) mm along every ray: floor within the walls, walls up to their height, beyond them little."""
         T, camera = self.T_arena_camera, self.camera
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -103,10 +122,11 @@ class Stage:
         fall = np.where(d[..., 2] < -1e-3, -d[..., 2], 1e-3)
         floor = height / fall
         ground = floor[..., None] * d[..., :2]
-        raised = _unevenness(rng, ground)
+        raised = _unevenness(rng, ground, scale)
         room = self.room(ground)
         # multiple reflections fill the corner between floor and wall
-        raised += rng.uniform(0.0, 12.0) * np.exp(-np.maximum(room, 0.0) / rng.uniform(6.0, 25.0)) * (self.wall_mm > 0)
+        corner, spread = rng.uniform(0.0, 12.0) * scale, rng.uniform(6.0, 25.0) * scale
+        raised += corner * np.exp(-np.maximum(room, 0.0) / spread) * (self.wall_mm > 0)
         inside = (room > 0) & (d[..., 2] < -1e-3)
         depth = np.where(inside, floor - raised / fall, 0.0)
         wall = self._wall_distance(d)
@@ -116,7 +136,7 @@ class Stage:
         if self.wall_mm == 0.0:
             depth = np.where(beyond, floor - raised / fall, depth)
         elif rng.random() < 0.4:  # the untidy room around the arena
-            around = height + rng.uniform(0.0, 700.0) - 60.0 * _unevenness(rng, ground)
+            around = height + rng.uniform(0.0, 700.0) * scale - 60.0 * _unevenness(rng, ground, scale)
             depth = np.where(beyond & (d[..., 2] < -0.2), around / fall, depth)
         return np.where((depth > 100.0) & (depth < 4500.0), depth, 0.0).astype(np.float32)
 
@@ -133,10 +153,11 @@ class Stage:
             leave = (np.sign(d) * self.half - start) / d
         return np.maximum(np.nanmin(np.where(np.isfinite(leave), leave, np.inf), axis=-1), 0.0)
 
-    def places(self, rng: np.random.Generator, outline: Array, tops: Array) -> Array:
+    def places(self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None) -> Array:
         """Shifts (n, 2) mm that bring each of n bodies to a random free place on the floor, whole and in the picture.
 
-        outline (n, K, 2) mm: outermost points of the bodies on the floor; tops (n,) mm: their heights.
+        outline (n, K, 2) mm: outermost points of the bodies on the floor; tops, bottoms (n,) mm: how high they reach
+        and begin, None on the floor.
         """
         n = len(outline)
         middle = outline.mean(axis=1)
@@ -145,7 +166,7 @@ class Stage:
         points = outline[:, None] - middle[:, None, None] + aim[:, :, None]
         room = self.room(points).min(axis=2) - _WALL_MM
         T_camera_arena, c = self.T_arena_camera.inverse(), self.camera
-        for height in (np.zeros(n), tops):
+        for height in (np.zeros(n) if bottoms is None else bottoms, tops):
             above = np.broadcast_to(height[:, None, None, None], (*points.shape[:-1], 1))
             uv = c.project(T_camera_arena @ np.concatenate([points, above], axis=-1))
             border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3)) - _EDGE_PX
@@ -158,13 +179,13 @@ class Stage:
         return aim[np.arange(n), chosen] - middle
 
 
-def draw_views(rng: np.random.Generator, m: int) -> SE3:
-    """T_arena_camera (m) of cameras that look down from 500 to 1000 mm, tilted by up to 10 degrees in any direction."""
-    tilt, toward = MAX_TILT_RAD * np.sqrt(rng.random(m)), rng.uniform(-np.pi, np.pi, m)
+def draw_views(rng: np.random.Generator, m: int, setting: Setting = ARENA) -> SE3:
+    """T_arena_camera (m) of cameras that look down on a setting, tilted in any direction."""
+    tilt, toward = setting.tilt_rad * np.sqrt(rng.random(m)), rng.uniform(-np.pi, np.pi, m)
     up = -np.stack([np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)], axis=-1)
     x = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    height = rng.uniform(*CAMERA_HEIGHT_MM, m)
+    height = rng.uniform(*setting.camera_mm, m)
     translation = np.stack([np.zeros(m), np.zeros(m), height], axis=-1)
     return SE3(np.stack([x, np.cross(up, x), up], axis=-2), translation)
 
@@ -182,11 +203,11 @@ def outline_of(vertices: Array, n_directions: int = 24) -> Array:
     return np.take_along_axis(vertices[..., :2], extent.argmax(axis=1)[..., None], axis=1)
 
 
-def _unevenness(rng: np.random.Generator, ground: Array) -> Array:
+def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
     """Heights (H, W) mm of a floor that is not quite flat: a few long waves over points (H, W, 2) mm."""
     waves = np.zeros(ground.shape[:-1])
     for _ in range(4):
-        way, length = rng.uniform(-np.pi, np.pi), rng.uniform(70.0, 350.0)
+        way, length = rng.uniform(-np.pi, np.pi), rng.uniform(70.0, 350.0) * scale
         along = ground @ np.array([np.cos(way), np.sin(way)])
-        waves += rng.uniform(0.0, 0.7) * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
+        waves += rng.uniform(0.0, 0.7) * scale * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
     return waves

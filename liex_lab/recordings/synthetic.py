@@ -1,4 +1,4 @@
-"""Synthetic recordings: a virtual mouse in a virtual arena before an imitated sensor, with the exact truth.
+"""Synthetic recordings: a virtual animal in a virtual arena before an imitated sensor, with the exact truth.
 
 Frames are made when asked for, from a seed, in any order. `test_split` holds the splits on which accuracy is told.
 """
@@ -12,24 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape, draw_shapes, draw_tail_bends
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
+from liex_lab.body.surface import Body, Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _stage
-from liex_lab.recordings._sensors import NORMAL
+from liex_lab.recordings._sensors import NORMAL, UNIT
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.postures import SIZE_RANGE, sample_postures
+from liex_lab.recordings.habits import Habits, MouseHabits
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.sensors import SENSORS, Sensor
+from liex_lab.recordings.sensors import Sensor
 from liex_lab.recordings.stage import Stage, outline_of
-from liex_lab.recordings.things import THING_FACES, THINGS, draw_thing
+from liex_lab.recordings.things import THING_FACES, draw_thing
 
 Array = NDArray[np.float64]
 
-FRAME_NS = 33_333_333
+FRAME_NS = MouseHabits.frame_ns
 N_SESSIONS, N_FRAMES = 40, 50
 # name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
 SPLITS = {
@@ -51,8 +50,8 @@ class Cast:
     spine_mm: float
     pose: Pose
     girth: Array
-    shape: BodyShape
-    bends: Array
+    shape: Body
+    bends: Array | None
     things: Array
     shown: NDArray[np.bool_]
     parameters: Array
@@ -87,7 +86,8 @@ class SyntheticSession(Recording):
         cast, part, camera = self.cast, slice(start, stop), self.stage.camera
         pose = Pose(SE3(cast.pose.root.rotation[part], cast.pose.root.translation[part]), cast.pose.angles[part],
                     cast.pose.scale[part])  # fmt: skip
-        vertices = self.surface.vertices(pose, cast.shape, cast.girth[part], cast.bends[part])
+        bends = None if cast.bends is None else cast.bends[part]
+        vertices = self.surface.vertices(pose, cast.shape, cast.girth[part], bends)
         out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
         T_camera_arena = self.T_arena_camera.inverse()
         _stage.frames_parallel(
@@ -96,7 +96,8 @@ class SyntheticSession(Recording):
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), cast.parameters[part], cast.seeds[part],
             NORMAL, out,
         )  # fmt: skip
-        return out.astype(np.float32)
+        unit = float(cast.parameters[0, UNIT])
+        return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
 
     def chunks(self, n_frames: int) -> Iterator[list[DepthFrame]]:
         """All frames in lists of `n_frames`, each list made on all threads."""
@@ -116,51 +117,55 @@ class SyntheticSession(Recording):
         erosion_px: int = 0,
         thing_share: float = 0.0,
         spine_mm: float | None = None,
-        skeleton: Skeleton | None = None,
+        habits: Habits | None = None,
         name: str | None = None,
     ) -> SyntheticSession:
         """A session of independent postures and places: one camera, arena and animal, all drawn from the seed.
 
-        spine_mm: the animal's size; None draws 0.9 to 1.1 of the skeleton's own. thing_share: of frames with another
-        object in view. See `Sensor.draw` for noise and erosion_px, `draw_shapes` for family.
+        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws it. thing_share: of frames with
+        another object in view. See `Sensor.draw` for noise and erosion_px, `draw_shapes` for family.
         """
         rng = np.random.default_rng(seed)
-        skeleton = Skeleton.load("mouse") if skeleton is None else skeleton
-        sensor = SENSORS[int(rng.integers(len(SENSORS)))] if sensor is None else sensor
-        drawn = skeleton.length * float(rng.uniform(*SIZE_RANGE))
+        habits = MouseHabits() if habits is None else habits
+        home = habits.skeleton.length
+        sensor = habits.sensors[int(rng.integers(len(habits.sensors)))] if sensor is None else sensor
+        drawn = home * float(rng.uniform(*habits.sizes))
         spine = drawn if spine_mm is None else float(spine_mm)
-        stage = Stage.draw(rng, sensor.camera, spine)
-        shape = draw_shapes(rng, skeleton, family, 1)
-        pose, girth = sample_postures(rng, skeleton, n_frames, spine / skeleton.length, shape[0])
-        cast = assemble(rng, stage, sensor, skeleton, spine, shape, pose, girth, noise, erosion_px, thing_share, True)
-        return SyntheticSession(name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", stage, cast)
+        stage = Stage.draw(rng, sensor.camera, spine, habits.setting)
+        shape = habits.shapes(rng, family, 1)
+        size, camera_mm = np.full(n_frames, spine / home), np.full(n_frames, stage.T_arena_camera.translation[2])
+        pose, girth, _ = habits.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
+        cast = assemble(rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, True)
+        times = np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+        return SyntheticSession(name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", stage, cast, times)
 
 
 def assemble(
-    rng: np.random.Generator, stage: Stage, sensor: Sensor, skeleton: Skeleton, spine_mm: float, shape: BodyShape,
+    rng: np.random.Generator, stage: Stage, sensor: Sensor, habits: Habits, spine_mm: float, shape: Body,
     pose: Pose, girth: Array, noise: float, erosion_px: int, thing_share: float, scatter: bool,
 ) -> Cast:  # fmt: skip
     """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things beside it."""
     n = len(girth)
-    surface = Surface.of(skeleton)
-    bends = draw_tail_bends(rng, n)
+    surface = Surface.of(habits.skeleton)
+    bends = habits.bends(rng, n)
     vertices = surface.vertices(pose, shape[0], girth, bends)
     trunk = vertices[:, : surface.n_trunk_vertices]
     if scatter:
-        shift = stage.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1))
+        bottoms = trunk[..., 2].min(axis=1) if habits.floats else None
+        shift = stage.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
         pose.root.translation[:, :2] += shift
         trunk[..., :2] += shift[:, None]
-    things, shown = _beside(rng, stage, trunk, spine_mm, thing_share)
+    things, shown = _beside(rng, stage, trunk, spine_mm, thing_share, habits, sensor.stride)
     parameters = np.repeat(sensor.draw(rng, 1, shape.fur, noise, erosion_px), n, axis=0)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    return Cast(skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds)
+    return Cast(habits.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds)
 
 
 def _beside(
-    rng: np.random.Generator, stage: Stage, trunk: Array, spine_mm: float, share: float
+    rng: np.random.Generator, stage: Stage, trunk: Array, spine_mm: float, share: float, habits: Habits, stride: int
 ) -> tuple[Array, NDArray[np.bool_]]:
     """One thing for a session, at a free place of its own in every frame: (n, V, 3) mm and where it is shown (n,)."""
-    mesh = draw_thing(rng, str(rng.choice(THINGS)), spine_mm)
+    mesh = draw_thing(rng, str(rng.choice(habits.things)), spine_mm)
     n = len(trunk)
     things, shown = np.repeat(mesh[None], n, axis=0), rng.random(n) < share
     reach = 1.1 * stage.half
@@ -171,8 +176,9 @@ def _beside(
             outline = mesh[::3, :2] + shift
             gap = np.linalg.norm(outline[:, None] - own, axis=-1).min()
             # a hand reaches over the wall; anything else stands within
-            free = bool(gap > 8.0 and (mesh[:, 2].max() > 0.6 * spine_mm or stage.room(shift) > 0))
-            if free and not _covers(stage, things[i] + [*shift, 0.0], trunk[i]):
+            within = mesh[:, 2].max() > 0.6 * spine_mm or stage.room(shift) > 0
+            free = bool(gap > 8.0 * habits.setting.scale and within)
+            if free and not _covers(stage, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
                 things[i, :, :2] += shift
                 break
         else:
@@ -180,33 +186,42 @@ def _beside(
     return things, shown
 
 
-def _covers(stage: Stage, thing: Array, trunk: Array) -> bool:
-    """Whether the thing and the animal overlap in the picture, as boxes around a few millimetres' margin."""
+def _covers(stage: Stage, thing: Array, trunk: Array, margin_px: float) -> bool:
+    """Whether the thing and the animal overlap in the picture or nearly so."""
     T_camera_arena = stage.T_arena_camera.inverse()
     a, b = stage.camera.project(T_camera_arena @ thing), stage.camera.project(T_camera_arena @ trunk)
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
     around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()
-    return bool(gap < 4.0 or around)
+    return bool(gap < margin_px or around)
 
 
-def test_split(name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS) -> list[SyntheticSession]:  # noqa: PT028
-    """The sessions of a fixed split: 'clean', 'hard' or 'other-body', 40 of 50 frames, half of them from each sensor.
+def test_split(
+    name: str,
+    spine_mm: float | None = None,  # noqa: PT028
+    n_sessions: int = N_SESSIONS,  # noqa: PT028
+    habits: Habits | None = None,  # noqa: PT028
+    seed: int | None = None,  # noqa: PT028
+) -> list[SyntheticSession]:
+    """The sessions of a fixed split: 'clean', 'hard' or 'other-body', 40 of 50 frames, as many from each sensor.
 
-    spine_mm sets the animals' size instead of drawing it; n_sessions takes only the first ones.
+    spine_mm sets the animals' size instead of drawing it; n_sessions takes only the first ones; habits: of the animal,
+    None a mouse; seed: another one makes recordings like those of the split, to develop on.
     """
     if name not in SPLITS:
         raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
-    seed, family, noise, erosion_px, thing_share = SPLITS[name]
+    frozen, family, noise, erosion_px, thing_share = SPLITS[name]
+    habits = MouseHabits() if habits is None else habits
     return [
         SyntheticSession.draw(
-            [seed, k],
-            sensor=SENSORS[k % len(SENSORS)],
+            [frozen if seed is None else seed, k],
+            sensor=(sensor := habits.sensors[k % len(habits.sensors)]),
             family=family,
             noise=noise,
-            erosion_px=erosion_px,
+            erosion_px=erosion_px * sensor.stride,
             thing_share=thing_share,
             spine_mm=spine_mm,
+            habits=habits,
             name=f"{name}-{k:02d}",
         )
         for k in range(n_sessions)

@@ -11,12 +11,13 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.shape import BodyShape, draw_shapes
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Lens
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.camera_file import fitting
-from liex_lab.recordings.postures import KINDS, SIZE_RANGE, Posture, draw_postures, stand
+from liex_lab.recordings.habits import MouseHabits
+from liex_lab.recordings.postures import KINDS, Posture, draw_postures, stand
 from liex_lab.recordings.sensors import BY_NAME, KINECT_V2_SENSOR, Sensor
 from liex_lab.recordings.stage import Stage, floor_point
 from liex_lab.recordings.synthetic import SyntheticSession, assemble
@@ -97,15 +98,16 @@ def walking_session(
     erosion_px: int = 0,
     thing_share: float = 0.0,
     spine_mm: float | None = None,
-    skeleton: Skeleton | None = None,
+    habits: MouseHabits | None = None,
     name: str = "walking",
 ) -> SyntheticSession:
     """n_frames of one animal at 30 frames/s, drawn from the seed; arguments as in `SyntheticSession.draw`."""
     rng = np.random.default_rng(seed)
-    skeleton = Skeleton.load("mouse") if skeleton is None else skeleton
-    spine = skeleton.length * float(rng.uniform(*SIZE_RANGE)) if spine_mm is None else float(spine_mm)
+    habits = MouseHabits() if habits is None else habits
+    skeleton = habits.skeleton
+    spine = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
     stage = Stage.draw(rng, sensor.camera, spine)
-    shape = draw_shapes(rng, skeleton, family, 1)
+    shape = habits.shapes(rng, family, 1)
     kinds, spines_per_s = _script(rng, n_frames)
     posture = _flow(rng, skeleton, shape[0].broadcast(n_frames), kinds)
     position, heading = _path(rng, stage, spine, spines_per_s * spine)
@@ -118,7 +120,8 @@ def walking_session(
     )  # fmt: skip
     middle = pose.joints(skeleton)[..., :2].mean(axis=1)
     pose.root.translation[:, :2] += position - middle
-    cast = assemble(rng, stage, sensor, skeleton, spine, shape, pose, girth, noise, erosion_px, thing_share, False)
+    cast = assemble(rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, False)
+    assert cast.bends is not None  # mice have tails
     cast.bends[:] = cast.bends[:1] + 4.0 * _smooth(rng.normal(0.0, 0.05, cast.bends.shape))
     return SyntheticSession(name, stage, cast)
 

@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape, draw_shapes, draw_tail_bends
-from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
+from liex_lab.body.surface import Body, Surface
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _stage
 from liex_lab.recordings._sensors import EROSION, NOISE, NORMAL
-from liex_lab.recordings.postures import KINDS, SHARES, SIZE_RANGE, sample_postures
-from liex_lab.recordings.sensors import SENSORS
-from liex_lab.recordings.stage import draw_views
+from liex_lab.recordings.habits import Habits, MouseHabits
+from liex_lab.recordings.stage import Setting, draw_views
 from liex_lab.recordings.things import PART_FACES, rounded
 from liex_lab.threads import threads
 
@@ -37,12 +34,13 @@ _THING_SHARE, _WALL_SHARE = 0.10, 0.35
 class TrainingWindows:
     """n windows of S x S pixels around an animal, and the truth behind each.
 
-    depth, background (n, S, S) uint16 mm, 0 = unread: the picture, and the still scene as a recording would have
-    taught it. origin (n, 2) int32: the full picture's pixel (u, v) of window pixel (0, 0); intrinsics (n, 4): fx, fy,
-    cx, cy of the full picture. floor, floor_true (n, 3): 1 / z = a u + b v + c in its pixels, as estimated and exact.
+    depth, background (n, S, S) uint16, steps of unit_mm, 0 = unread: the picture, and the still scene as a recording
+    would have taught it. origin (n, 2) int32: the full picture's pixel (u, v) of window pixel (0, 0); intrinsics (n,
+    4): fx, fy, cx, cy of the full picture. floor, floor_true (n, 3): 1 / z = a u + b v + c in its pixels, as estimated
+    and exact.
     T_arena_camera (n), exact. root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones;
     joints_mm (n, J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
-    whose number is `session` (n,); sensor (n,) indexes `SENSORS`, kind (n,) `postures.KINDS`.
+    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture.
     """
 
     depth: NDArray[np.uint16]
@@ -60,6 +58,7 @@ class TrainingWindows:
     session: NDArray[np.int64]
     sensor: NDArray[np.int64]
     kind: NDArray[np.int64]
+    unit_mm: float = 1.0
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -69,9 +68,9 @@ class TrainingWindows:
         picked: list[Any] = []
         for field in fields(self):
             value = getattr(self, field.name)
-            picked.append(
-                SE3(value.rotation[index], value.translation[index]) if isinstance(value, SE3) else value[index]
-            )
+            if isinstance(value, SE3):
+                value = SE3(value.rotation[index], value.translation[index])
+            picked.append(value[index] if isinstance(value, np.ndarray) else value)
         return TrainingWindows(*picked)
 
     @staticmethod
@@ -84,6 +83,8 @@ class TrainingWindows:
                 columns.append(
                     SE3(np.concatenate([v.rotation for v in values]), np.concatenate([v.translation for v in values]))
                 )
+            elif isinstance(values[0], float):
+                columns.append(values[0])
             else:
                 columns.append(np.concatenate(values))
         return TrainingWindows(*columns)
@@ -99,7 +100,7 @@ class _Looks:
     T_arena_camera: SE3
     parameters: Array
     size: Array
-    shape: BodyShape
+    shape: Body
     rough: Array
     floor_error: Array
 
@@ -107,7 +108,7 @@ class _Looks:
 def training_windows(
     seed: int,
     n: int,
-    skeleton: Skeleton | None = None,
+    habits: Habits | None = None,
     *,
     family: str = "train",
     noise: float = 1.0,
@@ -120,7 +121,7 @@ def training_windows(
     """N training images; the first n of `training_blocks`, which explains the arguments."""
     parts, left = [], n
     for block in training_blocks(
-        seed, -(-n // BLOCK), skeleton, family=family, noise=noise, erosion_px=erosion_px,
+        seed, -(-n // BLOCK), habits, family=family, noise=noise, erosion_px=erosion_px,
         degraded_share=degraded_share, spine_mm=spine_mm, window_px=window_px, parallel=parallel,
     ):  # fmt: skip
         parts.append(block if left >= BLOCK else block[:left])
@@ -131,7 +132,7 @@ def training_windows(
 def training_blocks(
     seed: int,
     n_blocks: int,
-    skeleton: Skeleton | None = None,
+    habits: Habits | None = None,
     *,
     first: int = 0,
     family: str = "train",
@@ -144,46 +145,48 @@ def training_blocks(
 ) -> Iterator[TrainingWindows]:
     """Blocks of `BLOCK` training images from block `first` on, bit for bit the same for a seed, whatever the threads.
 
-    family: of body shapes. noise, erosion_px: see `Sensor.draw`; a share `degraded_share` of the mini-sessions has 1 to
-    2.5 times the noise and half of those an outline eroded by a pixel. spine_mm: the animals' mean size, None the
-    skeleton's own; window_px must hold the animal with a margin: 144 does up to spines of 70 mm.
+    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see `Sensor.draw`; a share
+    `degraded_share` of the mini-sessions has 1 to 2.5 times the noise and half of those an outline eroded by a pixel.
+    spine_mm: the animals' mean size, None the skeleton's own; window_px must hold the animal with a margin: 144 does up
+    to mice of 70 mm.
     """
-    skeleton = Skeleton.load("mouse") if skeleton is None else skeleton
-    surface = Surface.of(skeleton)
+    habits = MouseHabits() if habits is None else habits
+    surface = Surface.of(habits.skeleton)
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
-        looks = _draw_looks(rng, skeleton, family, noise, erosion_px, degraded_share, spine_mm)
-        yield _draw_block(rng, skeleton, surface, looks, window_px, number * (BLOCK // PER_SESSION), parallel)
+        looks = _draw_looks(rng, habits, family, noise, erosion_px, degraded_share, spine_mm)
+        yield _draw_block(rng, habits, surface, looks, window_px, number * (BLOCK // PER_SESSION), parallel)
 
 
 def _draw_looks(
-    rng: np.random.Generator, skeleton: Skeleton, family: str, noise: float, erosion_px: int, degraded_share: float,
+    rng: np.random.Generator, habits: Habits, family: str, noise: float, erosion_px: int, degraded_share: float,
     spine_mm: float | None,
 ) -> _Looks:  # fmt: skip
     """Cameras, floors and animals of one block's mini-sessions, repeated for each of their images."""
-    m = BLOCK // PER_SESSION
-    sensor = np.arange(m) % len(SENSORS)
-    shape = draw_shapes(rng, skeleton, family, m)
+    m, skeleton = BLOCK // PER_SESSION, habits.skeleton
+    sensor = np.arange(m) % len(habits.sensors)
+    shape = habits.shapes(rng, family, m)
     intrinsics, picture = np.empty((m, 4)), np.empty((m, 2), np.int64)
     parameters = np.empty((m, 0))
-    for k, kind in enumerate(SENSORS):
-        rows, camera = sensor == k, kind.camera
+    for k, kind in enumerate(habits.sensors):
+        rows, camera = sensor == k, kind.camera.every(kind.stride)
         # units of one make differ by a few per cent in focal length, and by some pixels in the optical axis
         focal = rng.uniform(0.97, 1.03, (m, 1)) * [camera.fx, camera.fy]
         axis = rng.normal(0.0, 4.0, (m, 2)) + np.array([camera.cx, camera.cy])
         intrinsics[rows] = np.concatenate([focal, axis], axis=1)[rows]
         picture[rows] = camera.width, camera.height
-        drawn = kind.draw(rng, m, shape.fur, noise, erosion_px)
+        drawn = kind.coarse(kind.draw(rng, m, shape.fur, noise, erosion_px))
         parameters = drawn if not parameters.size else np.where(rows[:, None], drawn, parameters)
     _degrade(rng, parameters, degraded_share)
     nominal = skeleton.length if spine_mm is None else spine_mm
     each = np.repeat(np.arange(m), PER_SESSION)
-    T_arena_camera = draw_views(rng, m)
+    T_arena_camera = draw_views(rng, m, habits.setting)
+    scale = habits.setting.scale
     return _Looks(
         sensor[each], intrinsics[each], picture[each],
         SE3(T_arena_camera.rotation[each], T_arena_camera.translation[each]), parameters[each],
-        (nominal / skeleton.length * rng.uniform(*SIZE_RANGE, m))[each], shape[each],
-        rng.uniform(0.0, 1.0, m)[each], (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8])[each],
+        (nominal / skeleton.length * rng.uniform(*habits.sizes, m))[each], shape[each],
+        scale * rng.uniform(0.0, 1.0, m)[each], (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale])[each],
     )  # fmt: skip
 
 
@@ -209,20 +212,19 @@ def inverse_depth_plane(T_arena_camera: SE3, intrinsics: Array, tilt_and_lift: A
 
 
 def _draw_block(
-    rng: np.random.Generator, skeleton: Skeleton, surface: Surface, looks: _Looks, window_px: int, first_session: int,
+    rng: np.random.Generator, habits: Habits, surface: Surface, looks: _Looks, window_px: int, first_session: int,
     parallel: bool,
 ) -> TrainingWindows:  # fmt: skip
     """The images of one block."""
-    n = len(looks.size)
-    kinds = rng.choice(len(KINDS), n, p=SHARES)
-    pose, girth = sample_postures(rng, skeleton, n, looks.size, looks.shape, kinds)
-    _place(rng, skeleton, pose, looks)
-    vertices = surface.vertices(pose, looks.shape, girth, draw_tail_bends(rng, n), parallel)
+    n, skeleton, scale = len(looks.size), habits.skeleton, habits.setting.scale
+    pose, girth, kinds = habits.postures(rng, looks.size, looks.shape, looks.T_arena_camera.translation[:, 2])
+    _place(rng, habits, pose, looks)
+    vertices = surface.vertices(pose, looks.shape, girth, habits.bends(rng, n), parallel)
     trunk = vertices[:, : surface.n_trunk_vertices]
     T_camera_arena = looks.T_arena_camera.inverse()
     origin = _window_origin(trunk, T_camera_arena, looks.intrinsics, window_px)
-    thing, has_thing = _draw_neighbours(rng, trunk, looks.size * skeleton.length)
-    walls, seeds = _draw_walls(rng, trunk), rng.integers(1, 2**63, n).astype(np.uint64)
+    thing, has_thing = _draw_neighbours(rng, trunk, looks.size * skeleton.length, scale, habits.floats)
+    walls, seeds = _draw_walls(rng, trunk, habits.setting), rng.integers(1, 2**63, n).astype(np.uint64)
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
@@ -237,21 +239,21 @@ def _draw_block(
         inverse_depth_plane(looks.T_arena_camera, looks.intrinsics, looks.floor_error),
         inverse_depth_plane(looks.T_arena_camera, looks.intrinsics), looks.T_arena_camera, seen.root, seen.angles,
         seen.scale, seen.joints(skeleton), looks.size * skeleton.length,
-        first_session + np.arange(n) // PER_SESSION, looks.sensor, kinds,
+        first_session + np.arange(n) // PER_SESSION, looks.sensor, kinds, habits.sensors[0].unit_mm,
     )  # fmt: skip
 
 
-def _place(rng: np.random.Generator, skeleton: Skeleton, pose: Pose, looks: _Looks) -> None:
+def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) -> None:
     """Move the poses over the floor so that each animal is somewhere in its picture, whole."""
-    n, T = len(pose.scale), looks.T_arena_camera
-    height = T.translation[:, 2]
+    n, T, skeleton = len(pose.scale), looks.T_arena_camera, habits.skeleton
+    middle = pose.joints(skeleton).mean(axis=1)
+    height = T.translation[:, 2] - (middle[:, 2] if habits.floats else 0.0)
     margin = 0.85 * pose.scale * skeleton.length * looks.intrinsics[:, 0] / height + 6.0
     uv = np.stack([margin + rng.random(n) * (looks.picture[:, k] - 2.0 * margin) for k in range(2)], axis=-1)
     ray = np.concatenate([(uv - looks.intrinsics[:, 2:]) / looks.intrinsics[:, :2], np.ones((n, 1))], axis=1)
     direction = np.einsum("nij,nj->ni", T.rotation, ray)
     spot = (height / -direction[:, 2])[:, None] * direction[:, :2]
-    centre = pose.joints(skeleton)[..., :2].mean(axis=1)
-    pose.root.translation[:, :2] += spot - centre
+    pose.root.translation[:, :2] += spot - middle[:, :2]
 
 
 def _window_origin(trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int) -> NDArray[np.int64]:
@@ -261,27 +263,35 @@ def _window_origin(trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_
     return np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + 0.5).astype(np.int64)
 
 
-def _draw_neighbours(rng: np.random.Generator, trunk: Array, spine_mm: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """A block or ball (n, V, 3) beside each trunk, never touching it, and which images show theirs (n,)."""
+def _draw_neighbours(
+    rng: np.random.Generator, trunk: Array, spine_mm: Array, scale: float, floats: bool
+) -> tuple[Array, NDArray[np.bool_]]:
+    """A block or ball (n, V, 3) beside each trunk, never touching it, and which images show theirs (n,).
+
+    Beside an animal that floats it is anywhere between the floor and the animal's back.
+    """
     n = len(trunk)
     radii = spine_mm[:, None] * rng.uniform(0.12, 0.5, (n, 3))
     way = rng.uniform(-np.pi, np.pi, n)
     toward = np.stack([np.cos(way), np.sin(way)], axis=-1)
     reach = np.einsum("nvk,nk->nv", trunk[..., :2], toward).max(axis=1)
     middle = trunk[..., :2].mean(axis=1)
-    clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1]) + rng.uniform(5.0, 40.0, n)
-    centre = np.concatenate([middle + clear[:, None] * toward, radii[:, 2:]], axis=-1)
+    clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1])
+    clear = clear + scale * rng.uniform(5.0, 40.0, n)
+    lift = rng.uniform(0.0, 1.0, n) * np.maximum(trunk[..., 2].max(axis=1) - radii[:, 2], 0.0) if floats else 0.0
+    centre = np.concatenate([middle + clear[:, None] * toward, (radii[:, 2] + lift)[:, None]], axis=-1)
     power = np.where(rng.random(n) < 0.5, 2.0, 10.0)
     return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < _THING_SHARE
 
 
-def _draw_walls(rng: np.random.Generator, trunk: Array) -> Array:
+def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Array:
     """A straight wall (n, WALL_COLUMNS) beyond some of the trunks, seen from the arena's inside."""
-    n = len(trunk)
+    n, scale = len(trunk), setting.scale
     middle = trunk[..., :2].mean(axis=1)
     way = np.arctan2(middle[:, 1], middle[:, 0]) + rng.normal(0.0, 0.7, n)
     outward = np.stack([np.cos(way), np.sin(way)], axis=-1)
-    distance = np.einsum("nvk,nk->nv", trunk[..., :2], outward).max(axis=1) + rng.uniform(1.0, 60.0, n)
-    there = (rng.random(n) < _WALL_SHARE) & (distance > 40.0)
-    height, rounding, spread = rng.uniform(60, 400, n), rng.uniform(0, 12, n), rng.uniform(6, 25, n)
-    return np.column_stack([outward, np.where(there, distance, 0.0), height, rounding, spread])
+    distance = np.einsum("nvk,nk->nv", trunk[..., :2], outward).max(axis=1) + scale * rng.uniform(1.0, 60.0, n)
+    there = (rng.random(n) < _WALL_SHARE) & (distance > 40.0 * scale)
+    low, high = setting.walls_mm
+    height, rounding, spread = rng.uniform(0.75 * low, high, n), rng.uniform(0, 12, n), rng.uniform(6, 25, n)
+    return np.column_stack([outward, np.where(there, distance, 0.0), height, scale * rounding, scale * spread])

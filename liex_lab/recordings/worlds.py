@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings import synthetic, walking, windows
+from liex_lab.recordings.habits import Habits, MouseHabits
 from liex_lab.recordings.hand_world import HandWorld, find_reference
 from liex_lab.recordings.synthetic import SyntheticSession
 from liex_lab.recordings.windows import TrainingWindows
@@ -17,8 +18,13 @@ from liex_lab.recordings.windows import TrainingWindows
 class World(Protocol):
     """Where an animal's training and test data come from. Everything is drawn from seeds, in any order."""
 
-    skeleton: Skeleton
-    splits: tuple[str, ...]
+    @property
+    def skeleton(self) -> Skeleton:
+        """The animal's skeleton."""
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The names of the test splits."""
 
     def training_blocks(
         self,
@@ -44,29 +50,40 @@ class World(Protocol):
 
 
 @dataclass(frozen=True)
-class MouseWorld:
-    """A mouse in an arena, seen from above."""
+class RenderedWorld:
+    """The world of an animal with these habits."""
 
-    skeleton: Skeleton
+    habits: Habits
     splits: tuple[str, ...] = tuple(synthetic.SPLITS)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The animal's skeleton."""
+        return self.habits.skeleton
 
     def training_blocks(self, seed: int, n_blocks: int, **settings: Any) -> Iterator[TrainingWindows]:
         """Blocks of training images."""
-        return windows.training_blocks(seed, n_blocks, self.skeleton, **settings)
+        return windows.training_blocks(seed, n_blocks, self.habits, **settings)
 
     def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
         """The recordings of a split."""
-        return synthetic.test_split(name, spine_mm, n_sessions)
+        return synthetic.test_split(name, spine_mm, n_sessions, self.habits)
+
+
+@dataclass(frozen=True)
+class MouseWorld(RenderedWorld):
+    """A mouse in an arena, seen from above."""
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
         """A mouse that walks, turns, rears and curls up."""
-        return walking.walking_session(seed, n_frames, skeleton=self.skeleton, **settings)
+        assert isinstance(self.habits, MouseHabits)
+        return walking.walking_session(seed, n_frames, habits=self.habits, **settings)
 
 
 def world_of(skeleton: Skeleton) -> World:
     """The world of an animal."""
     if skeleton.name == "mouse":
-        return MouseWorld(skeleton)
+        return MouseWorld(MouseHabits(skeleton))
     if skeleton.name == "hand":
         return HandWorld(skeleton, find_reference())
     raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")

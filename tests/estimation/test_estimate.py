@@ -9,11 +9,12 @@ import pytest
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation._estimate import mode_of_votes
+from liex_lab.estimation._estimate import choose_survivors, mode_of_votes
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.estimation.model import Calibration
 from liex_lab.estimation.scoring import Chosen, choose
+from liex_lab.estimation.training import train_pruner
 from liex_lab.geometry import SE3, so3
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, toy_mice, trained, unseen, with_box
 from tests.oracles import algorithm1
@@ -133,6 +134,56 @@ def test_the_size_of_an_animal_is_found_from_its_frames(true_size):
     estimator = PoseEstimator(trained("default").model)
     area = float(np.median(SCENE.extract(toy.depths, 1.0).moments[:, 1]))
     assert estimator.find_size(toy.depths, replace(SCENE, area_mm2=area)) == pytest.approx(true_size, rel=0.06)
+
+
+def pruned_model(survivors: int):
+    """The toy model with a small metric that lets some candidates go on."""
+    toy = trained("default")
+    method = replace(toy.model.method, survivors=survivors, pruner=METHODS["default"].pruner)
+    cascade = replace(toy.model.cascade, method=method)
+    pruner = train_pruner(toy.data, cascade, toy.candidates, np.random.default_rng(3))
+    return replace(toy.model, cascade=cascade, pruner=pruner)
+
+
+def test_candidates_that_outlive_the_base_end_as_they_do_among_all():
+    model, depths = pruned_model(3), unseen().depths[:30]
+    crops = SCENE.extract(depths, 1.0)
+    looks = SCENE.looks(crops)
+    few = PoseEstimator(model).candidates(crops, looks, 1.0)
+    all_of_them = PoseEstimator(model, unpruned=True).candidates(crops, looks, 1.0)
+    assert few[3].shape == (30, 3)
+    assert all_of_them[3].shape == (30, model.method.n_candidates)
+    for i in range(30):
+        same = np.abs(few[1][i][:, None] - all_of_them[1][i][None]).max(axis=(2, 3)) == 0.0
+        assert (same.sum(axis=1) == 1).all()
+        np.testing.assert_array_equal(few[3][i], all_of_them[3][i][same.argmax(axis=1)])
+
+
+def test_survivors_are_better_than_those_that_do_not_go_on_and_cost_little():
+    model, depths = pruned_model(4), unseen().depths
+    true = FLOOR.T_arena_camera.inverse() @ unseen().joints
+    crops = SCENE.extract(depths, 1.0)
+    looks = SCENE.looks(crops)
+    few, all_of_them = (PoseEstimator(model, unpruned=u).candidates(crops, looks, 1.0) for u in (False, True))
+    assert few[3].mean() < all_of_them[3].mean()
+    off = [
+        np.linalg.norm(PoseEstimator(model, unpruned=u).estimate(depths, SCENE, 1.0).chosen.pose.joints(model.skeleton)
+                       - true, axis=-1).mean()
+        for u in (False, True)
+    ]  # fmt: skip
+    assert off[0] < 1.15 * off[1]
+
+
+def test_the_best_candidate_that_points_the_other_way_always_goes_on():
+    heading = np.array([0.0, 0.1, -0.1, 0.2, 3.0, 3.1])
+    rotations = so3.exp(np.stack([0 * heading, 0 * heading, heading], axis=1))
+    chosen = np.zeros(3, np.int64)
+    choose_survivors(rotations, np.array([1.0, 2.0, 1.5, 3.0, 9.0, 8.0]), chosen)
+    assert chosen.tolist() == [0, 2, 5]
+    choose_survivors(rotations, np.array([1.0, 2.0, 1.5, 3.0, 0.5, 8.0]), chosen)
+    assert chosen.tolist() == [4, 0, 2]
+    choose_survivors(rotations[:4], np.array([4.0, 2.0, 1.5, 3.0]), chosen)
+    assert chosen.tolist() == [2, 1, 3]
 
 
 def test_more_candidates_may_be_asked_for_than_the_model_was_made_with():

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
+from numba import njit
 
 from liex_lab.forests import _kernels as kernels
+from liex_lab.forests._walk import LANES, walk_one_view, walk_views
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from tests.oracles.forest import leaf_by_hand
@@ -48,16 +50,47 @@ def test_a_node_holds_offsets_and_threshold_of_any_sign():
 def test_descents_agree_with_the_walk_a_reader_would_write(bumps):
     samples, labels = bumps
     forest, _ = grow_forest(samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0))
-    at, active, leaf = np.empty((3, 1), np.int64)
     for s in range(0, 400, 7):
         for root in forest.roots:
             scene = (samples.heights[s], samples.inverse_size[s], samples.views[s], samples.scalars[s])
-            by_hand = leaf_by_hand(forest.nodes, root, *scene)
-            assert kernels.descend(forest.nodes, root, *scene) == by_hand
-            kernels.descend_many(
-                forest.nodes, root, *scene[:2], samples.views[s : s + 1], samples.scalars[s : s + 1], at, active, leaf
-            )
-            assert leaf[0] == by_hand
+            assert kernels.descend(forest.nodes, root, *scene) == leaf_by_hand(forest.nodes, root, *scene)
+
+
+@njit
+def walk_all(nodes, root, pixels, base, scalar_base, inverse, one, several, side, leaves):
+    """Leaves (2, n) of all lanes, for a forest of one view and for one that chooses among views."""
+    n = base.size
+    for first in range(0, n, LANES):
+        walk_one_view(nodes, root, pixels, base, scalar_base, inverse, one, n, side, leaves[0], first)
+        walk_views(nodes, root, pixels, base, scalar_base, inverse, several, several.size // n, side, leaves[1], first)
+
+
+@pytest.mark.parametrize("n_views", [1, 3])
+def test_sixteen_lanes_reach_the_leaves_that_one_sample_after_the_other_does(bumps, n_views):
+    samples, labels = bumps
+    rng = np.random.default_rng(5)
+    n, side = 32, samples.heights.shape[1]
+    views = np.repeat(samples.views, n_views, axis=1)
+    views += rng.normal(0, 0.4, views.shape).astype(np.float32)
+    many = replace(samples, views=views)
+    forest, _ = grow_forest(many, labels, np.ones(len(many), bool), PLAN, rng)
+    n_scalars, area = many.scalars.shape[1], side * side
+    scalars = np.floor(many.scalars[:n]).astype(np.int16)
+    pixels = np.concatenate([many.heights[:n].ravel(), scalars.ravel()])
+    base = np.arange(n, dtype=np.int32) * area
+    scalar_base = (n * area + np.arange(n) * n_scalars).astype(np.int32)
+    leaves = np.zeros((2, n), np.int32)
+    for root in forest.roots:
+        wanted = [
+            kernels.descend(forest.nodes, root, many.heights[s], many.inverse_size[s], views[s], many.scalars[s])
+            for s in range(n)
+        ]
+        one = np.ascontiguousarray(views[:n, 0].T).ravel()
+        walk_all(forest.nodes, root, pixels, base, scalar_base, many.inverse_size[:n].copy(), one,
+                 views[:n].ravel(), side, leaves)  # fmt: skip
+        np.testing.assert_array_equal(leaves[1], wanted)
+        if n_views == 1:
+            np.testing.assert_array_equal(leaves[0], wanted)
 
 
 def test_a_forest_learns_where_the_bump_is(bumps):

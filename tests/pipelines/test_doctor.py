@@ -11,6 +11,7 @@ from liex_lab.pipelines.doctor import FINDINGS, examine, print_report
 
 from liex_lab.camera import Camera
 from liex_lab.errors import RecordingError
+from tests.recordings.oni_files import depth_builder
 from tests.recordings.writers import (
     Frames,
     cut,
@@ -19,6 +20,7 @@ from tests.recordings.writers import (
     write_camera,
     write_mcap,
     write_moseq_folder,
+    write_oni_file,
     write_png_folder,
 )
 
@@ -55,6 +57,21 @@ def test_a_sound_recording_has_its_facts_told_and_no_problem(tmp_path: Path) -> 
     assert findings["floor_mm"] == pytest.approx(700, abs=1)
     assert findings["intrinsics_source"] == "CameraCalibration on /camera/calibration"
     assert findings["problems"] == []
+
+
+def test_a_primesense_recording_says_where_its_intrinsics_come_from(tmp_path: Path) -> None:
+    findings = examined(write_oni_file(tmp_path / "r.oni", frames(), CAMERA))
+    assert (findings["format"], findings["n_frames"], findings["problems"]) == ("oni", 12, [])
+    assert findings["rate_hz"] == pytest.approx(30, rel=1e-4)
+    assert findings["floor_mm"] == pytest.approx(700, abs=1)
+    assert findings["intrinsics_source"] == "intrinsics in the .oni file (liexIntrinsics)"
+    # as another program writes it
+    payloads = [frame.tobytes() for frame in frames()]
+    findings = examined(depth_builder(payloads, "NONE", 160, 120).write(tmp_path / "theirs.oni"))
+    assert findings["intrinsics_source"] == "field of view in the .oni file (xnFOV)"
+    assert findings["fx"] == pytest.approx(80 / np.tan(0.5))
+    cut(tmp_path / "theirs.oni", 0.5)
+    assert "cut or damaged" in problems(tmp_path / "theirs.oni")
 
 
 def test_dropped_frames_are_counted(tmp_path: Path) -> None:

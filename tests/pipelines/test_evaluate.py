@@ -17,7 +17,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings import synthetic
-from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
 from liex_lab.recordings.synthetic import SyntheticSession
 from liex_lab.tracking.track import Track
 from tests.estimation.toy import trained
@@ -112,7 +112,7 @@ def test_errors_over_sizes_are_told_in_per_cent_of_the_spine(monkeypatch):
 
 def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(small_world, monkeypatch):
     def one_of_640(name: str, *how: Any) -> list[SyntheticSession]:
-        return [SyntheticSession.draw(3, 6, sensor=synthetic.SENSORS[0], name=name)]
+        return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
     monkeypatch.setattr(synthetic, "test_split", one_of_640)
     monkeypatch.setattr(evaluate, "_SPEED_FRAMES", 8)

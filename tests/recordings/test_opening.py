@@ -31,7 +31,7 @@ STORED = depth_frames(4)
         ("fish.rays", "export its depth maps as TIFF"),
         ("colour.JPG", "16-bit depth was expected"),
         ("colour.mp4", "16-bit depth was expected"),
-        ("xtion.oni", "not read yet"),
+        ("xtion.oni", "something else"),
         ("session.bag", "not read yet"),
         ("notes.txt", "a folder of 16-bit PNG or TIFF"),
         ("noextension", "a folder of 16-bit PNG or TIFF"),
@@ -50,7 +50,7 @@ def test_a_file_that_cannot_be_read_is_told_in_a_sentence(tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize(
-    "name", ["a.png", "a.tif", "depth.dat", "a.tar.gz", "a.tgz", "a.mcap", "camera.toml", "a.tar", "a.xyz"]
+    "name", ["a.png", "a.tif", "depth.dat", "a.tar.gz", "a.tgz", "a.mcap", "a.oni", "camera.toml", "a.tar", "a.xyz"]
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_is_refused_whatever_it_is_called(tmp_path: Path, name: str, seed: int) -> None:

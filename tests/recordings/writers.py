@@ -19,6 +19,8 @@ from foxglove.messages import CameraCalibration, CompressedImage, RawImage, Time
 from numpy.typing import NDArray
 
 from liex_lab.camera import Camera
+from liex_lab.recordings import Recording
+from liex_lab.recordings.primesense_writer import Codec, write_oni
 
 Frames = NDArray[np.uint16]
 
@@ -170,6 +172,22 @@ def _image(
         timestamp=stamp, frame_id=frame_id, encoding=encoding, width=frame.shape[1], height=frame.shape[0],
         step=padded.shape[1], data=padded.tobytes(),
     )  # fmt: skip
+
+
+def in_memory(frames: NDArray[Any], camera: Camera = SMALL, times_ns: Sequence[int] | None = None) -> Recording:
+    """Depths (n, H, W) mm as a recording that is in no file."""
+    times = even_times(len(frames)) if times_ns is None else times_ns
+    return Recording(
+        name="in memory", format="memory", camera=camera, times_ns=np.array(times, np.int64),
+        read=lambda index: frames[index].astype(np.float32),
+    )  # fmt: skip
+
+
+def write_oni_file(
+    path: Path, frames: Frames, camera: Camera = SMALL, times_ns: Sequence[int] | None = None, codec: Codec = "16zT"
+) -> Path:
+    """An .oni file by the product's own writer, which keeps times to the microsecond."""
+    return write_oni(in_memory(frames, camera, times_ns), path, codec=codec, overwrite=True)
 
 
 def cut(path: Path, share: float, to: Path | None = None) -> Path:
