@@ -51,8 +51,8 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C, of the base and of the other joints; reach mm of the offsets; levers (3,) of base, joints and scale; bandwidth mm of the mean shift, 0 for
-    the mean; how many candidates outlive the base joint.
+    """Rounds C, of the base and of the other joints; reach mm of the offsets; levers (3,) of base, joints and scale;
+    bandwidth mm of the mean shift, 0 for the mean; how many candidates outlive the base joint.
     """
 
     base_rounds: int
