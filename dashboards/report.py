@@ -115,7 +115,8 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
     time_s = frames["time_s"].to_numpy(float)
     time = figures.time_scale(session.metadata["frames"]["duration_s"])
     spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
-    lost = list(zip(session.gaps["start_s"], session.gaps["stop_s"], strict=True))
+    empty = session.gaps[session.gaps["n_frames_missing"] > 0]  # the others are stamps that were moved
+    lost = list(zip(empty["start_s"], empty["stop_s"], strict=True))
     error = frames["predicted_error_mm"].to_numpy(float)
     drawn = dict.fromkeys(("lanes", "way", "speed", "nose", "error", "errors", "budget"), "")
     if words or lost:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,126 @@ from numpy.typing import ArrayLike, NDArray
 from liex_lab.errors import LiexError
 
 Array = NDArray[np.float64]
+
+BROWN_CONRADY, KANNALA_BRANDT = "brown_conrady", "kannala_brandt"
+_N_COEFFICIENTS = {BROWN_CONRADY: 8, KANNALA_BRANDT: 4}
+_MODELS = {  # as OpenCV, ROS and Foxglove call them; an empty name is ROS's usual model
+    **dict.fromkeys(("", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv", "radtan"), BROWN_CONRADY),
+    **dict.fromkeys(("kannala_brandt", "equidistant", "fisheye", "opencv_fisheye"), KANNALA_BRANDT),
+}
+_WIDEST = 8.0  # tangent of the largest angle from the optical axis that is considered, 83 degrees
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """How a lens bends rays: the ray (x, y, 1) of an ideal pinhole meets the picture where (x', y', 1) should.
+
+    model and coefficients, in OpenCV's order: 'brown_conrady' has k1 k2 p1 p2 k3 k4 k5 k6 (ROS: plumb_bob with five of
+    them, rational_polynomial with all), 'kannala_brandt' the k1 k2 k3 k4 of a fisheye lens (ROS: equidistant). `of`
+    makes one from what a file states.
+    """
+
+    model: str
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        n = _N_COEFFICIENTS.get(self.model)
+        if n is None or len(self.coefficients) != n or not np.isfinite(self.coefficients).all():
+            raise LiexError(
+                f"a lens distortion is brown_conrady with 8 finite coefficients or kannala_brandt with 4, got "
+                f"{self.model} with {list(self.coefficients)}; correct distortion in camera.toml or in the plan"
+            )
+
+    @staticmethod
+    def of(model: str, coefficients: Sequence[float]) -> Distortion | None:
+        """The distortion that a file states; None where all coefficients are zero, for then there is none.
+
+        Coefficients that are left out at the end are zero; OpenCV's thin prism (beyond the eighth) is refused unless
+        zero. Raises LiexError for a model that is not known.
+        """
+        values = [float(value) for value in coefficients]
+        name = model.strip().lower().replace("-", "_").replace(" ", "_")
+        if not any(values):
+            return None
+        if name not in _MODELS:
+            raise LiexError(
+                f"the lens distortion model '{model}' is not known; state it as plumb_bob, rational_polynomial or "
+                "equidistant, or set all its coefficients to 0 where it does not matter"
+            )
+        n = _N_COEFFICIENTS[_MODELS[name]]
+        if any(values[n:]):
+            raise LiexError(
+                f"the lens distortion model '{model}' has up to {n} coefficients here, got {len(values)}: {values}; "
+                "calibrate the lens with fewer, or leave the others out"
+            )
+        return Distortion(_MODELS[name], tuple((values + [0.0] * n)[:n]))
+
+    @cached_property
+    def limit(self) -> float:
+        """The radius of (x, y) up to which farther out stays farther out; beyond it the model is no lens any more."""
+        r = np.linspace(0.0, _WIDEST, 4001)
+        turned = np.flatnonzero(~(np.diff(self._radius(r)) > 0))
+        return float(r[turned[0]]) if len(turned) else _WIDEST
+
+    def _radius(self, r: Array) -> Array:
+        """Where a ray at radius r (...) of the ideal picture meets the real one, without the tangential part."""
+        k = self.coefficients
+        if self.model == KANNALA_BRANDT:
+            angle = np.arctan(r)
+            s = angle * angle
+            return np.asarray(angle * (1.0 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))))
+        s = r * r
+        below = 1.0 + s * (k[5] + s * (k[6] + s * k[7]))
+        return np.asarray(r * (1.0 + s * (k[0] + s * (k[1] + s * k[4]))) / np.where(below > 0, below, np.nan))
+
+    def distort(self, xy: ArrayLike) -> Array:
+        """Ideal rays (..., 2), z = 1 -> where the lens sends them (..., 2); NaN beyond `limit`."""
+        x, y = np.moveaxis(np.asarray(xy, float), -1, 0)
+        s = x * x + y * y
+        r = np.sqrt(s)
+        ratio = np.where(r > 1e-12, self._radius(r) / np.maximum(r, 1e-12), 1.0)
+        ratio = np.where(r <= self.limit, ratio, np.nan)
+        if self.model == KANNALA_BRANDT:
+            return np.stack([x * ratio, y * ratio], axis=-1)
+        p1, p2 = self.coefficients[2:4]
+        across = 2.0 * x * y
+        return np.stack(
+            [x * ratio + p1 * across + p2 * (s + 2.0 * x * x), y * ratio + p1 * (s + 2.0 * y * y) + p2 * across],
+            axis=-1,
+        )
+
+    def undistort(self, xy: ArrayLike) -> Array:
+        """Where rays met the picture (..., 2) -> the ideal rays (..., 2) that did; NaN where none within `limit` does.
+
+        The radius by bisection of the radial part, which increases, then Newton's steps for the small tangential one.
+        """
+        seen = np.asarray(xy, float)
+        target = np.linalg.norm(seen, axis=-1)
+        low, high = np.zeros_like(target), np.full_like(target, self.limit)
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            below = self._radius(middle) < target
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        ideal = seen * (np.where(target > 1e-12, low / np.maximum(target, 1e-12), 1.0))[..., None]
+        ideal = np.where(self._radius(low)[..., None] < target[..., None] - 1e-3, np.nan, ideal)
+        right, down = np.array([1e-6, 0.0]), np.array([0.0, 1e-6])
+        for _ in range(8):
+            bent = self.distort(ideal)
+            off = bent - seen
+            along_x, along_y = (self.distort(ideal + right) - bent) / 1e-6, (self.distort(ideal + down) - bent) / 1e-6
+            determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
+            move_x = (off[..., 0] * along_y[..., 1] - off[..., 1] * along_y[..., 0]) / determinant
+            move_y = (along_x[..., 0] * off[..., 1] - along_x[..., 1] * off[..., 0]) / determinant
+            ideal = ideal - np.stack([move_x, move_y], axis=-1)
+        wrong = ~(np.linalg.norm(self.distort(ideal) - seen, axis=-1, keepdims=True) < 1e-9)
+        return np.where(wrong, np.nan, ideal)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for session.json; `Distortion.of(**...)` makes it again."""
+        return {"model": self.model, "coefficients": list(self.coefficients)}
+
+    def __str__(self) -> str:
+        return f"{self.model} {', '.join(f'{value:.4g}' for value in self.coefficients)}"
 
 
 @dataclass(frozen=True)
@@ -21,6 +143,7 @@ class Lens:
     fy: float
     cx: float
     cy: float
+    distortion: Distortion | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
@@ -32,9 +155,11 @@ class Lens:
 
 @dataclass(frozen=True)
 class Camera(Lens):
-    """A depth camera without lens distortion. Pixels; (0, 0) is the centre of the top-left pixel.
+    """A depth camera. Pixels; (0, 0) is the centre of the top-left pixel.
 
-    Camera frame: x right, y down, z away from the lens, mm. `source` names where the intrinsics come from.
+    Camera frame: x right, y down, z away from the lens, mm. `source` names where the intrinsics come from. Only a
+    recording as it was opened may have a distortion; what looks at pictures wants an ideal pinhole and gets it from
+    `recordings.rectify`.
     """
 
     width: int
@@ -53,20 +178,26 @@ class Camera(Lens):
         """Points (..., 3) mm in the camera frame -> (u, v) pixels (..., 2); NaN behind the lens."""
         x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
         z = np.where(z > 0, z, np.nan)
-        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+        if self.distortion is None:
+            return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+        return self.distortion.distort(np.stack([x / z, y / z], axis=-1)) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Array:
         """Pixels (..., 2) and their depth (...) mm -> points (..., 3) mm in the camera frame."""
         u, v = np.moveaxis(np.asarray(uv, float), -1, 0)
         z = np.asarray(depth, float)
-        return np.stack([(u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z * np.ones_like(u)], axis=-1)
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        if self.distortion is not None:
+            x, y = np.moveaxis(self.distortion.undistort(np.stack([x, y], axis=-1)), -1, 0)
+        return np.stack([x * z, y * z, z * np.ones_like(u)], axis=-1)
 
     def every(self, stride: int) -> Camera:
         """The camera whose picture is every `stride`-th row and column of this one's."""
         if stride == 1:
             return self
         fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
-        return Camera(fx, fy, cx, cy, -(-self.width // stride), -(-self.height // stride), self.source)
+        width, height = -(-self.width // stride), -(-self.height // stride)
+        return Camera(fx, fy, cx, cy, width, height, self.source, distortion=self.distortion)
 
     @property
     def matrix(self) -> Array:
@@ -75,7 +206,15 @@ class Camera(Lens):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json and camera.toml."""
-        return {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
+        numbers = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
+        return numbers if self.distortion is None else {**numbers, "distortion": self.distortion.to_dict()}
+
+    @staticmethod
+    def from_dict(numbers: dict[str, Any]) -> Camera:
+        """The camera that `to_dict` wrote; other keys are passed over."""
+        known = {name: numbers[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
+        bent = numbers.get("distortion")
+        return Camera(**known, distortion=Distortion.of(**bent) if bent else None)
 
 
 KINECT_V2 = Camera(365.0, 365.0, 255.5, 211.5, 512, 424, source="typical Kinect v2")

@@ -38,6 +38,9 @@ RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
 PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
 OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
+TopicName = Annotated[
+    str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
+]
 AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse or hand.")]
 VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
@@ -71,6 +74,7 @@ def run(
     recording: RecordingPath,
     plan: PlanName = "mouse",
     out: OutFolder = Path(),
+    topic: TopicName = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
     ] = None,
@@ -79,7 +83,8 @@ def run(
     """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
     from liex_lab.plan import Plan
 
-    chosen = Plan.load(plan).with_settings(settings or [])  # first: a wrong plan is told at once
+    asked = [] if topic is None else [f"recording.topic={topic}"]
+    chosen = Plan.load(plan).with_settings([*asked, *(settings or [])])  # first: a wrong plan is told at once
     from liex_lab.api import run_session
 
     with progress_bar() as progress:
@@ -92,7 +97,7 @@ def doctor(
     recording: RecordingPath,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
-    topic: Annotated[str | None, typer.Option("--topic", help="The MCAP topic, where several hold depth.")] = None,
+    topic: TopicName = None,
 ) -> None:
     """Say what is in a recording and what is wrong with it. Needs no model."""
     from liex_lab.pipelines.doctor import examine, print_report
@@ -103,6 +108,32 @@ def doctor(
         typer.echo(_json(findings))
     else:
         print_report(findings)
+
+
+@app.command()
+def convert(
+    recording: RecordingPath,
+    to: Annotated[
+        Path, typer.Option("--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures.")
+    ],
+    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
+    topic: TopicName = None,
+    step_mm: Annotated[
+        float | None, typer.Option("--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP.")
+    ] = None,
+    ros: Annotated[bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under this name.")] = False,
+) -> None:
+    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG pictures."""
+    from liex_lab.pipelines.convert import convert as job
+
+    with progress_bar() as progress:
+        done = job(
+            recording, to, fps=fps, topic=topic, step_mm=step_mm, ros=ros, overwrite=overwrite, progress=progress
+        )
+    typer.echo(f"recording: {done.path} ({done.n_frames} frames)")
+    for sentence in (*done.problems, *done.notes):
+        typer.echo(f"note: {sentence}")
 
 
 @app.command()
@@ -140,12 +171,23 @@ def evaluate_pose(
 
 
 @evaluate.command("speed")
-def evaluate_speed(animal: AnimalName = "mouse", json_file: JsonFile = None) -> None:
+def evaluate_speed(
+    animal: AnimalName = "mouse",
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Measure how fast recordings of each format are read instead.")
+    ] = False,
+    json_file: JsonFile = None,
+) -> None:
     """Frames per second on one and two cores, stage by stage, and the ratio to the paper's variant."""
-    from liex_lab.pipelines.evaluate import evaluate_speed as measure
-
     with progress_bar() as progress:
-        result = measure(animal, progress=progress)
+        if recordings:
+            from liex_lab.pipelines.evaluate_recordings import evaluate_recordings
+
+            result = evaluate_recordings(progress=progress)
+        else:
+            from liex_lab.pipelines.evaluate import evaluate_speed as measure
+
+            result = measure(animal, progress=progress)
     _tell_numbers(result, json_file)
 
 

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -63,7 +63,45 @@ class CameraOverride(_Table):
         None, description="column of the optical axis, pixels; 0 is the centre of the first column"
     )
     cy: float | None = Field(None, description="row of the optical axis, pixels; 0 is the centre of the first row")
+    distortion: list[float] | None = Field(
+        None,
+        description="coefficients of the lens distortion, in OpenCV's order: [k1, k2, p1, p2, k3, k4, k5, k6], all but "
+        "the first may be left out; [] says that there is none; not set: what the recording says",
+    )
+    distortion_model: str | None = Field(
+        None, description="plumb_bob (not set), rational_polynomial, or equidistant for a fisheye lens [k1, k2, k3, k4]"
+    )
     source: str | None = Field(None, description="where these numbers come from; it is written into session.json")
+
+
+class WaterSurface(_Table):
+    """[water]: a flat water surface between the camera and the animal; not needed for a camera behind glass in air."""
+
+    height_mm: Positive | None = Field(
+        None, description="height of the lens above the water; set, it makes millimetres under water true"
+    )
+    refractive_index: float = Field(
+        1.333, ge=1, le=2, description="of the water: 1.333 fresh at 20 degrees C in visible light, 1.34 sea water"
+    )
+    tilt_x_rad: float = Field(
+        0.0, ge=-1, le=1, description="angle by which the surface recedes from the camera towards the picture's right"
+    )
+    tilt_y_rad: float = Field(
+        0.0, ge=-1, le=1, description="angle by which the surface recedes from the camera towards the picture's bottom"
+    )
+    ranging: Literal["light_field", "structured_light", "time_of_flight", "paraxial"] = Field(
+        "light_field",
+        description="how the camera measures: light_field (Raytrix), structured_light (PrimeSense, RealSense; stereo "
+        "along the picture's rows), time_of_flight (Kinect v2, Azure), or paraxial: depth / n at every angle",
+    )
+
+
+class ArenaFacts(_Table):
+    """[arena]: where in the arena the animal is."""
+
+    zones: str | None = Field(
+        None, description="path of a TOML file with named zones, circles and polygons; see the README"
+    )
 
 
 class RecordingOptions(_Table):
@@ -173,6 +211,8 @@ class Plan(_Table):
     animal: Animal = Animal()
     camera: CameraOverride = CameraOverride()
     recording: RecordingOptions = RecordingOptions()
+    water: WaterSurface = WaterSurface()
+    arena: ArenaFacts = ArenaFacts()
     foreground: Foreground = Foreground()
     estimation: Estimation = Estimation()
     session: SessionFacts = SessionFacts()
@@ -330,8 +370,10 @@ def _comment(text: str) -> list[str]:
     return textwrap.wrap(text, 116, initial_indent="# ", subsequent_indent="# ")
 
 
-def _literal(value: bool | int | float | str) -> str:
+def _literal(value: bool | int | float | str | list[float]) -> str:
     """A value as TOML writes it. JSON's string escapes are TOML's, but for DEL."""
+    if isinstance(value, list):
+        return f"[{', '.join(_literal(item) for item in value)}]"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

@@ -16,32 +16,64 @@ if TYPE_CHECKING:
 
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.body.skeleton import Skeleton
+    from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.recordings.crops import Foreground
     from liex_lab.recordings.recording import Recording
+    from liex_lab.recordings.walls import Arena
+    from liex_lab.recordings.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
+    from liex_lab.water import Water
 
 
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
     """The recording at a path, opened as the plan says, or one that is open already; the plan's camera overrules.
 
-    A plan that states all four intrinsics opens a recording that has none, too.
+    A plan that states all four intrinsics opens a recording that has none, too. Lens distortion and the water's
+    refraction are undone whenever a frame is read: what comes back is a recording of an ideal camera in air.
     """
-    from liex_lab.camera import Lens
     from liex_lab.recordings import open_recording
+    from liex_lab.recordings.rectify import rectified
 
     settings = plan.recording
-    stated: dict[str, Any] = plan.camera.model_dump(exclude_none=True)
     if isinstance(recording, str | Path):
-        lens = {name: stated[name] for name in ("fx", "fy", "cx", "cy") if name in stated}
         recording = open_recording(
-            recording, camera=Lens(**lens) if len(lens) == 4 else None, fps=settings.fps, topic=settings.topic,
+            recording, camera=_stated_lens(plan), fps=settings.fps, topic=settings.topic,
             strict=not settings.accept_truncated, progress=progress,
         )  # fmt: skip
-    if stated:
-        recording.camera = replace(recording.camera, **{"source": "plan", **stated})
-    return recording
+    recording.camera = _overruled(recording.camera, plan)
+    return rectified(recording, build_water(plan))
+
+
+def build_water(plan: Plan) -> Water | None:
+    """The water surface of the plan, if there is one."""
+    from liex_lab.water import Water
+
+    stated = plan.water.model_dump()
+    return Water(**stated) if stated["height_mm"] is not None else None
+
+
+def _stated_lens(plan: Plan) -> Lens | None:
+    """The plan's camera where it states all of it."""
+    from liex_lab.camera import Lens
+
+    stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
+    return None if None in stated.values() else Lens(**stated, distortion=_stated_distortion(plan))
+
+
+def _stated_distortion(plan: Plan) -> Distortion | None:
+    from liex_lab.camera import Distortion
+
+    return Distortion.of(plan.camera.distortion_model or "plumb_bob", plan.camera.distortion or [])
+
+
+def _overruled(camera: Camera, plan: Plan) -> Camera:
+    """The camera with what the plan states put in."""
+    stated: dict[str, Any] = plan.camera.model_dump(exclude_none=True, exclude={"distortion", "distortion_model"})
+    if plan.camera.distortion is not None:
+        stated["distortion"] = _stated_distortion(plan)
+    return replace(camera, **{"source": "plan", **stated}) if stated else camera
 
 
 def build_estimator(plan: Plan) -> PoseEstimator:
@@ -63,6 +95,7 @@ def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     """The tracker of a recording: its scene learned, the animal's size and girth found."""
     from liex_lab.tracking.tracker import FrameTracker
 
+    build_zones(plan)  # a slip in their file is told before any work is done
     estimator = build_estimator(plan)
     scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
     return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, plan.estimation.doubtful_above_mm)
@@ -90,6 +123,7 @@ def build_provenance(
     from liex_lab.sessions import Provenance
 
     recording.digest(progress)  # kept by the recording; the longest wait here, so it is the one that is shown
+    arena, zones = build_arena(tracker.scene, plan)
     origin = {"plan": "stated in the plan", "recording": "estimated over the recording"}[tracker.size_origin]
     return Provenance.of(
         recording,
@@ -98,7 +132,29 @@ def build_provenance(
         plan,
         model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
         animal_size={"spine_mm": round(tracker.spine_mm, 3), "origin": origin, "girth": round(tracker.body.girth, 3)},
+        arena=arena,
+        zones=zones,
     )
+
+
+def build_arena(scene: Foreground, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+    """The shape of the arena, where there is one, and the plan's zones in it."""
+    from liex_lab.recordings.arena import Floor
+    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.walls import UNKNOWN, find_arena
+
+    arena = UNKNOWN
+    if isinstance(scene, Scene):
+        floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
+        arena = find_arena(scene.background, floor, scene.grid)
+    return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
+
+
+def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
+    """The zones of the plan, as they were drawn."""
+    from liex_lab.recordings.zones import read_zones
+
+    return read_zones(plan.arena.zones) if plan.arena.zones else ()
 
 
 def build_rules(plan: Plan) -> MouseRules:

@@ -157,10 +157,16 @@ def _sample_depth(recording: Recording, progress: Progress) -> _Depths:
 
 def _time_problems(recording: Recording) -> list[str]:
     found = []
-    if gaps := recording.gaps:
+    jumps = [gap for gap in recording.gaps if gap.reason == "clock_jumped"]
+    if jumps:
+        found.append(
+            f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before frame "
+            f"{jumps[0].start_frame}; nothing is measured across them"
+        )
+    if gaps := [gap for gap in recording.gaps if gap.reason != "clock_jumped"]:
         missing = sum(gap.n_frames_missing for gap in gaps)
         share = missing / (len(recording) + missing)
-        longest_s = int(np.diff(recording.times_ns).max()) / 1e9
+        longest_s = max(gap.stop_ns - recording.times_ns[gap.start_frame - 1] for gap in gaps) / 1e9
         places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         found.append(
             f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest time between two "

@@ -52,6 +52,7 @@ def measure_session(
                 writer.add(frames, track)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
             writer.note(problems=opened.problems)
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan))
+            zones = [zone.name for zone in provenance.zones]
+            behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
             session = writer.close(timings_s=timings, **behaviour.for_session())
     return session.path

@@ -1,17 +1,19 @@
-"""The pinhole: project undoes unproject, and nothing is seen behind the lens."""
+"""The camera: project undoes unproject, nothing is seen behind the lens, and a bent lens bends as OpenCV says."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.camera import KINECT_V2, PRIMESENSE, Camera
+from liex_lab.camera import KINECT_V2, PRIMESENSE, Camera, Distortion
 from liex_lab.errors import LiexError
 
 pixels = st.floats(-50, 700)
@@ -78,3 +80,57 @@ def test_a_camera_that_cannot_be_is_refused_in_a_sentence(wrong: dict[str, Any])
 
 def test_a_camera_survives_its_own_table() -> None:
     assert Camera(**PRIMESENSE.to_dict()) == PRIMESENSE
+
+
+LENSES = [
+    Distortion.of("plumb_bob", [-0.28, 0.08, 0.001, -0.002, -0.01]),
+    Distortion.of("plumb_bob", [0.12, 0.03]),
+    Distortion.of("rational_polynomial", [0.5, -2.6, 0.0007, -0.0003, 1.5, 0.38, -2.4, 1.4]),
+    Distortion.of("equidistant", [-0.02, 0.01, -0.004, 0.0005]),
+]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_a_bent_lens_agrees_with_opencv_and_unproject_undoes_project(lens: Distortion) -> None:
+    camera = replace(KINECT_V2, distortion=lens)
+    v, u = np.mgrid[0 : camera.height : 13.0, 0 : camera.width : 13.0]
+    points = replace(camera, distortion=None).unproject(np.stack([u, v], axis=-1), 600.0)
+    seen = camera.project(points)
+    flat, k = points.reshape(-1, 1, 3), np.array(lens.coefficients)
+    still = np.zeros((3, 1))
+    bend = cv2.fisheye.projectPoints if lens.model == "kannala_brandt" else cv2.projectPoints
+    expected = bend(flat, still, still, camera.matrix, k)[0].reshape(seen.shape)
+    np.testing.assert_allclose(seen, expected, atol=1e-8)
+    np.testing.assert_allclose(camera.unproject(seen, 600.0), points, atol=1e-6)
+    assert np.abs(seen - np.stack([u, v], axis=-1)).max() > 1.0, "it does bend"
+
+
+def test_where_a_model_folds_back_nothing_is_seen() -> None:
+    lens = Distortion.of("plumb_bob", [-0.4])
+    assert lens is not None
+    assert lens.limit == pytest.approx(np.sqrt(1 / 1.2), abs=0.01)  # where r - 0.4 r^3 turns
+    assert np.isnan(lens.distort([1.0, 0.0])).all()
+    assert np.isnan(lens.undistort([0.7, 0.0])).all(), "the model never reaches as far as this"
+    assert np.isfinite(lens.undistort(lens.distort([[0.85, 0.1], [0.0, 0.0]]))).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "k", "says"),
+    [("mei", [0.1], "'mei' is not known"), ("plumb_bob", [0.1] * 12, "has up to 8 coefficients here, got 12"),
+     ("equidistant", [0.1] * 5, "has up to 4"), ("plumb_bob", [math.nan], "finite")],
+)  # fmt: skip
+def test_a_distortion_that_cannot_be_used_is_refused_in_a_sentence(model: str, k: list[float], says: str) -> None:
+    with pytest.raises(LiexError, match=says):
+        Distortion.of(model, k)
+
+
+@pytest.mark.parametrize("k", [[], [0.0] * 5, [0.0] * 12])
+@pytest.mark.parametrize("model", ["plumb_bob", "", "anything"])
+def test_coefficients_of_zero_are_no_distortion(model: str, k: list[float]) -> None:
+    assert Distortion.of(model, k) is None
+
+
+@pytest.mark.parametrize("lens", [None, *LENSES])
+def test_a_camera_of_any_lens_survives_its_own_table(lens: Distortion | None) -> None:
+    camera = replace(PRIMESENSE, distortion=lens)
+    assert Camera.from_dict(json.loads(json.dumps(camera.to_dict())) | {"floor_distance_mm": 700.0}) == camera

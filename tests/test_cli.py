@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from liex_lab import cli
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
-VERBS = ["demo", "run", "doctor", "train", "evaluate", "show", "info"]
+VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "show", "info"]
 MEASURES = ["pose", "speed", "sizes", "reference"]
 
 
@@ -203,6 +203,44 @@ def test_the_other_measures_reach_their_jobs(monkeypatch: pytest.MonkeyPatch, tm
     assert json.loads(speed.read_text()) == {"animal": "mouse", "stages_ms": {"foreground": 0.1}}
     assert json.loads(sizes.read_text()) == {"n_frames": None}
     assert json.loads(reference.read_text()) == {"session": "m.liex", "reference": "r.csv"}
+
+
+def test_evaluate_speed_measures_recordings_where_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    numbers = {"frames_per_s_1core": {"mcap": 400.0}}
+    job(monkeypatch, "evaluate_recordings", evaluate_recordings=lambda progress: numbers)
+    file = tmp_path / "numbers.json"
+    result = CliRunner().invoke(cli.app, ["evaluate", "speed", "--recordings", "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    assert json.loads(file.read_text()) == numbers
+
+
+def test_convert_says_what_was_written_and_what_is_odd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: dict[str, Any] = {}
+
+    def convert(recording: Path, to: Path, *, progress: Any, **how: Any) -> Any:
+        seen.update(how, recording=recording, to=to)
+        return SimpleNamespace(path=to, n_frames=7, notes=["a [note]"], problems=["it was cut"])
+
+    job(monkeypatch, "convert", convert=convert)
+    words = ["convert", "a.bag", "--to", "b.oni", "--topic", "/d", "--step-mm", "0.1", "--fps", "30", "--overwrite"]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.output == "recording: b.oni (7 frames)\nnote: it was cut\nnote: a [note]\n"
+    assert seen == {
+        "recording": Path("a.bag"), "to": Path("b.oni"), "topic": "/d", "step_mm": 0.1, "fps": 30.0, "ros": False,
+        "overwrite": True,
+    }  # fmt: skip
+
+
+def test_run_hands_the_topic_to_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    plans: list[Plan] = []
+
+    def run_session(recording: Path, plan: Plan, out: Path, **how: Any) -> Path:
+        plans.append(plan)
+        return out
+
+    monkeypatch.setattr("liex_lab.api.run_session", run_session)
+    CliRunner().invoke(cli.app, ["run", "m01.mcap", "--topic", "/left/depth", "--out", str(tmp_path)])
+    assert plans[0].recording.topic == "/left/depth"
 
 
 def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,7 +51,7 @@ def test_every_column_is_one_with_its_unit() -> None:
 def test_every_verb_and_every_setting_exists() -> None:
     verbs = re.findall(r"^\| `(\w+)", section("The verbs"), re.MULTILINE)[1:]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
-    assert sorted(verbs) == ["demo", "doctor", "evaluate", "info", "run", "show", "train"]
+    assert sorted(verbs) == ["convert", "demo", "doctor", "evaluate", "info", "run", "show", "train"]
     assert all(verb in told for verb in verbs)
     plan = tomllib.loads(re.sub(r"^# (\w+) =$", r"\1 = 0", Plan.load("mouse").to_toml(), flags=re.MULTILINE))
     for table, key in re.findall(r"`(\w+)\.(\w+)(?:=[^`]*)?`", section("The plan").split("**Size.**")[0]):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from liex_lab.sessions.tables import FRAMES, Column, columns
 
 _OWN = "this library's choice"
@@ -77,5 +79,20 @@ SUMMARY: tuple[Column, ...] = columns(
     ("unlabelled_s", "float64", "s", "observed time that no rule names", "observed_s - time in bouts"),
     ("unlabelled_share", "float64", "", "share of the observed time that no rule names", "unlabelled_s / observed_s"),
 )  # fmt: skip
+
+
+def zone_columns(zones: Sequence[str]) -> tuple[Column, ...]:
+    """The columns of the summary that a session has because these zones were drawn."""
+    return columns("summary", *(
+        row
+        for zone in zones
+        for row in (
+            (f"zone_{zone}_s", "float64", "s", f"time in which the centroid lay in the zone {zone}",
+             "sum over its frames of the time to the next frame", _OWN),
+            (f"zone_{zone}_share", "float64", "", f"share of the observed time in the zone {zone}; zones may overlap",
+             f"zone_{zone}_s / observed_s", _OWN),
+        )
+    ))  # fmt: skip
+
 
 COLUMNS: tuple[Column, ...] = (*KINEMATICS, *BOUT_MEASURES, *SUMMARY)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from liex_lab.camera import Lens
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.progress import Progress, silent
+from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.times import Gap
@@ -14,15 +17,27 @@ from liex_lab.recordings.times import Gap
 __all__ = ["DepthFrame", "Gap", "Recording", "open_recording"]
 
 _READS = (
-    "a folder of 16-bit PNG or TIFF pictures with a camera.toml, a MoSeq session (its folder, depth.dat or .tar.gz), "
-    "a PrimeSense recording (.oni) or an MCAP file with Foxglove depth pictures"
+    "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix camera with a "
+    "raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or .tar.gz), a PrimeSense recording "
+    "(.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
-_ARCHIVES = (".tar.gz", ".tgz", ".tar")
-_PICTURES = (".png", ".tif", ".tiff")
-_VIDEOS = ("depth.avi", "depth.mkv")
+_PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
+_MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
+_ALONE = {  # how the name of a file ends that holds a whole recording: its module and function
+    ".tar.gz": "moseq.open_moseq", ".tgz": "moseq.open_moseq", ".tar": "moseq.open_moseq", ".avi": "moseq.open_moseq",
+    ".mkv": "moseq.open_moseq", ".mcap": "mcap.open_mcap", ".oni": "primesense.open_oni",
+    ".bag": "rosbag.open_bag", ".db3": "rosbag.open_bag",
+}  # fmt: skip
+_FILES = _ALONE | {".dat": "moseq.open_moseq"} | dict.fromkeys(_PICTURES, "images.open_images")
+_WITH_TOPICS = ("mcap.open_mcap", "rosbag.open_bag")
 _RAYTRIX = (
-    "is in Raytrix's own format, which only the maker's licensed software reads; export its depth maps as TIFF from "
-    "RxLive and give their folder"
+    "is in Raytrix's own format, which only the maker's licensed software reads; compute metric depth in RxLive, save "
+    "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, write a raytrix.toml "
+    'with the line profile = "raytrix-f32-negative-mm" into it, and give that folder'
+)
+_CLOUD = (
+    "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says what its numbers "
+    'mean, with a line such as profile = "raytrix-points-mm", and give the folder'
 )
 _EIGHT_BIT = (
     "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give the depth itself"
@@ -30,9 +45,28 @@ _EIGHT_BIT = (
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
-    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".avi", ".mov", ".webm"), _EIGHT_BIT),
-    **dict.fromkeys((".bag", ".db3", ".mkv", ".pclzf", ".pgm", ".ply", ".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
+    **dict.fromkeys((".ply", ".xyz"), _CLOUD),
+    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT),
+    **dict.fromkeys((".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
+
+
+@dataclass(frozen=True)
+class _How:
+    """What was asked for besides the path."""
+
+    camera: Lens | None
+    fps: float | None
+    topic: str | None
+    progress: Progress
+
+    def open(self, where: str, path: Path) -> Recording:
+        """By the function `where`, as in "moseq.open_moseq"; a format brings its libraries when it is asked for."""
+        module, name = where.split(".")
+        opener = getattr(import_module(f"liex_lab.recordings.{module}"), name)
+        topic = (self.topic,) if where in _WITH_TOPICS else ()
+        recording: Recording = opener(path, self.camera, self.fps, self.progress, *topic)
+        return recording
 
 
 def open_recording(
@@ -48,12 +82,13 @@ def open_recording(
 
     path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual mouse (see `open_synthetic`); camera:
     comes before whatever the files state, a `Lens` for pictures of any size; fps: used only where the files hold no
-    time stamps; topic: of an MCAP file with several depth topics; strict: refuse a recording that is cut short, instead
-    of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an index made.
+    time stamps; topic: of an MCAP file or a ROS bag with several depth topics; strict: refuse a recording that is cut
+    short, instead of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an
+    index made.
     """
     path = Path(path)
     try:
-        recording = _open(path, camera, fps, topic, progress)
+        recording = _open(path, _How(camera, fps, topic, progress))
     except OSError as error:
         raise RecordingError(f"{error.filename or path} cannot be read ({error.strerror or error}); check it") from None
     except RecordingError:
@@ -70,61 +105,53 @@ def open_recording(
     return recording
 
 
-def _open(path: Path, camera: Lens | None, fps: float | None, topic: str | None, progress: Progress) -> Recording:
-    name = path.name.lower()
+def _open(path: Path, how: _How) -> Recording:
     if str(path).startswith("synthetic:"):
         from liex_lab.recordings.walking import open_synthetic
 
-        return open_synthetic(str(path), camera)
+        return open_synthetic(str(path), how.camera)
     if not path.exists():
         raise RecordingError(f"there is no file or folder {path}; check the spelling")
     if path.is_dir():
-        return _open_folder(path, camera, fps, topic, progress)
-    if name.endswith(_PICTURES):
-        from liex_lab.recordings.images import open_images
+        return _open_folder(path, how)
+    from liex_lab.recordings.nyu import looks_like_nyu
 
-        return open_images(path, camera, fps, progress)
-    if name.endswith((*_ARCHIVES, ".dat")):
-        from liex_lab.recordings.moseq import open_moseq
-
-        return open_moseq(path, camera, fps, progress)
-    if name.endswith(".mcap"):
-        from liex_lab.recordings.mcap import open_mcap
-
-        return open_mcap(path, camera, fps, progress, topic)
-    if name.endswith(".oni"):
-        from liex_lab.recordings.primesense import open_oni
-
-        return open_oni(path, camera, fps, progress)
+    if looks_like_nyu(path.parent, [path.name]):
+        return how.open("nyu.open_nyu", path)
+    if (where := _reader(path.name)) is not None:
+        return how.open(where, path)
     why = _NOT_READ.get(path.suffix.lower())
     raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")
 
 
-def _open_folder(
-    folder: Path, camera: Lens | None, fps: float | None, topic: str | None, progress: Progress
-) -> Recording:
+def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
+    return next((where for end, where in files.items() if name.lower().endswith(end)), None)
+
+
+def _open_folder(folder: Path, how: _How) -> Recording:
+    from liex_lab.recordings.nyu import looks_like_nyu
+    from liex_lab.recordings.raytrix import PROFILE_FILE, looks_like_raytrix, no_profile_error
+
     inside = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     if not inside:
         raise RecordingError(f"{folder} is an empty folder; give {_READS}")
-    if "depth.dat" in inside:
-        from liex_lab.recordings.moseq import open_moseq
-
-        return open_moseq(folder, camera, fps, progress)
-    if video := next((name for name in _VIDEOS if name in inside), None):
-        from liex_lab.recordings.moseq import video_error
-
-        raise video_error(folder, video)
+    if any(name in inside for name in _MOSEQ):
+        return how.open("moseq.open_moseq", folder)
+    if PROFILE_FILE in inside:
+        return how.open("raytrix.open_raytrix", folder)
+    if CAMERA_FILE not in inside and looks_like_raytrix(folder, inside):
+        raise no_profile_error(folder)
+    if looks_like_nyu(folder, inside):
+        return how.open("nyu.open_nyu", folder)
     if "session.json" in inside:
         raise RecordingError(
             f"{folder} is a session, the result of a run; look at it with `liex show`, or give a recording"
         )
     if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
-        from liex_lab.recordings.images import open_images
-
-        return open_images(folder, camera, fps, progress)
-    files = [name for name in inside if name.lower().endswith((*_ARCHIVES, ".mcap", ".oni"))]
+        return how.open("images.open_images", folder)
+    files = [name for name in inside if _reader(name, _ALONE)]
     if len(files) == 1:
-        return _open(folder / files[0], camera, fps, topic, progress)
+        return _open(folder / files[0], how)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]
     raise RecordingError(
         f"{folder} holds no depth pictures and no depth.dat; "

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.progress import Progress
-from liex_lab.recordings._png import not_depth_error, one_size_error
+from liex_lab.recordings._pictures import none_whole_error, not_depth_error, one_size_error, too_large
 
 # tifffile reports damage twice, as an exception and in the log; the log would come out between our sentences
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
@@ -119,11 +119,7 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
             sizes.setdefault(size, path.name)
         progress(number, len(files), "looking at the pictures")
     if not any(page.whole for page in pages):
-        raise RecordingError(
-            f"none of the {len(files)} TIFF files in {files[0].parent} holds a whole picture; copy them again"
-            if len(files) > 1
-            else f"{files[0]} is cut short and holds no whole picture; copy it again"
-        )
+        raise none_whole_error(files, "TIFF")
     if len(sizes) > 1:
         raise one_size_error([(name, *size) for size, name in sizes.items()])
     ((width, height),) = sizes
@@ -151,7 +147,10 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
             ends = _list_ends(tif)
             return (_imagej_stack(tif, listed[0], size_bytes) if len(listed) == 1 else listed), size, ends
     except RecordingError:
-        raise
+        if not any(page.whole for page in listed):
+            raise
+        # damage inside a directory, or a picture of another kind behind the depth: the stack ends before it
+        return listed, size, False
     except Exception:  # the directory of a cut file is garbage, and comes out as almost any exception
         return listed, size, False
 
@@ -173,12 +172,14 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
         raise not_depth_error(str(path), f"{page.bitspersample}-bit {colour}", width, height)
     ends = [offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)]
     plain = page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
+    # without compression the size follows from the bytes; a directory that contradicts itself is damaged
+    agrees = page.compression != 1 or sum(page.databytecounts) == width * height * dtype.itemsize
     return _Page(
         path=path,
         page=index,
         offset=int(page.dataoffsets[0]) if plain else -1,
         dtype=page.parent.byteorder + dtype.kind + str(dtype.itemsize),
-        whole=bool(ends) and max(ends) <= size_bytes,
+        whole=bool(ends) and max(ends) <= size_bytes and agrees and not too_large((width, height)),
     )
 
 

@@ -7,6 +7,7 @@ import os
 import tarfile
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -17,6 +18,7 @@ from liex_lab.progress import Progress
 _BLOCK = 1 << 16
 _PACKED = 1 << 16  # bytes read at once
 _UNPACKED = 1 << 20  # and unpacked at once: an empty picture is a thousand times its packed size
+_PIECE = 256  # packed bytes tried at once where there is damage
 _ENOUGH_ZEROS = 1 << 22  # far more than the end of any tar; a walk that asks for more skips over what is missing
 _GZIP_MAGIC = b"\x1f\x8b"
 
@@ -87,12 +89,24 @@ class _Patient:
                 self.ended = True
                 return
             self._inflate = zlib.decompressobj(31)
+        spare = self._inflate.copy()
         try:
             self._buffer += self._inflate.decompress(self._pending, _UNPACKED)
             self._pending = self._inflate.unused_data if self._inflate.eof else self._inflate.unconsumed_tail
             self.whole = self._inflate.eof
         except zlib.error:
+            self._salvage(spare)
             self.ended, self.whole = True, False
+
+    def _salvage(self, inflate: zlib._Decompress) -> None:
+        """What comes out before the damage: zlib keeps back all of a piece in which it finds some."""
+        for size in (_PIECE, 1):
+            with suppress(zlib.error):
+                while self._pending:
+                    before = inflate.copy() if size > 1 else inflate
+                    self._buffer += inflate.decompress(self._pending[:size])
+                    self._pending = self._pending[size:]
+            inflate = before
 
 
 def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progress) -> Unpacked:

@@ -12,9 +12,9 @@ from liex_lab.errors import EstimationError
 from liex_lab.geometry import SE3
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.signedinteger]
 
-_N_SAMPLES = 6000  # pixels that vote for the plane
+_N_VOTERS, _N_TRIALS = 6000, 600  # pixels that vote for a plane, and planes tried
+_N_FITTED = 60_000  # pixels that the plane is fitted to
 _INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
 _MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
 _MAX_TILT_DEG = 60.0
@@ -66,29 +66,28 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
 
     Raises EstimationError where less than a fifth of the readable pixels lie on one plane that faces the camera.
     """
-    from sklearn.linear_model import LinearRegression, RANSACRegressor
-
+    if camera.distortion is not None:
+        raise EstimationError(
+            "a floor is found in pictures of a straight lens, but this camera's distortion was not undone; pass the "
+            "recording through liex_lab.recordings.rectify.rectified"
+        )
     rows, columns = np.nonzero(background > 0)
     if len(rows) < 500:
         raise EstimationError(
             f"a floor needs at least 500 readable background pixels, got {len(rows)}; check the depth unit and range"
         )
     rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(rows), min(_N_SAMPLES, len(rows)), replace=False)
-    uv = np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
-    inverse = 1.0 / background[rows[chosen], columns[chosen]].astype(float)
-    search = RANSACRegressor(
-        LinearRegression(),
-        min_samples=3,
-        max_trials=300,
-        loss=lambda true, found: np.abs(1.0 / true - 1.0 / np.maximum(found, 1e-6)),
-        residual_threshold=_INLIER_MM,
-        random_state=seed,
-    )
-    search.fit(uv, inverse)
-    floor = Floor.from_inverse_depth(np.array([*search.estimator_.coef_, search.estimator_.intercept_]), camera)
-    for _ in range(3):  # least squares on all pixels of the picture, not only on the voters
-        floor, share = _refit(background, rows, columns, floor, camera)
+    chosen = rng.choice(len(rows), min(_N_FITTED, len(rows)), replace=False)
+    rows, columns = rows[chosen], columns[chosen]
+    depth = background[rows, columns].astype(float)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    # pixels counted from the picture's middle, in units of its size: so the sums below lose no digits
+    points = np.stack([(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))], axis=1)
+    plane = _largest_plane(points[:_N_VOTERS], depth[:_N_VOTERS], camera.fx / middle[0], rng)
+    share = 0.0
+    for _ in range(3):  # least squares on many pixels, not only on the voters
+        plane, share = _refit(points, depth, plane)
+    floor = _in_pixels(plane, middle, camera)
     tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
     if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
         raise EstimationError(
@@ -98,15 +97,44 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     return floor
 
 
-def _refit(
-    background: NDArray[np.float32], rows: Indices, columns: Indices, floor: Floor, camera: Camera
-) -> tuple[Floor, float]:
-    """The plane again from every pixel near it, and the share of pixels that are."""
-    a, b, c = floor.inverse_depth
-    depth = background[rows, columns].astype(float)
-    near = np.abs(depth - 1.0 / np.maximum(a * columns + b * rows + c, 1e-6)) < _INLIER_MM
+def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Generator) -> Array:
+    """The plane (3,), 1 / depth = points . plane, that the most points (n, 3) are on, out of many through three each.
+
+    Planes that do not face the camera (a wall) do not stand. All are tried on some points, the best few on more.
+    focal: in the units of the points.
+    """
+    three = rng.integers(0, len(depth), (_N_TRIALS, 3))
+    p, w = points[three], 1.0 / depth[three]
+    ends = np.stack([p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]], axis=1)
+    rise = np.stack([w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]], axis=1)
+    area = ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]
+    area = np.where(np.abs(area) > 1e-4, area, np.nan)  # three points in a line
+    a = (rise[:, 0] * ends[:, 1, 1] - rise[:, 1] * ends[:, 0, 1]) / area
+    b = (ends[:, 0, 0] * rise[:, 1] - ends[:, 1, 0] * rise[:, 0]) / area
+    planes = np.stack([a, b, w[:, 0] - a * p[:, 0, 0] - b * p[:, 0, 1]], axis=1)
+    steepness = np.hypot(a, b) * focal / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)  # tangent of the tilt
+    planes = planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))]
+    for n_kept, n_voters in ((20, _N_VOTERS // 6), (1, _N_VOTERS)):
+        votes = _is_near(points[:n_voters] @ planes.T, depth[:n_voters, None]).sum(axis=0)
+        planes = planes[np.argsort(-votes, kind="stable")[:n_kept]]
+    return planes[0] if len(planes) else np.array([0.0, 0.0, 1.0 / float(np.median(depth))])
+
+
+def _is_near(inverse: Array, depth: Array) -> NDArray[np.bool_]:
+    """Whether points at `depth` lie within `_INLIER_MM` of a plane that has 1 / z = inverse there."""
+    return np.asarray(np.abs(depth * inverse - 1.0) < _INLIER_MM * inverse)
+
+
+def _in_pixels(plane: Array, middle: Array, camera: Camera) -> Floor:
+    a, b, c = plane / [middle[0], middle[0], 1.0]
+    return Floor.from_inverse_depth(np.array([a, b, c - a * middle[0] - b * middle[1]]), camera)
+
+
+def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
+    """The plane again from every point near it, and the share of points that are."""
+    near = _is_near(points @ plane, depth)
     if near.sum() < 3:
-        return floor, 0.0
-    design = np.stack([columns[near], rows[near], np.ones(near.sum())], axis=1)
-    coefficients, *_ = np.linalg.lstsq(design, 1.0 / depth[near], rcond=None)
-    return Floor.from_inverse_depth(coefficients, camera), float(near.mean())
+        return plane, 0.0
+    some = points[near]
+    fitted = np.linalg.lstsq(some.T @ some, some.T @ (1.0 / depth[near]), rcond=None)[0]
+    return np.asarray(fitted, float), float(near.mean())

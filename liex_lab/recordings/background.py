@@ -58,13 +58,26 @@ def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> 
     """
     import cv2
 
-    flat = ((background > 0) & (np.abs(background - bare) < _FLAT_MM)).astype(np.uint8)
+    patch = floor_patch(background, bare)
+    if not patch.any():
+        return near_plane(background, bare)
+    region = np.zeros(patch.shape, np.uint8)
+    cv2.fillConvexPoly(region, cv2.convexHull(cv2.findNonZero(patch.astype(np.uint8))), 1)
+    return region.astype(bool)
+
+
+def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The largest connected part (H, W) of the background (H, W) mm that lies on the bare floor (H, W) mm."""
+    import cv2
+
+    flat = near_plane(background, bare).astype(np.uint8)
     opened = cv2.morphologyEx(flat, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
     n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
     if n < 2:
-        return flat.astype(bool)
-    largest = (labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))).astype(np.uint8)
-    points = cv2.findNonZero(largest)
-    region = np.zeros(flat.shape, np.uint8)
-    cv2.fillConvexPoly(region, cv2.convexHull(points), 1)
-    return region.astype(bool)
+        return np.zeros(flat.shape, np.bool_)
+    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
+
+
+def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H, W) the background lies on the bare floor, or nearly."""
+    return (background > 0) & (np.abs(background - bare) < _FLAT_MM)

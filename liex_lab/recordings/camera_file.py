@@ -9,8 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from liex_lab.camera import Camera, Lens
-from liex_lab.errors import RecordingError
+from liex_lab.camera import Camera, Distortion, Lens
+from liex_lab.errors import LiexError, RecordingError
+from liex_lab.recordings.encodings import ENCODINGS, Stored, decode, own_unit_mm
+from liex_lab.recordings.frame import Depth
+from liex_lab.recordings.stamp_files import UNITS
 from liex_lab.recordings.times import start_of_day
 
 CAMERA_FILE = "camera.toml"
@@ -20,17 +23,23 @@ WHAT_TO_WRITE = (
 )
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
-_TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time")
-_KEYS = (*_NUMBERS, "unread", *_TEXTS)
+_TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
+_WORDS: dict[str, tuple[str, ...]] = {  # keys that take one of a few words
+    "encoding": ENCODINGS, "byte_order": ("big", "little"), "time_unit": tuple(UNITS),
+}  # fmt: skip
+_KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
 
 
 @dataclass(frozen=True)
 class CameraFile:
     """What a camera.toml states, under [camera] or at its top; everything may be left out.
 
-    intrinsics: any of fx, fy, cx, cy; width, height: pixels; unit_mm: millimetres per stored step; unread: stored
-    values that mean "no reading"; fps: used where there are no stamps; timestamps: name of the stamp file; pattern:
-    which pictures of the folder to read, as in "*_depth.png"; metadata: subject_id, session_start_time.
+    intrinsics: any of fx, fy, cx, cy; distortion: of the lens, from distortion (a list of coefficients in OpenCV's
+    order) and distortion_model; width, height: pixels; unit_mm: millimetres per stored step; unread: stored values that
+    mean "no reading"; encoding: how stored values mean depth, a key of `encodings`; byte_order: of PGM pictures, "big"
+    or "little"; fps: used where there are no stamps; timestamps: name of the stamp file, time_column and time_unit: its
+    column of times, see `read_csv_times`; pattern: which pictures of the folder to read, as in "*_depth.png"; metadata:
+    subject_id, session_start_time; source: who says all this.
     """
 
     path: Path
@@ -39,11 +48,17 @@ class CameraFile:
     height: int | None = None
     unit_mm: float = 1.0
     unread: tuple[float, ...] = (0.0,)
+    encoding: str = "linear"
+    byte_order: str | None = None
     fps: float | None = None
     timestamps: str = "timestamps.csv"
+    time_column: str | int | None = None
+    time_unit: str | None = None
     pattern: str = "*"
     metadata: dict[str, str] = field(default_factory=dict)
+    source: str = CAMERA_FILE
     problems: tuple[str, ...] = ()
+    distortion: Distortion | None = None
 
     @staticmethod
     def read(path: Path) -> CameraFile:
@@ -61,6 +76,10 @@ class CameraFile:
         unknown = [key for key in table if key not in _KEYS]
         return _from_table(path, table, tuple(_unknown_key(path, key) for key in unknown))
 
+    def decode(self, stored: Stored) -> Depth:
+        """Stored values -> depth (H, W) float32 mm."""
+        return decode(stored, self.encoding, self.unit_mm, self.unread)
+
     def camera(self, width: int, height: int, stated: Lens | None = None) -> Camera:
         """The camera of pictures of this size; `stated` comes before the file."""
         if stated is not None:
@@ -70,13 +89,17 @@ class CameraFile:
         missing = [name for name in _INTRINSICS if name not in self.intrinsics]
         if missing:
             raise RecordingError(f"{self.path} does not state {', '.join(missing)}; {WHAT_TO_WRITE}")
-        camera = Camera(**self.intrinsics, width=self.width or width, height=self.height or height, source=CAMERA_FILE)
+        camera = Camera(
+            **self.intrinsics, width=self.width or width, height=self.height or height, source=self.source,
+            distortion=self.distortion,
+        )  # fmt: skip
         return fitting(camera, width, height, str(self.path))
 
 
 def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
     """The camera itself, if it belongs to pictures of this size; one stated without a size belongs to any."""
-    camera = lens if isinstance(lens, Camera) else Camera(lens.fx, lens.fy, lens.cx, lens.cy, width, height)
+    bare = (lens.fx, lens.fy, lens.cx, lens.cy, width, height)
+    camera = lens if isinstance(lens, Camera) else Camera(*bare, distortion=lens.distortion)
     if (camera.width, camera.height) != (width, height):
         raise RecordingError(
             f"{where} is for pictures of {camera.width} x {camera.height} pixels, but these have {width} x {height}; "
@@ -106,7 +129,14 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
             )
     if numbers.get("unit_mm", 1.0) == 0.0:
         raise RecordingError(f"{path} states unit_mm = 0; it is the number of millimetres in one stored step")
-    for key in ("timestamps", "pattern", "subject_id"):
+    for key, words in _WORDS.items():
+        if table.get(key, words[0]) not in words:
+            listed = ", ".join(f'"{word}"' for word in words)
+            raise RecordingError(f"{path} states {key} = {table[key]!r}; it is one of {listed}")
+    column = table.get("time_column")
+    if column is not None and not (isinstance(column, str) and column) and not (type(column) is int and column >= 0):
+        raise RecordingError(f"{path} states time_column = {column!r}; it is a column's name, or its number from 0")
+    for key in ("timestamps", "pattern", "subject_id", "distortion_model"):
         if key in table and not (isinstance(table[key], str) and table[key]):
             raise RecordingError(f"{path} states {key} = {table[key]!r}; it is a text in quotation marks")
     metadata = {"subject_id": table["subject_id"]} if "subject_id" in table else {}
@@ -123,14 +153,32 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
         intrinsics={key: numbers[key] for key in _INTRINSICS if key in numbers},
         width=int(numbers["width"]) if "width" in numbers else None,
         height=int(numbers["height"]) if "height" in numbers else None,
-        unit_mm=numbers.get("unit_mm", 1.0),
+        unit_mm=numbers.get("unit_mm", own_unit_mm(table.get("encoding", "linear"))),
         unread=tuple(_number(path, "unread", value, finite=False) for value in unread),
+        encoding=table.get("encoding", "linear"),
+        byte_order=table.get("byte_order"),
         fps=rate(numbers.get("fps"), str(path)),
         timestamps=table.get("timestamps", "timestamps.csv"),
+        time_column=column,
+        time_unit=table.get("time_unit"),
         pattern=table.get("pattern", "*"),
         metadata=metadata,
         problems=problems,
+        distortion=_distortion(path, table),
     )
+
+
+def _distortion(path: Path, table: dict[str, Any]) -> Distortion | None:
+    values = table.get("distortion", [])
+    if not isinstance(values, list):
+        raise RecordingError(
+            f"{path} states distortion = {values!r}; it is a list of coefficients, as in [-0.1, 0.02, 0, 0]"
+        )
+    coefficients = [_number(path, "distortion", value) for value in values]
+    try:
+        return Distortion.of(table.get("distortion_model", "plumb_bob"), coefficients)
+    except LiexError as error:
+        raise RecordingError(f"{path}: {error}") from None
 
 
 def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:

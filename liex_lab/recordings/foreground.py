@@ -96,7 +96,7 @@ class Scene:
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit).astype(np.float32)
-            still = replace(scene, limit=bare_limit, background=bare)
+            still = replace(scene, limit=bare_limit, background=np.where(on_floor, bare, background))
             still_area, still_share = still.usual_area(sample, spine_mm)
             if still_share > share:
                 scene, area, share = still, still_area, still_share

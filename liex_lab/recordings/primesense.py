@@ -27,7 +27,7 @@ from liex_lab.recordings._oni_records import OniFile
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
 from liex_lab.recordings.frame import Depth, depth_mm
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.times import Times, from_rate, increasing, start_of_clock
+from liex_lab.recordings.times import Settled, from_rate, settle, start_of_clock
 
 RAW, WITH_TABLE, WITHOUT_TABLE = b"NONE", b"16zT", b"16zP"
 _CODECS = (RAW, WITH_TABLE, WITHOUT_TABLE)
@@ -133,7 +133,8 @@ def _open(path: Path, file: OniFile, camera: Lens | None, fps: float | None, pro
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems += camera_file.problems
     the_camera = _camera(path, node, look, camera_file, camera, problems)
-    times = _times(node, look, fps, problems)
+    settled = _times(node, look, fps, problems)
+    times = settled.times_ns
     frames = OniFrames(file, node, look, camera_file, problems)
     if not any(frames.decode(i) is not None for i in np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()):
         raise RecordingError(
@@ -143,7 +144,7 @@ def _open(path: Path, file: OniFile, camera: Lens | None, fps: float | None, pro
     start = start_of_clock(int(times[0]))
     return Recording(
         name=path.resolve().stem, format="oni", camera=the_camera, times_ns=times, read=frames.read, sources=[path],
-        problems=problems, truncated=not whole, close=file.close,
+        problems=problems, truncated=not whole, close=file.close, faults=settled.faults,
         metadata=({"session_start_time": start} if start else {}) | camera_file.metadata,
     )  # fmt: skip
 
@@ -203,7 +204,7 @@ def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
     return look
 
 
-def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) -> Times:
+def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) -> Settled:
     """Microseconds as ns; a rate where the clock stood still."""
     stamps = np.frombuffer(node.times_us, node.times_us.typecode)
     n = len(stamps)
@@ -212,7 +213,7 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
         hz = stated or float(look.fps if 0 < look.fps <= 1000 else _NOMINAL_HZ)
         origin = "as stated" if stated else "which the file names as its rate; state fps if yours differs"
         problems.append(f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, {origin}")
-        return from_rate(n, hz)
+        return settle(from_rate(n, hz))
     order = np.arange(n)
     sane = np.maximum.accumulate(np.where(stamps <= _LATEST_US, order, 0))
     if n_wild := int((sane != order).sum()):
@@ -221,9 +222,9 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
             "follow the one before at once"
         )
     times_us = np.minimum(stamps[sane], np.uint64(_LATEST_US)).astype(np.int64)
-    times, moved = increasing(times_us * 1000 + (order - sane))
-    problems += [moved] if moved else []
-    return times
+    settled = settle(times_us * 1000 + (order - sane))
+    problems += [settled.problem] if settled.problem else []
+    return settled
 
 
 def _camera(

@@ -138,7 +138,11 @@ class OniWriter:
             if kind is None:
                 self.close()
         finally:
-            self._file.close()
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Let go of the file as it is."""
+        self._file.close()
 
     def _write(self, kind: int, fields: bytes = b"", payload: bytes = b"", undoes: int = 0, node: int = _NODE) -> None:
         size = records.HEADER.size + len(fields)

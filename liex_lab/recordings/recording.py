@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,7 +17,7 @@ from liex_lab.camera import Camera
 from liex_lab.errors import RecordingError
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.times import Gap, find_gaps, median_step
+from liex_lab.recordings.times import FAULTS, JUMPED, Gap, find_faults, find_gaps, median_step
 
 Times = NDArray[np.int64]
 
@@ -32,7 +33,7 @@ class Recording:
     name; format ("images", "moseq", "mcap", ...); camera; times_ns (n,) int64 on the recording's own clock, strictly
     increasing; problems: sentences about what is odd in the file, also those found while reading; truncated: the file
     is cut or damaged, and n_whole of its frames are whole; metadata: subject_id and session_start_time (ISO 8601 with
-    zone) where the file tells them.
+    zone) where the file tells them; optics: what was undone on reading, empty where nothing was (see `rectify`).
     """
 
     def __init__(
@@ -51,23 +52,30 @@ class Recording:
         close: Callable[[], None] | None = None,
         step_ns: int | None = None,
         stored: NDArray[np.int64] | None = None,
+        faults: NDArray[np.uint8] | None = None,
     ) -> None:
-        """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from its parent."""
+        """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from its parent.
+
+        faults (n,): which stamps were moved and why, see `Settled`.
+        """
         self.name, self.format, self.camera = name, format, camera
         self.times_ns = np.ascontiguousarray(times_ns, np.int64)
         self.problems: list[str] = [] if problems is None else problems
         self.truncated = truncated
         self.n_whole = len(self.times_ns) if n_whole is None else n_whole
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
+        self.optics: dict[str, Any] = {}
         self._read, self._sources = read, tuple(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
+        self._faults = np.zeros(len(self.times_ns), np.uint8) if faults is None else faults
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
         self._digest: str | None = None
         self._whole: Recording | None = None
+        self._closed = False
         if not len(self.times_ns):
             raise RecordingError(f"{name} holds no frame; a recording has at least one")
         if not np.all(np.diff(self.times_ns) > 0):
-            raise RecordingError(f"the time stamps of {name} do not increase strictly; pass them through `increasing`")
+            raise RecordingError(f"the time stamps of {name} do not increase strictly; pass them through `settle`")
         self.times_ns.flags.writeable = False
         # at the latest when nobody holds the recording any more, or the program ends
         self._close = None if close is None else weakref.finalize(self, close)
@@ -95,7 +103,18 @@ class Recording:
     @property
     def gaps(self) -> list[Gap]:
         """Where the camera left out frames: steps of more than 1.5 median steps."""
-        return find_gaps(self.times_ns, self._step_ns)
+        found = find_gaps(self.times_ns, self._step_ns)
+        return [replace(gap, reason=JUMPED) if self._jumped(gap) else gap for gap in found]
+
+    def _jumped(self, gap: Gap) -> bool:
+        return FAULTS[self._faults[gap.start_frame]] == JUMPED
+
+    @property
+    def faults(self) -> list[Gap]:
+        """The frames whose stamps had to be moved: repeated, out of order, or wild; clock jumps are among the gaps."""
+        joined = {gap.start_frame for gap in self.gaps if self._jumped(gap)}
+        found = find_faults(self.times_ns, self._step_ns, self._faults)
+        return [fault for fault in found if fault.start_frame not in joined]
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -107,6 +126,8 @@ class Recording:
         """Frame `index`, counted from 0, or from the end when negative."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of a recording of {len(self)} frames")
+        if (self._whole or self)._closed:
+            raise RecordingError(f"{self.name} was closed; open it again to read from it")
         row = index % len(self)
         return DepthFrame(row, int(self.times_ns[row]), self._read(int(self._stored[row])))
 
@@ -132,9 +153,25 @@ class Recording:
             name=self.name, format=self.format, camera=self.camera, times_ns=self.times_ns[rows].copy(),
             read=self._read, sources=self._sources, problems=self.problems, truncated=self.truncated,
             metadata=self.metadata, step_ns=self._step_ns * step, stored=self._stored[rows],
+            faults=self._faults[rows],
         )  # fmt: skip
-        cut._whole = self._whole or self
+        cut._whole, cut.optics = self._whole or self, self.optics
         return cut
+
+    def seen_by(self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]) -> Recording:
+        """The same frames as another camera would have seen them: `change` turns each depth picture when it is read.
+
+        The input, and so the digest, stays the same; closing one closes both.
+        """
+        read = self._read
+        other = Recording(
+            name=self.name, format=self.format, camera=camera, times_ns=self.times_ns.copy(),
+            read=lambda number: change(read(number)), sources=self._sources, problems=self.problems,
+            truncated=self.truncated, n_whole=self.n_whole, metadata=self.metadata, step_ns=self._step_ns,
+            stored=self._stored, close=self.close, faults=self._faults,
+        )  # fmt: skip
+        other._whole, other.optics = self._whole or self, optics
+        return other
 
     def digest(self, progress: Progress = silent) -> str:
         """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in order of name.
@@ -155,6 +192,7 @@ class Recording:
 
     def close(self) -> None:
         """Let go of files, and remove what was unpacked; a slice leaves that to the recording it was cut from."""
+        self._closed = self._whole is None
         if self._close is not None:
             self._close()
 

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import csv
 from bisect import bisect_right
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from decimal import Decimal, InvalidOperation
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import RecordingError
-
 Times = NDArray[np.int64]
 
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
-CSV_COLUMNS = {"time_ns": 1, "time_ms": 10**6, "time_s": 10**9}  # column of timestamps.csv: nanoseconds per unit
-_LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
+CLOCK_JUMP_NS = 60 * 10**9  # no camera drops frames for a minute: it was stopped, or its clock was set
+_SURE = 5  # frames on either side that tell a lasting jump of the clock from a few stamps out of order
+LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
 _PLAUSIBLE_START_NS = 946_684_800 * 10**9  # the year 2000: earlier stamps count from something else than 1970
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Frames that the camera did not deliver.
+    """A place where the recording's time is not what a steady camera would have written.
 
-    Half open, like every interval here: start_frame = stop_frame = the frame after the gap, for no frame lies inside;
-    from start_ns, one median step after the last frame before, to stop_ns, the time of the frame after.
+    Half open, like every interval here. Frames that the camera did not deliver: start_frame = stop_frame = the frame
+    after the gap, for no frame lies inside; from start_ns, one median step after the last frame before, to stop_ns, the
+    time of the frame after. A stamp that had to be moved: the one frame it belongs to, n_frames_missing = 0.
     """
 
     start_frame: int
@@ -38,13 +35,31 @@ class Gap:
     reason: str = "camera_dropped"
 
 
+JUMPED = "clock_jumped"
+FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `Settled.faults` counts
+_REPEATED, _OUT_OF_ORDER, _JUMPED = 1, 2, 3  # their places in it
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Stamps made strictly increasing.
+
+    times_ns (n,); faults (n,) uint8, index into `FAULTS`: why this frame's stamp was moved, 0 for one that stayed;
+    problem: a sentence about what was moved, None where nothing was.
+    """
+
+    times_ns: Times
+    faults: NDArray[np.uint8]
+    problem: str | None
+
+
 def median_step(times_ns: Times) -> int:
     """The median time between neighbouring frames, ns; 0 for fewer than two frames."""
     return int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
 
 
 def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
-    """The places where more than 1.5 steps of `step_ns` lie between two frames."""
+    """The places where more than 1.5 steps of `step_ns` lie between two frames; 'clock_jumped' if over a minute."""
     if step_ns <= 0:
         return []
     dt = np.diff(times_ns)
@@ -55,8 +70,17 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
             start_ns=int(times_ns[i]) + step_ns,
             stop_ns=int(times_ns[i + 1]),
             n_frames_missing=round(int(dt[i]) / step_ns) - 1,
+            reason=JUMPED if dt[i] > CLOCK_JUMP_NS else "camera_dropped",
         )
         for i in np.flatnonzero(dt > GAP_FACTOR * step_ns)
+    ]
+
+
+def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> list[Gap]:
+    """The frames whose stamps were moved, as `Settled.faults` counts them."""
+    stops = np.append(times_ns[1:], times_ns[-1:] + max(step_ns, 1))
+    return [
+        Gap(int(i), int(i) + 1, int(times_ns[i]), int(stops[i]), 0, FAULTS[faults[i]]) for i in np.flatnonzero(faults)
     ]
 
 
@@ -65,14 +89,71 @@ def from_rate(n_frames: int, fps: float) -> Times:
     return np.round(np.arange(n_frames) * (1e9 / fps)).astype(np.int64)
 
 
-def increasing(times_ns: Times) -> tuple[Times, str | None]:
-    """The stamps made strictly increasing, frames in file order, and a sentence about what was moved, if anything.
+def settle(times_ns: Times) -> Settled:
+    """The stamps made strictly increasing, frames in file order, without hiding what was moved.
 
-    The most stamps that can stay do stay, exactly (the longest chain that increases), so that one wild stamp does not
-    drag its neighbours along; each of the others moves to the nearest nanosecond that fits between those that stay.
+    A clock that was set back, or wrapped around, while frames went on coming is let go on from where it was, as if one
+    frame were missing there: how long the jump really took, nobody knows. After that the most stamps that can stay do
+    stay, exactly (the longest chain that increases), so that one wild stamp does not drag its neighbours along; each of
+    the others moves to the nearest nanosecond that fits between those that stay.
     """
     if np.all(np.diff(times_ns) > 0):
-        return times_ns, None
+        return Settled(times_ns, np.zeros(len(times_ns), np.uint8), None)
+    joined, jumps = _join_clocks(times_ns)
+    times = _least_moved(joined)
+    moved = times != joined
+    faults = np.where(moved, np.where(np.abs(times - joined) > CLOCK_JUMP_NS, _JUMPED, _OUT_OF_ORDER), 0)
+    repeated = np.zeros(len(times), bool)
+    repeated[1:] = times_ns[1:] == times_ns[:-1]
+    repeated[:-1] |= repeated[1:]
+    faults[moved & repeated] = _REPEATED
+    faults[jumps] = _JUMPED
+    sentences = []
+    if len(jumps):
+        first = int(jumps[0])
+        back_s = float(times_ns[first - 1] - times_ns[first]) / 1e9
+        sentences.append(
+            f"the clock jumps back in {len(jumps)} places, the first by {back_s:.3f} s at frame {first}; time was "
+            "taken to go on there as after one missing frame"
+        )
+    if moved.any():
+        largest_ms = float(np.abs(times - joined).max()) / 1e6
+        sentences.append(
+            f"time stamps do not increase: {int(moved.sum())} of {len(times)} are repeated or out of order; "
+            f"frames were kept in file order and these stamps moved as little as possible, at most {largest_ms:.3f} ms"
+        )
+    return Settled(times, faults.astype(np.uint8), "; ".join(sentences))
+
+
+def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
+    """The stamps with every lasting jump back taken out, and the frames (k,) at which the clock jumps.
+
+    Lasting: `_SURE` stamps before it increase, and `_SURE` from it on increase without reaching the one before it. What
+    is shorter is frames out of order, or one wild stamp.
+    """
+    dt = np.diff(times_ns)
+    back = np.flatnonzero(dt <= 0) + 1
+    rising = np.concatenate([[0], np.cumsum(dt > 0)])  # how many of the steps up to a frame go up
+    jumps = [
+        int(i)
+        for i in back
+        if i >= _SURE
+        and i + _SURE <= len(times_ns)
+        and rising[i - 1] - rising[i - _SURE] == _SURE - 1
+        and rising[i + _SURE - 1] - rising[i] == _SURE - 1
+        and times_ns[i + _SURE - 1] < times_ns[i - 1]
+    ]
+    step = max(1, int(np.median(dt[dt > 0]))) if jumps else 1
+    shifts = [int(times_ns[i - 1]) - int(times_ns[i]) + 2 * step for i in jumps]
+    if sum(shifts) + int(np.abs(times_ns).max()) >= LIMIT_NS:  # noise, not clocks
+        return times_ns, np.array([], np.int64)
+    steps = np.zeros(len(times_ns), np.int64)
+    steps[jumps] = shifts
+    return times_ns + np.cumsum(steps), np.array(jumps, np.int64)
+
+
+def _least_moved(times_ns: Times) -> Times:
+    """The stamps made strictly increasing by moving as few of them as possible, each to the nearest place."""
     # Integers that must increase by at least 1 are integers minus their rank that must not decrease.
     rank = np.arange(len(times_ns), dtype=np.int64)
     slack = times_ns - rank
@@ -81,12 +162,7 @@ def increasing(times_ns: Times) -> tuple[Times, str | None]:
     for i in np.flatnonzero(~np.isin(rank, keep)):
         floor = int(settled[i - 1]) if i else ceiling[0]
         settled[i] = min(max(int(slack[i]), floor), ceiling[i])
-    moved = settled != slack
-    largest_ms = float(np.abs(settled - slack).max()) / 1e6
-    return settled + rank, (
-        f"time stamps do not increase: {int(moved.sum())} of {len(times_ns)} are repeated or out of order; "
-        f"frames were kept in file order and these stamps moved as little as possible, at most {largest_ms:.3f} ms"
-    )
+    return settled + rank
 
 
 def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
@@ -112,73 +188,8 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
 def _next_kept(slack: Times, keep: NDArray[np.int64]) -> list[int]:
     """For every index the value of the next kept stamp at or after it; the limit after the last."""
     position = np.searchsorted(keep, np.arange(len(slack)))
-    values = np.append(slack[keep], _LIMIT_NS)
+    values = np.append(slack[keep], LIMIT_NS)
     return [int(v) for v in values[position]]
-
-
-def to_ns(text: str, ns_per_unit: int) -> int:
-    """A decimal number as integer nanoseconds, exactly: a float64 of seconds since 1970 is good to 200 ns only."""
-    value = Decimal(text.strip()) * ns_per_unit
-    if not value.is_finite() or abs(value) >= _LIMIT_NS:
-        raise InvalidOperation(f"{text} is not a time")
-    return int(value.to_integral_value())
-
-
-def read_csv_times(path: Path) -> Times:
-    """The stamps of a timestamps.csv with a header that names a column time_ns, time_ms or time_s."""
-    lines = _lines(path)
-    delimiter = next((d for d in ",;\t" if d in lines[0]), ",") if lines else ","
-    rows = list(csv.reader(lines, delimiter=delimiter))
-    header = [name.strip().strip('"') for name in rows[0]] if rows else []
-    column = next((name for name in CSV_COLUMNS if name in header), None)
-    if column is None:
-        raise RecordingError(
-            f"{path} should begin with a line that names a column time_ns or time_s, but its first line is "
-            f"{_shorten(lines[0]) if lines else 'missing'!r}; add that header line"
-        )
-    place = header.index(column)
-    cells = [(number, row[place] if place < len(row) else "") for number, row in enumerate(rows[1:], start=2) if row]
-    return _parse(path, cells, CSV_COLUMNS[column])
-
-
-def read_column_times(path: Path, ns_per_unit: int) -> Times:
-    """The stamps in column 0 of a file of numbers parted by blanks or commas; a header line is passed over."""
-    rows = [(number, line.replace(",", " ").split()) for number, line in enumerate(_lines(path), start=1)]
-    cells = [(number, row[0]) for number, row in rows if row]
-    if cells and not _is_number(cells[0][1]):
-        cells = cells[1:]
-    return _parse(path, cells, ns_per_unit)
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path} should be a text file with one time stamp per line, but it is not text") from None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return Decimal(text).is_finite()
-    except InvalidOperation:
-        return False
-
-
-def _parse(path: Path, cells: list[tuple[int, str]], ns_per_unit: int) -> Times:
-    times = np.empty(len(cells), np.int64)
-    for i, (number, text) in enumerate(cells):
-        try:
-            times[i] = to_ns(text, ns_per_unit)
-        except InvalidOperation:
-            raise RecordingError(
-                f"{path} holds {_shorten(text)!r} on line {number} where a time stamp was expected; "
-                "correct or remove that line"
-            ) from None
-    return times
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def match_counts(n_frames: int, times_ns: Times, frames_from: str, times_from: str) -> tuple[int, str | None]:

@@ -5,26 +5,26 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
+from liex_lab.recordings.walls import UNKNOWN, Arena
 
 if TYPE_CHECKING:
     from liex_lab.plan import Plan
     from liex_lab.recordings.arena import Floor
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.times import Gap
+    from liex_lab.recordings.zones import Zone
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _PACKAGES = (
     "liex_lab", "numpy", "scipy", "numba", "scikit-learn", "pandas", "pyarrow", "opencv-python-headless", "rerun-sdk",
     "mcap", "foxglove-sdk",
@@ -36,9 +36,12 @@ class Provenance:
     """What is known about a recording before its first frame is written.
 
     name: the session's id; individual: the animal's name in it; T_arena_camera and floor_distance_mm: the camera's
-    place above the floor; input_sha256: of the recording's bytes; plan_toml: the plan as resolved; n_frames: expected,
-    None when unknown; gaps: what the camera did not deliver; problems: sentences about the recording; subject: any of
-    subject_id, group, cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin.
+    place above the floor; input_sha256: of the recording's bytes; profile: how its stored numbers were read, where a
+    profile says so; plan_toml: the plan as resolved; n_frames: expected, None when unknown; gaps: what the camera did
+    not deliver, and stamps that were moved; problems: sentences about the recording; subject: any of subject_id, group,
+    cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin; optics: what was undone
+    of lens and water, for then `camera` is the ideal one; arena: the shape of the floor; zones: those that a person has
+    drawn on it.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Provenance:
     input_sha256: str
     plan_toml: str = ""
     format: str = ""
+    profile: dict[str, Any] = field(default_factory=dict)
     individual: str = "animal_1"
     n_frames: int | None = None
     gaps: Sequence[Gap] = ()
@@ -58,6 +62,9 @@ class Provenance:
     session_start_time: str = ""
     model: dict[str, str] = field(default_factory=dict)
     animal_size: dict[str, Any] = field(default_factory=dict)
+    optics: dict[str, Any] = field(default_factory=dict)
+    arena: Arena = UNKNOWN
+    zones: Sequence[Zone] = ()
 
     @staticmethod
     def of(recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any) -> Provenance:
@@ -68,17 +75,20 @@ class Provenance:
             "name": recording.name, "skeleton": skeleton, "camera": recording.camera,
             "T_arena_camera": floor.T_arena_camera, "floor_distance_mm": floor.distance_mm,
             "input_sha256": recording.digest(), "plan_toml": plan.to_toml(), "format": recording.format,
-            "individual": stated.individual, "n_frames": len(recording), "gaps": recording.gaps,
+            "profile": dict(told.get("profile", {})), "individual": stated.individual, "n_frames": len(recording),
+            "gaps": [*recording.gaps, *recording.faults],
             "problems": list(recording.problems), "truncated": recording.truncated,
             "subject": {name: str(value) for name, value in subject.items() if value},
             "session_start_time": stated.session_start_time or told.get("session_start_time") or "",
+            "optics": recording.optics,
         }  # fmt: skip
         return Provenance(**{**known, **more})
 
     @property
     def calibration_hash(self) -> str:
         """Hash of the camera's numbers and its place in the arena."""
-        return _hash({**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist()})
+        place = {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist()}
+        return _hash({**place, "optics": self.optics} if self.optics else place)
 
     @property
     def recording_id(self) -> str:
@@ -104,10 +114,13 @@ class Provenance:
             "session_start_time": self.session_start_time or None,
             "versions": versions(),
             "input": {"name": self.name, "format": self.format, "sha256": self.input_sha256,
-                      "truncated": self.truncated},
+                      "truncated": self.truncated, **({"profile": self.profile} if self.profile else {})},
             "plan": plan_table(self.plan_toml),
             "camera": {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist(),
-                       "floor_distance_mm": float(self.floor_distance_mm), "calibration_hash": self.calibration_hash},
+                       "floor_distance_mm": float(self.floor_distance_mm), "calibration_hash": self.calibration_hash,
+                       "optics": self.optics},
+            "arena": self.arena.to_dict(),
+            "zones": [zone.to_dict() for zone in self.zones],
             "animal": {"name": self.skeleton.name, "joints": list(self.skeleton.names),
                        "bones": [list(edge) for edge in self.skeleton.edges], "home_length_mm": self.skeleton.length,
                        **self.animal_size},
@@ -135,21 +148,6 @@ def package_version(name: str) -> str:
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
     return {"python": platform.python_version(), **{name: package_version(name) for name in _PACKAGES}}
-
-
-def peak_memory_mb() -> float | None:
-    """The most memory this process has held, MB; None where the system does not tell."""
-    status = Path("/proc/self/status")  # getrusage would also count the process that started this one
-    if status.is_file():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024.0
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _hash(value: Any) -> str:

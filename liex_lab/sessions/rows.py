@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
+from liex_lab.recordings.walls import UNKNOWN, Arena
+from liex_lab.recordings.zones import Zone, zone_names
 from liex_lab.sessions.tables import ROWS_PER_GROUP, Block, Words
 from liex_lab.tracking.track import Track
 
@@ -19,18 +21,21 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.times)
+_Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
 @dataclass(frozen=True)
 class Rows:
-    """A track, the camera's frame count of its rows, and the names that every row carries."""
+    """A track, the camera's frame count of its rows, the names that every row carries, and where the animal can be."""
 
     track: Track
     frame_index: NDArray[np.int64]
     session_id: str
     individual: str
     camera_gaps: Sequence[Gap] = ()
+    arena: Arena = UNKNOWN
+    zones: Sequence[Zone] = ()
 
     @property
     def time_s(self) -> Array:
@@ -52,6 +57,8 @@ class Rows:
             "n_foreground_px": track.n_foreground_px,
             **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
             **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
+            "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
+            "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
             "spine_mm": track.spine_mm, "scale": track.scale,
             "flag": track.flag,
         }  # fmt: skip
@@ -93,19 +100,18 @@ class Rows:
         missing = np.zeros(self.track.n_frames, np.int64)
         for gap in self.camera_gaps:
             after = int(np.searchsorted(self.track.times_ns, gap.stop_ns))
-            if after < len(missing):
+            if gap.n_frames_missing and after < len(missing):
                 missing[after] += gap.n_frames_missing
         return missing
 
     def gaps(self) -> Block:
-        """The table `gaps`: frames never delivered, and stretches of frames without a pose, in order of time."""
-        time, missing = self.time_s, self.missing_before()
+        """The table `gaps`, in order of time.
+
+        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames without a pose.
+        """
+        time = self.time_s
         count = frame_count(self.frame_index)
-        found: list[tuple[float, float, int, int, int, str]] = []
-        for after in np.flatnonzero(missing):
-            before = stop_times(time)[after - 1] if after else time[after]
-            frame = int(self.frame_index[after])
-            found.append((before, time[after], frame, frame, int(missing[after]), "camera_dropped"))
+        found = self._camera_gaps()
         lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", "no_depth", "tracker_lost"))
         stops = stop_times(time)
         for start, stop, reason in stretches(lost):
@@ -117,6 +123,22 @@ class Rows:
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
         kinds = (float, float, np.int64, np.int64, np.int64, str)
         return {**self._who, **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)}}
+
+    def _camera_gaps(self) -> list[_Found]:
+        """Where the recording's time is not a steady camera's, as rows of the table `gaps`."""
+        time, found = self.time_s, []
+        stops = stop_times(time)
+        for gap in self.camera_gaps:
+            row = int(np.searchsorted(self.track.times_ns, gap.stop_ns if gap.n_frames_missing else gap.start_ns))
+            if row == len(time):
+                continue
+            frame = int(self.frame_index[row])
+            if gap.n_frames_missing:
+                span = (float(stops[row - 1]) if row else float(time[row]), float(time[row]), frame, frame)
+            else:
+                span = (float(time[row]), float(stops[row]), frame, frame + 1)
+            found.append((*span, gap.n_frames_missing, gap.reason))
+        return found
 
     @property
     def _who(self) -> dict[str, str]:

@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
-from liex_lab.sessions._rvl import rvl_message
+from liex_lab.recordings.rvl import rvl_message
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rows import Rows, frame_count, stop_times, stretches
 

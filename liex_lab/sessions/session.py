@@ -12,6 +12,7 @@ import numpy as np
 from liex_lab.camera import Camera
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
+from liex_lab.recordings.walls import Arena
 from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
 from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
@@ -132,15 +133,23 @@ class Session:
 
     @cached_property
     def camera(self) -> Camera:
-        """The depth camera."""
-        stated = self.metadata["camera"]
-        numbers = {name: stated[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
-        return Camera(**numbers)
+        """The depth camera, an ideal one in air; `metadata["camera"]["optics"]` says what was undone for that."""
+        return Camera.from_dict(self.metadata["camera"])
 
     @cached_property
     def T_arena_camera(self) -> SE3:
         """Carries points of the camera frame into the arena frame."""
         return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
+
+    @cached_property
+    def arena(self) -> Arena:
+        """The shape of the floor; open where it is not known."""
+        return Arena.from_dict(self.metadata.get("arena", {"kind": "open"}))
+
+    @property
+    def zone_names(self) -> list[str]:
+        """The names of the zones that were drawn."""
+        return [str(zone["name"]) for zone in self.metadata.get("zones", [])]
 
     @property
     def plan(self) -> str:

@@ -81,6 +81,10 @@ FRAMES = columns(
     ("centroid_z_mm", "float64", "mm", "mean height of the animal's back above the floor", "", "foreground"),
     ("centroid_u_px", "float64", "px", "column of the centroid in the depth picture", "", "foreground"),
     ("centroid_v_px", "float64", "px", "row of the centroid in the depth picture", "", "foreground"),
+    ("wall_distance_mm", "float64", "mm", "distance of the centroid from the nearest wall, negative beyond it; empty "
+     "where the arena's shape is not known", "to the circle or rectangle in session.json, arena", "arena"),
+    ("zone", "string", "", "the zones that the centroid lies in, in the order of the zones' file, with ; between them; "
+     "empty outside all of them and where there is no centroid", "", "arena.zones of the plan"),
     ("spine_mm", "float64", "mm", "length of the fitted chain of joints, all bones added up",
      "scale x length of the skeleton at home", "fit"),
     ("scale", "float64", "", "size of the animal relative to the skeleton's file", "", "fit"),
@@ -133,9 +137,12 @@ BOUTS = columns(
 
 GAPS = columns(
     "gaps", *_WHO, *_SPAN,
-    ("n_frames_missing", "int64", "", "frames without a pose, or never delivered by the camera"),
-    ("reason", "string", "", "camera_dropped: never recorded, start_frame = stop_frame = the next frame; no_depth: "
-     "recorded without any depth; tracker_lost: nothing in the frame looks like the animal"),
+    ("n_frames_missing", "int64", "", "frames without a pose, or never delivered by the camera; 0 where only a time "
+     "stamp was moved"),
+    ("reason", "string", "", "camera_dropped: never recorded, start_frame = stop_frame = the next frame; clock_jumped: "
+     "the camera was stopped, or its clock set, before the frame; stamp_repeated, stamp_out_of_order: this frame's own "
+     "time stamp could not be true and was moved; no_depth: recorded without any depth; tracker_lost: nothing in the "
+     "frame looks like the animal"),
 )  # fmt: skip
 
 FLIPS = columns(

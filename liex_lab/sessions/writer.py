@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
-from liex_lab.sessions.provenance import Provenance, package_version, peak_memory_mb
+from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rows import Rows, median_step, stop_times
 from liex_lab.sessions.tables import Column
 from liex_lab.sessions.thumbnails import Keepsakes
@@ -92,7 +93,7 @@ class SessionWriter:
 
     def add(self, frames: Sequence[DepthFrame], track_part: Track | None = None) -> None:
         """Consecutive frames and, unless `close` gets the whole track, their part of it."""
-        from liex_lab.sessions._rvl import to_millimetres
+        from liex_lab.recordings.rvl import to_millimetres
 
         if not frames:
             return
@@ -129,7 +130,7 @@ class SessionWriter:
         """The track as the tables see it."""
         origin = self.origin
         index = np.array(self._index, np.int64)
-        return Rows(self.track, index, origin.name, origin.individual, origin.gaps)
+        return Rows(self.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones)
 
     @property
     def frames(self) -> pd.DataFrame:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from liex_lab.pipelines.build import build_recording
 
+from liex_lab.camera import Distortion
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
@@ -80,3 +81,35 @@ def test_a_recording_that_is_cut_short_needs_the_plans_consent(tmp_path: Path) -
         build_recording(path, plan(*LENS))
     with build_recording(path, plan(*LENS, "recording.accept_truncated=true")) as recording:
         assert len(recording) == 3
+
+
+BARREL = [-0.2, 0.04, 0.001, -0.001]
+
+
+def test_what_a_file_says_of_its_lens_is_undone_and_the_plan_overrules_it(tmp_path: Path) -> None:
+    path = write_png_folder(tmp_path / "r", STORED, distortion=BARREL)
+    with open_recording(path) as raw:
+        assert raw.camera.distortion == Distortion.of("plumb_bob", BARREL)
+        original = raw.frame(0).depth
+    with build_recording(path, plan()) as recording:
+        assert recording.camera.distortion is None
+        assert recording.optics["distortion"]["coefficients"][:4] == BARREL
+        undone = recording.frame(0).depth
+        assert (undone != original).any()
+    with build_recording(path, plan("camera.distortion=[0.1]")) as recording:
+        assert (recording.frame(0).depth != undone).any()
+    with build_recording(path, plan("camera.distortion=[]")) as recording:
+        assert recording.optics == {}
+        assert (recording.frame(0).depth == original).all()
+    with build_recording(path, plan(*LENS)) as recording:  # a camera that is stated as a whole is the whole camera
+        assert recording.optics == {}
+    with pytest.raises(LiexError, match="'mei' is not known"):
+        build_recording(path, plan("camera.distortion=[0.1]", "camera.distortion_model=mei"))
+
+
+def test_the_water_of_the_plan_is_undone(tmp_path: Path) -> None:
+    path = write_png_folder(tmp_path / "r", STORED)
+    with build_recording(path, plan("water.height_mm=500", "water.ranging=paraxial")) as recording:
+        assert recording.optics["water"]["height_mm"] == 500.0
+        # stored are 700 mm: 200 mm below the surface as it seems, and 500 mm above it
+        assert recording.frame(0).depth[5, 30] == pytest.approx(1.333 * 700, abs=3)

@@ -10,7 +10,7 @@ import pytest
 from liex_lab.pipelines import session as job
 
 from liex_lab.api import run_session
-from liex_lab.errors import EstimationError, SessionError
+from liex_lab.errors import EstimationError, PlanError, SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
@@ -185,3 +185,39 @@ def test_a_recording_without_an_animal_is_refused_and_leaves_nothing(mouse, tmp_
         run_session(folder, Plan.load("mouse"), tmp_path / "out")
     assert "\n" not in str(error.value)
     assert not list((tmp_path / "out").glob("*"))
+
+
+def test_zones_are_drawn_in_a_file_that_the_plan_names(folder, session, tmp_path):
+    """Left and right of the arena's middle: every frame is in one of them, and together they take all the time."""
+    drawn = tmp_path / "zones.toml"
+    drawn.write_text("""
+        [[zones]]
+        name = "west"
+        polygon = [[-2000, -2000], [0, -2000], [0, 2000], [-2000, 2000]]
+        [[zones]]
+        name = "east"
+        polygon = [[0, -2000], [2000, -2000], [2000, 2000], [0, 2000]]
+    """)
+    again = Session.open(run_session(folder, Plan.load("mouse").with_settings([f"arena.zones={drawn}"]), tmp_path))
+    x = again.frames["centroid_x_mm"]
+    expected = np.where(x.isna(), "", np.where(x < 0, "west", "east"))
+    assert again.frames["zone"].tolist() == expected.tolist()
+    row = again.summary.iloc[0]
+    assert row["zone_west_s"] + row["zone_east_s"] == pytest.approx(row["observed_s"])
+    pd.testing.assert_frame_equal(again.frames.drop(columns="zone"), session.frames.drop(columns="zone"))
+
+
+def test_a_slip_in_the_zones_is_told_before_any_work(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("liex_lab.recordings.foreground.Scene.learn", lambda *_: pytest.fail("work was begun"))
+    plan = Plan.load("mouse").with_settings([f"arena.zones={tmp_path / 'none.toml'}"])
+    with pytest.raises(PlanError, match=r"there is no file .*none\.toml"):
+        run_session(folder, plan, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_shape_of_the_arena_is_found(session, mouse):
+    arena = session.arena
+    assert arena.kind in ("round", "rectangular", "open")
+    if arena.kind != "open":
+        assert arena.edge == "wall"
+        assert session.frames["wall_distance_mm"].dropna().between(-5.0, 1000.0).all()

@@ -13,7 +13,7 @@ from foxglove.messages import RawImage, Timestamp
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from liex_lab.camera import Camera
+from liex_lab.camera import Camera, Distortion
 from liex_lab.recordings import open_recording
 from tests.recordings.asking import opened_or_refused, refusal
 from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times, write_camera, write_mcap
@@ -116,9 +116,10 @@ def test_a_calibration_of_another_size_is_refused(path: Path) -> None:
     assert "640 x 480" in refusal(path)
 
 
-def test_distortion_is_told(path: Path) -> None:
+def test_distortion_belongs_to_the_camera(path: Path) -> None:
     with open_recording(write_mcap(path, STORED, distortion=[0.1, 0, 0, 0, 0])) as recording:
-        assert any("distortion" in problem for problem in recording.problems)
+        assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
+        assert recording.problems == []
 
 
 @pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 20).round(3).tolist())

@@ -157,12 +157,6 @@ def test_wrong_stamps_are_told_in_a_sentence(folder: Path) -> None:
     assert "'oops' on line 3" in refusal(folder)
 
 
-def test_a_video_is_not_read_yet(tmp_path: Path) -> None:
-    (tmp_path / "depth.avi").write_bytes(b"RIFF")
-    assert "depth.avi" in refusal(tmp_path)
-    assert "depth.avi" in refusal(write_archive(tmp_path, tmp_path / "s.tar.gz"))
-
-
 def test_an_archive_is_unpacked_once_and_cleared_away(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,13 +28,18 @@ STORED = depth_frames(4)
     ("name", "says"),
     [
         ("fish.ray", "Raytrix's own format"),
-        ("fish.rays", "export its depth maps as TIFF"),
+        ("fish.rays", "save the depth map of every frame as 32-bit TIFF"),
+        ("cloud.ply", "raytrix.toml"),
+        ("empty.pgm", "cut short"),
+        ("empty.pclzf", "cut short"),
+        ("empty.avi", "something else"),
+        ("empty.mkv", "something else"),
         ("colour.JPG", "16-bit depth was expected"),
         ("colour.mp4", "16-bit depth was expected"),
         ("xtion.oni", "something else"),
-        ("session.bag", "not read yet"),
-        ("notes.txt", "a folder of 16-bit PNG or TIFF"),
-        ("noextension", "a folder of 16-bit PNG or TIFF"),
+        ("session.bag", "something else"),
+        ("notes.txt", "a folder of 16-bit PNG, TIFF"),
+        ("noextension", "a folder of 16-bit PNG, TIFF"),
         ("empty.png", "cut short"),
         ("empty.tif", "cut short"),
         ("empty.dat", "0 bytes"),
@@ -50,7 +55,26 @@ def test_a_file_that_cannot_be_read_is_told_in_a_sentence(tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize(
-    "name", ["a.png", "a.tif", "depth.dat", "a.tar.gz", "a.tgz", "a.mcap", "a.oni", "camera.toml", "a.tar", "a.xyz"]
+    "name",
+    [
+        "a.png",
+        "a.tif",
+        "a.pgm",
+        "a.pclzf",
+        "depth.dat",
+        "depth.avi",
+        "a.mkv",
+        "a.tar.gz",
+        "a.tgz",
+        "a.mcap",
+        "a.oni",
+        "a.tar",
+        "camera.toml",
+        "raytrix.toml",
+        "a.xyz",
+        "a.ply",
+        "depth_1_0000001.png",
+    ],
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_is_refused_whatever_it_is_called(tmp_path: Path, name: str, seed: int) -> None:
@@ -132,7 +156,7 @@ def test_a_format_brings_only_its_own_libraries(tmp_path: Path) -> None:
     code = (
         "import sys; from liex_lab.recordings import open_recording\n"
         f"with open_recording({str(folder)!r}) as recording: recording.frame(0)\n"
-        "print({'cv2', 'tifffile', 'mcap', 'foxglove', 'numba', 'pandas', 'google'} & set(sys.modules))"
+        "print({'av', 'cv2', 'tifffile', 'mcap', 'foxglove', 'numba', 'pandas', 'google', 'scipy'} & set(sys.modules))"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "set()"

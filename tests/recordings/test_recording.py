@@ -1,10 +1,8 @@
-"""What every recording promises, whatever file it comes from."""
+"""What a recording is by itself: frames, slices, times, digests. What every format promises is in test_laws.py."""
 
 from __future__ import annotations
 
-import gc
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +15,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
 from liex_lab.recordings.frame import depth_mm
 from liex_lab.recordings.recording import file_digest
-from tests.recordings.writers import (
-    SMALL,
-    Frames,
-    depth_frames,
-    even_times,
-    write_archive,
-    write_camera,
-    write_mcap,
-    write_moseq_folder,
-    write_png_folder,
-    write_tiff_stack,
-)
+from tests.recordings.writers import SMALL, depth_frames, even_times, write_camera, write_mcap, write_png_folder
 
 N = 7
 STORED = depth_frames(N)
@@ -42,72 +29,6 @@ def in_memory(n: int = N, times_ns: list[int] | None = None, reads: list[int] | 
 
     times = np.array(even_times(n) if times_ns is None else times_ns)
     return Recording(name="memory", format="synthetic", camera=SMALL, times_ns=times, read=read)
-
-
-def moseq(folder: Path, frames: Frames) -> Path:
-    write_moseq_folder(folder / "session", frames)
-    write_camera(folder / "session")
-    return folder / "session"
-
-
-WRITERS: dict[str, Callable[[Path], Path]] = {
-    "png": lambda folder: write_png_folder(folder / "pictures", STORED),
-    "tiff": lambda folder: write_tiff_stack(folder / "stack" / "depth.tif", STORED).parent,
-    "moseq": lambda folder: moseq(folder, STORED),
-    "archive": lambda folder: write_archive(moseq(folder, STORED), folder / "session.tar.gz"),
-    "mcap": lambda folder: write_mcap(folder / "recording.mcap", STORED),
-}
-
-
-@pytest.fixture(params=list(WRITERS))
-def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return WRITERS[request.param](tmp_path)
-
-
-def test_every_format_gives_the_stored_millimetres_and_increasing_times(path: Path) -> None:
-    with open_recording(path) as recording:
-        assert (len(recording), recording.width, recording.height) == (N, 64, 48)
-        assert recording.times_ns.dtype == np.int64
-        assert np.all(np.diff(recording.times_ns) > 0)
-        assert not recording.truncated
-        assert recording.rate_hz == pytest.approx(30.0, rel=1e-5)
-        assert recording.duration_s == pytest.approx((N - 1) / 30, rel=1e-5)
-        assert recording.camera.fx == SMALL.fx
-        for index, frame in enumerate(recording):
-            assert (frame.index, frame.time_ns) == (index, int(recording.times_ns[index]))
-            assert frame.depth.dtype == np.float32
-            np.testing.assert_array_equal(frame.depth, STORED[index])
-
-
-def test_every_format_reads_in_any_order_and_again(path: Path) -> None:
-    with open_recording(path) as recording:
-        for index in (5, 0, 3, 3, -1):
-            np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
-        first, second = list(recording), list(recording)
-        np.testing.assert_array_equal([f.depth for f in first], [f.depth for f in second])
-        interleaved = zip(recording, recording[2:], strict=False)
-        for here, later in interleaved:
-            np.testing.assert_array_equal(here.depth, STORED[here.index])
-            np.testing.assert_array_equal(later.depth, STORED[here.index + 2])
-
-
-def test_every_format_hands_out_pictures_that_may_be_written_on(path: Path) -> None:
-    with open_recording(path) as recording:
-        recording.frame(1).depth[:] = -1
-        np.testing.assert_array_equal(recording.frame(1).depth, STORED[1])
-
-
-def test_strict_is_content_with_a_whole_recording(path: Path) -> None:
-    open_recording(path, strict=True).close()
-
-
-def test_an_open_recording_that_nobody_holds_lets_go_of_its_files(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(path.parent))
-    recording = open_recording(path)
-    recording.frame(0)
-    del recording
-    gc.collect()  # an unclosed file is a ResourceWarning, and a warning is an error here
-    assert not list(path.parent.glob("liex-*"))
 
 
 def test_a_recording_reads_only_what_is_asked_for() -> None:

@@ -14,7 +14,10 @@ from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.walls import UNKNOWN, Arena
+from liex_lab.recordings.zones import Zone
 from liex_lab.sessions import Provenance, Session
+from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.tracking.track import Track
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, part, steady, write
 
@@ -30,7 +33,7 @@ def session(tmp_path_factory) -> Session:
 
 def test_a_session_says_where_it_comes_from(session):
     about = session.metadata
-    assert about["schema_version"] == 1
+    assert about["schema_version"] == SCHEMA_VERSION
     assert about["versions"]["liex_lab"]
     assert about["versions"]["rerun-sdk"].startswith("0.41")
     assert about["plan"] == {"animal": "mouse", "seed": 7}
@@ -64,6 +67,42 @@ def test_a_recording_and_a_plan_tell_where_a_session_comes_from():
 def test_camera_and_arena_come_back_exactly(session):
     assert session.camera == MOUSE.camera
     np.testing.assert_array_equal(session.T_arena_camera.matrix, MOUSE.T_arena_camera.matrix)
+
+
+def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
+    """The mouse goes round a circle of 150 mm, 50 mm from the wall; a third of the zone's circle covers its way."""
+    bowl = Arena("round", (0.0, 0.0), 200.0, seen_share=1.0, edge="wall")
+    half = Zone("upper", polygon_mm=((-300.0, 0.0), (300.0, 0.0), (300.0, 300.0), (-300.0, 300.0)))
+    mouse = WalkingMouse(steady(2 * np.pi * 150 / 200), lost=(7,))
+    optics = {"distortion": None, "water": {"height_mm": 300.0}}
+    session = write(
+        tmp_path / "c.liex", mouse, arena=bowl, zones=(half, Zone("middle", (0.0, 0.0, 20.0))), optics=optics
+    )
+    assert session.arena == bowl
+    assert session.zone_names == ["upper", "middle"]
+    assert session.metadata["camera"]["optics"] == optics
+    assert session.camera == mouse.camera
+    frames = session.frames
+    seen = np.delete(np.arange(len(frames)), 7)
+    off = np.hypot(frames["centroid_x_mm"], frames["centroid_y_mm"])
+    np.testing.assert_allclose(frames["wall_distance_mm"][seen], 200.0 - off[seen])
+    assert np.isnan(frames["wall_distance_mm"][7])
+    assert frames["zone"][7] == ""
+    expected = np.where(frames["centroid_y_mm"][seen] > 0, "upper", "")
+    assert frames["zone"][seen].tolist() == expected.tolist()
+    row = session.summary.iloc[0]
+    assert row["zone_upper_share"] == pytest.approx(0.5, abs=0.03)
+    assert row["zone_upper_s"] == pytest.approx(row["zone_upper_share"] * row["observed_s"])
+    assert row["zone_middle_s"] == 0.0
+    assert {"zone_upper_s", "zone_middle_share"} <= set(session.columns.query("table == 'summary'")["name"])
+
+
+def test_a_session_without_walls_and_zones_says_so(session):
+    assert session.arena == UNKNOWN
+    assert session.zone_names == []
+    assert session.frames["wall_distance_mm"].isna().all()
+    assert (session.frames["zone"] == "").all()
+    assert not [name for name in session.summary.columns if name.startswith("zone_")]
 
 
 def test_poses_come_back_and_project_onto_their_pixels(session):
@@ -195,7 +234,7 @@ def test_a_recording_in_which_nothing_is_found_is_a_session_all_the_same(tmp_pat
 
 
 def test_a_newer_session_asks_for_an_upgrade(session, tmp_path):
-    (tmp_path / "session.json").write_text(json.dumps({**session.metadata, "schema_version": 2}))
+    (tmp_path / "session.json").write_text(json.dumps({**session.metadata, "schema_version": SCHEMA_VERSION + 1}))
     with pytest.raises(SessionError, match="upgrade"):
         Session.open(tmp_path)
 
@@ -239,7 +278,10 @@ from liex_lab.recordings.frame import DepthFrame
 from liex_lab.plan import Plan
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.walls import UNKNOWN, Arena
+from liex_lab.recordings.zones import Zone
 from liex_lab.sessions import Provenance, Session
+from liex_lab.sessions.provenance import SCHEMA_VERSION
 from tests.sessions.walking_mouse import WalkingMouse, part, steady
 
 def held_mb(what):

@@ -154,4 +154,5 @@ def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Se
     with Session.create(folder, mouse.provenance(**more), **own) as writer:
         for frames, track in mouse.chunks(chunk):
             writer.add(frames, track)
-        return writer.close(**behaviour.measure(writer.frames, writer.poses).for_session())
+        zones = [zone.name for zone in writer.origin.zones]
+        return writer.close(**behaviour.measure(writer.frames, writer.poses, zones=zones).for_session())

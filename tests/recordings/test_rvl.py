@@ -7,7 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from liex_lab.sessions._rvl import pack_rvl, rvl_message, to_millimetres
+from liex_lab.recordings.rvl import pack_rvl, rvl_message, to_millimetres
+from liex_lab.recordings.rvl import unpack_rvl as unpack
 from tests.oracles.rvl import unpack_rvl
 
 
@@ -18,6 +19,15 @@ def test_packed_depth_is_what_a_slow_decoder_reads(share_unread, spread):
     depth = (1 + rng.integers(0, spread, (23, 31))).astype(np.uint16)
     depth[rng.random(depth.shape) < share_unread] = 0
     np.testing.assert_array_equal(unpack_rvl(pack_rvl(depth), depth.size), depth.ravel())
+    np.testing.assert_array_equal(unpack(pack_rvl(depth).tobytes(), 31, 23), depth)
+
+
+def test_words_that_end_too_early_or_hold_too_much_are_no_picture():
+    words = pack_rvl(np.random.default_rng(3).integers(0, 900, (23, 31)).astype(np.uint16)).tobytes()
+    assert unpack(words, 31, 23) is not None
+    assert all(unpack(words[:n], 31, 23) is None for n in range(0, len(words) - 4, 4))
+    assert unpack(words, 31, 20) is None
+    assert unpack(b"\xff" * 400, 31, 23) is None
 
 
 def test_the_largest_steps_fit_into_the_space_that_is_set_aside():

@@ -67,6 +67,57 @@ def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return np.concatenate([np.frombuffer(head, np.uint8), pack_rvl(depth).view(np.uint8)])
 
 
+@njit(cache=True, inline="always")
+def _take(words: NDArray[np.uint32], word: np.uint32, at: int, held: int) -> tuple[int, np.uint32, int, int]:
+    """The next number, and where it ends; -1 where the words end before it does."""
+    value, shift = 0, 0
+    while shift < 33:
+        if held == 0:
+            if at >= len(words):
+                return -1, word, at, held
+            word, held = words[at], 8
+            at += 1
+        nibble = int(word >> np.uint32(28))
+        word = np.uint32(word << np.uint32(4))
+        held -= 1
+        value |= (nibble & 7) << shift
+        shift += 3
+        if nibble < 8:
+            return value, word, at, held
+    return -1, word, at, held
+
+
+@njit(cache=True, nogil=True)
+def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
+    """Decode into pixels (n,), which are zero; False where the words do not hold exactly as many."""
+    n, i, at, held = len(pixels), 0, 0, 0
+    last = np.int64(0)
+    word = np.uint32(0)
+    while i < n:
+        count, word, at, held = _take(words, word, at, held)
+        if count < 0 or count > n - i:
+            return False
+        i += count
+        count, word, at, held = _take(words, word, at, held)
+        if count < 0 or count > n - i:
+            return False
+        for k in range(i, i + count):
+            step, word, at, held = _take(words, word, at, held)
+            if step < 0:
+                return False
+            last += (step >> 1) ^ -(step & 1)
+            pixels[k] = np.uint16(last)
+        i += count
+    return True
+
+
+def unpack_rvl(data: bytes | memoryview, width: int, height: int) -> NDArray[np.uint16] | None:
+    """A depth image (H, W) out of its RVL words; None where they are cut short or damaged."""
+    words = np.frombuffer(data, "<u4", len(data) // 4).astype(np.uint32, copy=False)
+    pixels = np.zeros(width * height, np.uint16)
+    return pixels.reshape(height, width) if _unpack(words, pixels) else None
+
+
 @njit(cache=True, nogil=True)
 def _to_millimetres(depth: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
     for row in range(depth.shape[0]):

@@ -1,0 +1,54 @@
+"""A depth track inside a video file: where its pictures lie, before any of them is decoded."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+FFV1 = "ffv1"
+RAW = {"b16g": ">u2", "Y16 ": "<u2", "Y16": "<u2"}  # code of uncompressed 16-bit grey: how its numbers are stored
+BITMAP_HEADER = struct.Struct("<IiiHH4s5I")  # Windows' BITMAPINFOHEADER, in AVI and in Matroska alike
+
+
+@dataclass
+class DepthTrack:
+    """What an AVI or a Matroska file tells of its depth pictures.
+
+    codec: `FFV1`, a key of `RAW`, or the name of one that is not read; private: the codec's own header; offsets, sizes
+    (n,): bytes of every picture that lies whole in the file; times_ns (n,); even: the times are steps of a constant
+    rate, for the container knows no others; whole: the file ends where it should and holds as many pictures as it says.
+    tags, attachments (bytes by file name): of the whole file; session_start: ISO 8601 where the file tells it.
+    """
+
+    codec: str = ""
+    width: int = 0
+    height: int = 0
+    private: bytes = b""
+    offsets: list[int] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    even: bool = False
+    whole: bool = True
+    tags: dict[str, str] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    session_start: str | None = None
+
+    def take_bitmap_header(self, data: bytes) -> None:
+        """Size, codec and private data out of a BITMAPINFOHEADER and what follows it."""
+        if len(data) < BITMAP_HEADER.size:
+            return
+        _, width, height, _, bits, code, *_ = BITMAP_HEADER.unpack_from(data)
+        self.width, self.height = max(width, 0), abs(height)  # negative: rows from the top, as ours are
+        name = code.decode("ascii", "replace")
+        self.codec = FFV1 if name.upper() == "FFV1" else name.strip("\0") or f"{bits}-bit bitmaps"
+        self.private = data[BITMAP_HEADER.size :]
+
+
+def even_times(slots: list[int], scale: int, rate: int) -> NDArray[np.int64]:
+    """Stamps (n,) ns of the pictures in these slots of a constant rate of `rate` / `scale` per second, exactly."""
+    step = Fraction(10**9 * scale, rate)
+    return np.array([round(slot * step) for slot in slots], np.int64)

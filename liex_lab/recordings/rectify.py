@@ -1,0 +1,120 @@
+"""True millimetres on reading: a recording through a bent lens or a water surface, as an ideal pinhole would see it.
+
+Everything behind this door works with an ideal pinhole camera in air. A recording without distortion and water is
+handed on untouched. A bent lens becomes a straight one with the same focal lengths and picture size. For the water see
+`Water.without`: the ideal camera stands somewhat higher than the real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.camera import Camera
+from liex_lab.recordings import _rectify as kernels
+from liex_lab.recordings.frame import Depth
+from liex_lab.recordings.recording import Recording
+from liex_lab.water import Water
+
+_MUCH_LOST = 0.05  # share of a picture's pixels that leave it
+
+
+def rectified(recording: Recording, water: Water | None = None) -> Recording:
+    """The recording with its camera's distortion and the water's refraction undone whenever a frame is read.
+
+    The recording itself where there is neither. `optics` of the result says what was undone.
+    """
+    camera = recording.camera
+    water = None if recording.optics.get("water") else water  # it was undone before
+    if camera.distortion is None and water is None:
+        return recording
+    optics = {
+        "distortion": None if camera.distortion is None else camera.distortion.to_dict(),
+        "water": None if water is None else water.to_dict(),
+    }
+    seen = recording.seen_by(ideal_camera(camera, water), rectifier(camera, water), optics)
+    lost = share_lost(camera)
+    if lost > _MUCH_LOST:
+        seen.problems.append(
+            f"{lost:.0%} of the pixels leave the picture when the lens distortion is undone; keep the animal away from "
+            "the picture's edge, or check the distortion's coefficients"
+        )
+    return seen
+
+
+def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
+    """The ideal pinhole to which pictures of this camera are carried."""
+    straight = replace(camera, distortion=None)
+    return straight if water is None else water.without(straight)
+
+
+def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], Depth]:
+    """What turns a depth picture (H, W) mm of this camera into that of its `ideal_camera`."""
+    source = None if camera.distortion is None else lookup_table(camera)
+    laws = None if water is None else pixel_laws(replace(camera, distortion=None), water)
+
+    def undo(depth: Depth) -> Depth:
+        if source is not None:
+            straight = np.empty_like(depth)
+            kernels.look_up(depth, source, straight)
+            depth = straight
+        if laws is not None:
+            lifted, closed = np.empty_like(depth), np.empty_like(depth)
+            kernels.lift(depth, laws, lifted)
+            kernels.close(lifted, closed)
+            depth = closed
+        return depth
+
+    return undo
+
+
+def lookup_table(camera: Camera) -> NDArray[np.int32]:
+    """For every pixel (H, W) of the ideal picture the pixel of the bent one that lies nearest, row * W + column; or -1.
+
+    The other way round would leave holes where the ideal picture is the larger one. Depth along the optical axis is
+    the same in both, and is never mixed from neighbours, which would put points between the animal and the floor.
+    """
+    seen = np.floor(camera.project(replace(camera, distortion=None).unproject(_pixels(camera), 1.0)) + 0.5)
+    inside = _inside(seen, camera)
+    seen = np.where(inside[..., None], seen, 0).astype(np.int32)
+    return np.where(inside, seen[..., 1] * camera.width + seen[..., 0], -1).astype(np.int32)
+
+
+def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
+    """`Water.law` of every pixel's ray (H, 13, W) for `kernels.lift`, its points as homogeneous pixels of `without`.
+
+    A point of the law becomes (u z, v z, z), and three more numbers carry it to the higher camera.
+    """
+    ideal, up = water.without(camera), water.lift_mm
+    to_pixels = ideal.matrix
+    laws = np.empty((camera.height, 13, camera.width), np.float32)
+    uv = _pixels(camera)
+    for row in range(0, camera.height, 8):  # some rows at a time stay in the processor's cache
+        law = water.law(camera.unproject(uv[row : row + 8], 1.0)[..., :2])
+        part = [law[..., :4], law[..., 4:7] @ to_pixels.T, law[..., 7:10] @ to_pixels.T]
+        part.append(np.broadcast_to(to_pixels @ up, part[1].shape))
+        laws[row : row + 8] = np.moveaxis(np.concatenate(part, axis=-1), -1, 1)
+    return laws
+
+
+def share_lost(camera: Camera) -> float:
+    """The share of a bent picture's pixels that have no place in the straight one, told from every eighth."""
+    if camera.distortion is None:
+        return 0.0
+    straight = replace(camera, distortion=None)
+    uv = straight.project(camera.unproject(_pixels(camera)[::8, ::8], 1.0))
+    return float(1.0 - _inside(uv, camera).mean())
+
+
+def _inside(uv: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+    """Where (...) pixels (..., 2) are in the picture; False for NaN."""
+    right, down = uv[..., 0] + 0.5, uv[..., 1] + 0.5
+    return np.asarray((right >= 0) & (right < camera.width) & (down >= 0) & (down < camera.height))
+
+
+def _pixels(camera: Camera) -> NDArray[np.float64]:
+    """(u, v) of every pixel (H, W, 2)."""
+    return np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)

@@ -1,0 +1,174 @@
+"""The job behind `liex convert`: any recording that opens, written as MCAP, as .oni or as a folder of PNG pictures."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from liex_lab.camera import Lens
+from liex_lab.errors import RecordingError
+from liex_lab.progress import Progress, silent
+from liex_lab.recordings import Recording, open_recording
+from liex_lab.recordings.camera_file import CAMERA_FILE
+from liex_lab.recordings.steps import whole_steps
+from liex_lab.recordings.writing import STAMPS, OniRecordingWriter, PictureFolderWriter, RecordingWriter
+
+_STEPS_MM = {".oni": (1.0, 0.1), "": (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)}  # what each format can state
+_N_PROBED = 8
+# a name that ends like another kind of file is no folder's
+_OTHER_KINDS = re.compile(
+    r"\.(bag|db3|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$", re.I
+)
+_PICTURE = re.compile(r"frame_\d+\.png")
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What was written. notes: sentences about what is not as it was; problems: of the recording that was read."""
+
+    path: Path
+    n_frames: int
+    notes: list[str]
+    problems: list[str]
+
+
+def convert(
+    recording: str | Path | Recording,
+    to: str | Path,
+    *,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    topic: str | None = None,
+    step_mm: float | None = None,
+    ros: bool = False,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Converted:
+    """Write a recording as `to`: NAME.mcap, NAME.oni, or else a folder of PNG pictures.
+
+    MCAP keeps every depth; 16-bit pictures keep whole steps of a size that is found, or, where `step_mm` is stated,
+    the nearest steps. ros: ROS 2's messages in the MCAP file instead of Foxglove's. `camera`, `fps` and `topic` are
+    those of `open_recording`. The target has its name only when it is whole. Raises RecordingError where something is
+    in its place or the depth does not fit.
+    """
+    target = Path(to)
+    _check_target(target, overwrite)
+    if isinstance(recording, Recording):
+        return _convert(recording, target, step_mm, ros, progress)
+    if target.exists() and Path(recording).exists() and target.samefile(recording):
+        raise RecordingError(f"{target} is the recording itself; write under another name")
+    with open_recording(recording, camera=camera, fps=fps, topic=topic, progress=progress) as opened:
+        return _convert(opened, target, step_mm, ros, progress)
+
+
+def _convert(recording: Recording, target: Path, step_mm: float | None, ros: bool, progress: Progress) -> Converted:
+    with _in_place(target) as part:
+        writer = _writer(recording, target, part, step_mm, ros)
+        with writer:
+            for frame in recording:
+                writer.add(frame)
+                progress(frame.index + 1, len(recording), f"writing {target.name}")
+    return Converted(target, len(recording), writer.notes, list(recording.problems))
+
+
+def _writer(recording: Recording, target: Path, part: Path, step_mm: float | None, ros: bool) -> RecordingWriter:
+    kind, camera = _kind(target), recording.camera
+    if ros and kind != ".mcap":
+        raise RecordingError(f"ROS's messages are written into an .mcap file, not into {target.name}; leave out --ros")
+    if kind == ".mcap":
+        from liex_lab.recordings.mcap_writer import McapDepthWriter
+
+        if step_mm is not None:
+            raise RecordingError("an .mcap file keeps depth as it is, so that --step-mm says nothing; leave it out")
+        metadata = {"source": recording.name, "source_format": recording.format} | recording.metadata
+        return McapDepthWriter(part, camera, messages="ros" if ros else "foxglove", metadata=metadata)
+    step = _step(recording, kind, target) if step_mm is None else step_mm
+    if kind == ".oni":
+        if step not in _STEPS_MM[kind]:
+            raise RecordingError(f"{target.name} holds steps of 1 mm or 0.1 mm, got {step:g}; state one of them")
+        return OniRecordingWriter(
+            part, camera, step_mm=step, exact=step_mm is None, start_ns=int(recording.times_ns[0]),
+            rate_hz=recording.rate_hz if len(recording) > 1 else 30.0,
+        )  # fmt: skip
+    return PictureFolderWriter(part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata)
+
+
+def _kind(target: Path) -> str:
+    """.mcap, .oni, or nothing for a folder."""
+    suffix = target.suffix.lower()
+    return suffix if suffix in (".mcap", ".oni") else ""
+
+
+def _step(recording: Recording, kind: str, target: Path) -> float:
+    """The largest step of which all depths of some frames are whole multiples."""
+    rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
+    depths = [recording.frame(int(row)).depth for row in rows]
+    for step in _STEPS_MM[kind]:
+        if all(whole_steps(depth, step) is not None for depth in depths):
+            return step
+    # a depth that 16 bits cannot reach is told by the writer, with its frame
+    if max(float(depth.max()) for depth in depths) > 65535.0:
+        return 1.0
+    raise RecordingError(
+        f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and {target.name} would "
+        "hold 16-bit pictures, which do not keep them; write an .mcap file, which does, or let them be rounded with "
+        "--step-mm 0.1"
+    )
+
+
+def _check_target(target: Path, overwrite: bool) -> None:
+    """Refuse to write over what is there, and over anything but a recording at all."""
+    if _OTHER_KINDS.search(target.name):
+        raise RecordingError(
+            f"{target.name} is no name of what can be written; give NAME.mcap, NAME.oni, or a folder's name for PNG "
+            "pictures"
+        )
+    if not target.parent.is_dir():
+        raise RecordingError(f"there is no folder {target.parent} to write {target.name} into; make it first")
+    if not target.exists():
+        return
+    is_file = bool(_kind(target))
+    if target.is_dir() if is_file else not target.is_dir():
+        raise RecordingError(f"{target} is a {'folder' if is_file else 'file'}; give another name")
+    others = [] if is_file else [path.name for path in sorted(target.iterdir()) if not _written_here(path)]
+    if others:
+        raise RecordingError(
+            f"{target} holds more than a recording written by liex convert, such as {others[0]}; give another name"
+        )
+    if not overwrite and (is_file or any(target.iterdir())):
+        raise RecordingError(f"{target} is there already; give another name, or add --overwrite")
+
+
+def _written_here(path: Path) -> bool:
+    return path.is_file() and (path.name in (CAMERA_FILE, STAMPS) or _PICTURE.fullmatch(path.name) is not None)
+
+
+@contextmanager
+def _in_place(target: Path) -> Iterator[Path]:
+    """A name beside `target` to write under; what was written gets its own when the block ends, and else is gone."""
+    part = target.with_name(f".{target.name}.part-{os.getpid()}")
+    try:
+        yield part
+        if target.is_dir():
+            _remove(target)
+        part.replace(target)
+    except OSError as error:
+        raise RecordingError(
+            f"the recording cannot be written as {target} ({error.strerror or error}); make room, or name another place"
+        ) from None
+    finally:
+        _remove(part)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
