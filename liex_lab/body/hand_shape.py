@@ -28,7 +28,7 @@ N_ARM_CAPSULES = 4
 class HandShape:
     """The hands of n people. Lengths in mm at scale 1.
 
-    offsets (n, J, 3): the joints as in `Skeleton.offsets`; flesh: capsules with radii (n, C, 2); arm (n, 4): radii at
+    offsets (n, J, 3): the joints as in `Skeleton.offsets`; flesh: capsules, a batch (n); arm (n, 4): radii at
     wrist and elbow, how much wider than thick, and where on the forearm a sleeve begins (1: none), as a share.
     """
 
@@ -41,8 +41,7 @@ class HandShape:
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> HandShape:
         """Some of the people."""
-        flesh = Capsules(self.flesh.joints, self.flesh.offsets, self.flesh.radii[index])
-        return HandShape(self.offsets[index], flesh, self.arm[index])
+        return HandShape(self.offsets[index], self.flesh[index], self.arm[index])
 
     def joints(self, skeleton: Skeleton, pose: Pose) -> tuple[Array, Array]:
         """Rotations (n, J, 3, 3) and positions (n, J, 3) mm of each person's own hand in a pose (n)."""
@@ -91,7 +90,8 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
     wrist = rng.uniform(22.0, 29.0, n) * np.sqrt(girth)
     sleeve = np.where(rng.random(n) < 0.5, rng.uniform(0.0, 0.7, n), 1.0)
     arm = np.stack([wrist, wrist * rng.uniform(1.15, 1.55, n), rng.uniform(1.1, 1.45, n), sleeve], axis=1)
-    return HandShape(offsets, Capsules(flesh.joints, flesh.offsets, radii), arm)
+    ends = np.broadcast_to(flesh.offsets, (n, *flesh.offsets.shape)).copy()
+    return HandShape(offsets, Capsules(flesh.joints, ends, radii, np.zeros(n)), arm)
 
 
 def forearms(rng: np.random.Generator, rotations: Array, positions: Array, scale: Array) -> tuple[Array, Array]:
@@ -130,5 +130,5 @@ def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm:
     wide = 1.25 * (arm[:, 0] + sleeve * (arm[:, 1] - arm[:, 0]) + side)
     radii[:, 2] = np.where(sleeve < 1.0, [wide, 1.3 * arm[:, 1]], 1.0).T
     radii[:, 3] = 1.3 * arm[:, 1:2]
-    tubes = Capsules(np.array([[0, _ELBOW], [0, _ELBOW], [0, _ELBOW], [_ELBOW, _SHOULDER]]), offsets, radii)
+    tubes = Capsules(np.array([[0, _ELBOW], [0, _ELBOW], [0, _ELBOW], [_ELBOW, _SHOULDER]]), offsets, radii, np.zeros(n))
     return tubes.vertices(np.repeat(frame[:, None], 3, axis=1), joints, scale, scale)

@@ -67,6 +67,7 @@ class Body(NamedTuple):
     """The body that finished candidates are held against the picture with, see `body.balls.Balls`; none: no balls."""
 
     unit_mm: float
+    n_own: int
     joints: Any
     offsets: Any
     share: Any
@@ -174,8 +175,8 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
         fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)
         _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
-            explain_pose(heights[i], looks[i], rotations[i, k], positions[i, k], scales[i, k], size, body.unit_mm,
-                         body.joints, body.offsets, body.share, body.radius, fit)  # fmt: skip
+            explain_pose(heights[i], looks[i], moments[i, 5], rotations[i, k], positions[i, k], scales[i, k], size,
+                         body.unit_mm, body.n_own, body.joints, body.offsets, body.share, body.radius, fit)
             _write_scalars(lanes, s, N_SCALARS, fit)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-N_FIT = 7
+N_FIT = 8
 _SHARE_UNIT, _MM_UNIT = 1000.0, 50.0  # thresholds are integers
 _MOST_MM = 30.0  # in tenths of the balls' usual radius, as the next two: farther off is simply wrong
 _HIDDEN_MM = 12.0
@@ -32,14 +32,14 @@ def place_balls(rotations, positions, scale, joints, offsets, share, out):
 
 
 @njit(cache=True)
-def explain(heights, look, balls, radius, size, unit_mm, out):
-    """Fill `out` (N_FIT,) for balls (B, 3) mm of radius (B,) mm in the view frame of a height map.
+def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
+    """Fill `out` (N_FIT,) for balls (B, 3) mm of radius (B,) mm in the view frame of a height map, n_own of the body.
 
     size: of the animal over home size; unit_mm: as in `Balls`. Of the balls: share beside the
     animal, mean distance of their fronts from the readings, mean by which they stick out of them, share hidden behind
     them; of the readings: mean distance from the nearest ball, share far from any, mean of the distances within balls.
     """
-    n = len(balls)
+    n = n_own
     per_mm = 1.0 / (size * unit_mm)
     beside, off, out_of, hidden = 0.0, 0.0, 0.0, 0.0
     last = heights.shape[0] - 1
@@ -73,10 +73,13 @@ def explain(heights, look, balls, radius, size, unit_mm, out):
             z = (heights[r, c] / 16.0 - look[13]) / (look[10] * dx + look[11] * dy + look[12])
             px, py = z * (look[4] * dx + look[5] * dy + look[6]), z * (look[7] * dx + look[8] * dy + look[9])
             pz = heights[r, c] / 16.0
-            nearest = 1e9
-            for b in range(n):
+            nearest, which = 1e9, 0
+            for b in range(len(balls)):
                 d = np.sqrt((px - balls[b, 0]) ** 2 + (py - balls[b, 1]) ** 2 + (pz - balls[b, 2]) ** 2) - radius[b]
-                nearest = min(nearest, d)
+                if d < nearest:
+                    nearest, which = d, b
+            if which >= n_own:
+                continue
             nearest *= per_mm
             n_read += 1
             far += nearest > _APART_MM
@@ -87,19 +90,24 @@ def explain(heights, look, balls, radius, size, unit_mm, out):
 
 
 @njit(cache=True)
-def explain_pose(heights, look, rotations, positions, scale, size, unit_mm, joints, offsets, share, radius, out):
-    """`explain` for one pose; radius (B,) mm at scale 1."""
+def explain_pose(
+    heights, look, axis, rotations, positions, scale, size, unit_mm, n_own, joints, offsets, share, radius, out
+):  # fmt: skip
+    """`explain` for one pose; radius (B,) mm at scale 1. axis rad: of the animal's long axis, against which the last
+    number holds the base's x axis.
+    """
     balls = np.empty((len(joints), 3))
     place_balls(rotations, positions, scale, joints, offsets, share, balls)
-    explain(heights, look, balls, radius * scale, size, unit_mm, out)
+    explain(heights, look, balls, radius * scale, n_own, size, unit_mm, out)
+    out[7] = _SHARE_UNIT * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0])
 
 
 @njit(cache=True, parallel=True)
 def explain_all(
-    heights, looks, image, rotations, positions, scale, size, unit_mm, joints, offsets, share, radius, out
+    heights, looks, moments, image, rotations, positions, scale, size, unit_mm, n_own, joints, offsets, share, radius, out
 ):  # fmt: skip
     """`explain_pose` for a batch of n poses on some of the images (n,); out (n, N_FIT)."""
     for s in prange(len(image)):
         i = image[s]
-        explain_pose(heights[i], looks[i], rotations[s], positions[s], scale[s], size[s], unit_mm, joints, offsets,
-                     share, radius, out[s])  # fmt: skip
+        explain_pose(heights[i], looks[i], moments[i, 5], rotations[s], positions[s], scale[s], size[s], unit_mm, n_own,
+                     joints, offsets, share, radius, out[s])  # fmt: skip

@@ -109,8 +109,8 @@ class Cascade:
             return samples
         fit, b = np.empty((len(candidates), explaining.N_FIT), np.float32), self.balls
         explaining.explain_all(
-            images.heights, images.looks, candidates.image, candidates.rotations, candidates.positions,
-            candidates.scale, candidates.size, b.unit_mm, b.joints, b.offsets, b.share, b.radius, fit,
+            images.heights, images.looks, images.moments, candidates.image, candidates.rotations, candidates.positions,
+            candidates.scale, candidates.size, b.unit_mm, b.n_own, b.joints, b.offsets, b.share, b.radius, fit,
         )  # fmt: skip
         return replace(samples, scalars=np.concatenate([samples.scalars, fit], axis=1))
 

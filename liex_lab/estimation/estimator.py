@@ -88,9 +88,9 @@ class PoseEstimator:
     def _body(self) -> kernels.Body:
         """The body that candidates are held against the picture with."""
         if not self.model.method.explains:
-            return kernels.Body(1.0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+            return kernels.Body(1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
         b = self.model.cascade.balls
-        return kernels.Body(b.unit_mm, b.joints, b.offsets, b.share, b.radius)
+        return kernels.Body(b.unit_mm, b.n_own, b.joints, b.offsets, b.share, b.radius)
 
     @cached_property
     def _starts(self) -> Array:

@@ -428,11 +428,15 @@ def extract_one(
     plane = view_plane(rotation, distance[k], intrinsics)
     raw = np.empty((crop, crop), np.float32)
     cut_heights(depth, blocks, labels, found, plane, distance[k], intrinsics, origin[k], step, near, far, raw)
-    segment.keep_largest(raw, np.empty((crop, crop), np.int32), np.empty((crop * crop, 2), np.int32))
+    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * found[2] / np.sqrt(focal2)
     radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])
     segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k])
+    # the arm tells which way along the long axis the fingers point
+    along = rotation @ found[3:6]
+    if along[0] * np.cos(moments[k, 5]) + along[1] * np.sin(moments[k, 5]) < 0.0:
+        moments[k, 5] += np.pi
     n_px[k] = int(moments[k, 0])
 
 

@@ -112,7 +112,10 @@ def cut_nearest(
     depths: NDArray[np.float32] | NDArray[np.uint16], intrinsics: Array, size: Array, view: View,
     range_mm: tuple[float, float], camera_view: bool, rank: int,
 ) -> Crops:  # fmt: skip
-    """Height maps of the hands in pictures (n, H, W) mm; intrinsics (n, 4), size (n,)."""
+    """Height maps of the hands in pictures (n, H, W) mm; intrinsics (n, 4), size (n,).
+
+    The long axis among the moments points away from the arm, where one is seen.
+    """
     n = len(depths)
     crops = Crops(
         np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32), np.zeros(n, np.int64),
