@@ -130,5 +130,6 @@ def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm:
     wide = 1.25 * (arm[:, 0] + sleeve * (arm[:, 1] - arm[:, 0]) + side)
     radii[:, 2] = np.where(sleeve < 1.0, [wide, 1.3 * arm[:, 1]], 1.0).T
     radii[:, 3] = 1.3 * arm[:, 1:2]
-    tubes = Capsules(np.array([[0, _ELBOW], [0, _ELBOW], [0, _ELBOW], [_ELBOW, _SHOULDER]]), offsets, radii, np.zeros(n))
+    ends = np.array([[0, _ELBOW], [0, _ELBOW], [0, _ELBOW], [_ELBOW, _SHOULDER]])
+    tubes = Capsules(ends, offsets, radii, np.zeros(n))
     return tubes.vertices(np.repeat(frame[:, None], 3, axis=1), joints, scale, scale)

@@ -104,7 +104,8 @@ def explain_pose(
 
 @njit(cache=True, parallel=True)
 def explain_all(
-    heights, looks, moments, image, rotations, positions, scale, size, unit_mm, n_own, joints, offsets, share, radius, out
+    heights, looks, moments, image, rotations, positions, scale, size, unit_mm, n_own, joints, offsets, share, radius,
+    out,
 ):  # fmt: skip
     """`explain_pose` for a batch of n poses on some of the images (n,); out (n, N_FIT)."""
     for s in prange(len(image)):

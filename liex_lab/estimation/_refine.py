@@ -89,6 +89,12 @@ def forward(parents, offsets, rest, root_rotation, root_position, angles, scale,
 
 
 @njit(cache=True)
+def cross(a, b):
+    """The cross product (3,)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True)
 def turning_axes(free, angles, rotations, axes):
     """World axes (F, 3) about which the free angles (F, 2: joint, axis) turn: R J_r(w) e, J_r the right Jacobian."""
     for f in range(len(free)):
@@ -100,11 +106,7 @@ def turning_axes(free, angles, rotations, axes):
         if th2 > 1e-8:
             th = np.sqrt(th2)
             b, c = (1.0 - np.cos(th)) / th2, (th - np.sin(th)) / (th2 * th)
-            first = np.array([w[1] * e[2] - w[2] * e[1], w[2] * e[0] - w[0] * e[2], w[0] * e[1] - w[1] * e[0]])
-            second = np.array(
-                [w[1] * first[2] - w[2] * first[1], w[2] * first[0] - w[0] * first[2], w[0] * first[1] - w[1] * first[0]]
-            )
-            e = e - b * first + c * second
+            e = e - b * cross(w, e) + c * cross(w, cross(w, e))
         for i in range(3):
             axes[f, i] = rotations[j, i, 0] * e[0] + rotations[j, i, 1] * e[1] + rotations[j, i, 2] * e[2]
 

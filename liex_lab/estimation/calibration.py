@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
-from liex_lab.estimation.scoring import LEAST_MM, choose, clue_samples
+from liex_lab.estimation.scoring import LEAST_MM, clue_samples
 from liex_lab.estimation.training import TrainingSet, quantised
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
@@ -56,7 +56,7 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
             np.full(len(rows), 1), moments, looks[:, 13], np.ones(len(rows), np.int64),
         )  # fmt: skip
         rotations, positions, _, scores = estimator.candidates(crops, looks, size)
-        picked = choose(skeleton, model.method, model.calibration, size, rotations, positions, scores)
+        picked = estimator.pick(data.images.heights[rows], looks, moments, size, rotations, positions, scores)
         off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[rows], axis=-1)
         scores_of.append(picked.score)
         spreads.append(picked.spread)

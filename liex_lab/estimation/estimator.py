@@ -18,6 +18,7 @@ from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
+from liex_lab.estimation.refine import Refiner
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
@@ -93,6 +94,10 @@ class PoseEstimator:
         return kernels.Body(b.unit_mm, b.n_own, b.joints, b.offsets, b.share, b.radius)
 
     @cached_property
+    def _refiner(self) -> Refiner:
+        return Refiner.of(self.skeleton, self.model.cascade.balls)
+
+    @cached_property
     def _starts(self) -> Array:
         k = self.n_candidates or self.model.method.n_candidates
         if self.model.cascade.proposals is not None:
@@ -147,11 +152,24 @@ class PoseEstimator:
                 values[better] for values in (other_looks, found[0], found[1], found[3])
             )
         usable = crops.found
-        picked = choose(self.skeleton, method, self.model.calibration, size,
-                        rotations[usable], positions[usable], scores[usable])  # fmt: skip
+        with threads(parallel):
+            picked = self.pick(crops.heights[usable], looks[usable], crops.moments[usable], size,
+                               rotations[usable], positions[usable], scores[usable])  # fmt: skip
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops, looks)
+
+    def pick(
+        self, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, rotations: Array, positions: Array,
+        scores: Array,
+    ) -> Chosen:  # fmt: skip
+        """One pose for each of n frames out of its candidates, taken into the picture where the method does so."""
+        method = self.model.method
+        picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
+        if not method.refine_steps or not len(scores):
+            return picked
+        pose = self._refiner.refine(picked.pose, heights, looks, size, method.refine_steps)
+        return replace(picked, pose=pose, fit=self._refiner.fit(pose, heights, looks, moments, size))
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array
@@ -223,4 +241,5 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
     return Chosen(
         pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
         rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+        rows(picked.fit, picked.fit.shape[1]),
     )  # fmt: skip

@@ -29,7 +29,8 @@ class Chosen:
     pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n, J) of each joint;
     error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home size behind it; doubts (n, 4) mm at
     home size: best score, the best score of a candidate that points the other way, the spread of the good scores, and
-    how far the candidates of all scores lie from the chosen pose.
+    how far the candidates of all scores lie from the chosen pose; fit (n, F): how well the pose explains the picture,
+    where that is asked, see `_explain`.
     """
 
     pose: Pose
@@ -40,6 +41,7 @@ class Chosen:
     score: Array
     spread: Array
     doubts: Array
+    fit: Array
 
 
 def choose(
@@ -76,7 +78,7 @@ def choose(
     sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
-    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts)
+    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, np.zeros((len(score), 0)))
 
 
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
@@ -125,7 +127,7 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
     """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
 
     Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high
-    the animal looks; how many millimetres a pixel covers.
+    the animal looks; how many millimetres a pixel covers; how well the pose explains the picture.
     """
     pose = chosen.pose
     unit, whole = skeleton.relative_size, size * skeleton.relative_size
@@ -136,6 +138,7 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
             10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
             5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
             moments[:, 6] / whole, moments[:, 7] / whole, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
+            *chosen.fit.T / 50,
         ],
         axis=1,
     )  # fmt: skip
