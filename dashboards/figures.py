@@ -94,17 +94,27 @@ def lanes(
     return _svg(WIDTH, bottom + 8, [_HATCH, *parts])
 
 
-def trajectory(x_mm: Array, y_mm: Array, time_s: Array, size: int = 420) -> str:
-    """The way over the floor seen from above, coloured by time from dark to light; y points up in the picture."""
+def trajectory(
+    x_mm: Array, y_mm: Array, time_s: Array, outlines: Sequence[tuple[str, Array]] = (), size: int = 420
+) -> str:
+    """The way over the floor seen from above, coloured by time from dark to light; y points up in the picture.
+
+    outlines: the arena and zones in it, each a name and its corners (n, 2) mm.
+    """
     known = np.isfinite(x_mm) & np.isfinite(y_mm)
     if not known.any():
         return _svg(size, 40, ['<text class="label" x="10" y="24">no position is known</text>'])
     margin, plot = 52.0, size - 64.0
-    middle = [0.5 * (float(v[known].min()) + float(v[known].max())) for v in (x_mm, y_mm)]
-    reach = 0.55 * max(float(np.ptp(x_mm[known])), float(np.ptp(y_mm[known])), 20.0)
+    shown = [np.column_stack([x_mm[known], y_mm[known]]), *(corners for _, corners in outlines if len(corners))]
+    low, high = np.min([p.min(axis=0) for p in shown], axis=0), np.max([p.max(axis=0) for p in shown], axis=0)
+    middle = 0.5 * (low + high)
+    reach = 0.55 * max(float((high - low).max()), 20.0)
     across = Scale(middle[0] - reach, middle[0] + reach, margin, margin + plot)
     up = Scale(middle[1] - reach, middle[1] + reach, 8 + plot, 8.0)
     parts = [_frame(across, up)]
+    for name, corners in outlines:
+        places = " ".join(f"{float(across(x)):.1f},{float(up(y)):.1f}" for x, y in corners)
+        parts.append(f'<polygon class="outline" points="{places}"><title>{escape(name)}</title></polygon>')
     keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), 4000)).astype(int))
     x, y, t = across(x_mm)[keep], up(y_mm)[keep], time_s[keep]
     span = max(float(t[-1] - t[0]), 1e-9)

@@ -125,7 +125,9 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
         moved = session.kinematics
         rears = [(start, stop) for start, stop, action in spans if action == "rear"]
         speed, nose = (_across_gaps(moved[name], frames) for name in ("speed_mm_s", "nose_height_mm"))
-        drawn["way"] = figures.trajectory(*(_across_gaps(moved[name], frames) for name in ("x_mm", "y_mm")), time_s)
+        drawn["way"] = figures.trajectory(
+            *(_across_gaps(moved[name], frames) for name in ("x_mm", "y_mm")), time_s, outlines(session)
+        )
         drawn["speed"] = figures.curve(time_s, speed, time, "mm/s", _SPEED)
         drawn["nose"] = figures.curve(time_s, nose, time, "mm", _HEIGHT, shaded=rears)
     drawn["error"] = figures.curve(time_s, _across_gaps(frames["predicted_error_mm"], frames), time, "mm", _ERROR,
@@ -137,6 +139,13 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
                   if f"{word}_share" in row]  # fmt: skip
         drawn["budget"] = figures.budget(shares)
     return drawn
+
+
+def outlines(session: Session) -> list[tuple[str, Array]]:
+    """The arena's walls and the zones, by name: corners (n, 2) mm."""
+    walls = session.arena.outline_mm()
+    known = [("the arena", walls)] if len(walls) else []
+    return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
 
 
 def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:
@@ -163,7 +172,7 @@ def facts(session: Session) -> list[tuple[str, str]]:
     camera, frames, animal = about["camera"], about["frames"], about["animal"]
     flags = ", ".join(f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items())
     size = f"{animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else "unknown"
-    memory = about.get("peak_memory_mb")
+    memory, zones = about.get("peak_memory_mb"), ", ".join(zone.name for zone in session.zones)
     known = [
         ("Recording", f"{about['input']['name']} ({about['input']['format']})"),
         ("Input, sha256", about["input"]["sha256"]),
@@ -173,13 +182,31 @@ def facts(session: Session) -> list[tuple[str, str]]:
         ("Camera", f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy {camera['fy']:.1f}, "
          f"cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px ({camera['source']}), {camera['floor_distance_mm']:.0f} mm "
          "from the floor"),
+        ("Arena", f"{session.arena}{f'; zones: {zones}' if zones else ''}"),
         ("Model", f"{about['model'].get('name', 'none')} {about['model'].get('sha256', '')[:16]}".strip()),
         ("Software", ", ".join(f"{name} {v}" for name, v in about["versions"].items() if v != "unknown")),
         ("Run", f"{about['timings_s']['total']:.1f} s, {about['frames_per_s']:.0f} frames/s"
          + (f", peak memory {memory:.0f} MB" if memory else "")),
     ]  # fmt: skip
+    if undone := _optics(session):
+        known.insert(5, ("Optics", undone))
     subject = ", ".join(f"{name} {value}" for name, value in about["subject"].items())
     return known + ([("Subject", subject)] if subject else [])
+
+
+def _optics(session: Session) -> str:
+    """What was undone between the real camera and the ideal one, as a sentence without its full stop; or nothing."""
+    optics = session.metadata["camera"].get("optics", {})
+    undone = []
+    if bent := optics.get("distortion"):
+        undone.append(f"the lens distortion ({bent['model']} {', '.join(f'{k:g}' for k in bent['coefficients'])})")
+    if water := optics.get("water"):
+        undone.append(
+            f"the refraction at a water surface {water['height_mm']:g} mm below the lens (index "
+            f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')} camera)"
+        )
+    what = " and ".join(undone)
+    return f"{what} undone; camera and pictures are those of an ideal camera in air" if undone else ""
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
@@ -210,6 +237,8 @@ def methods(session: Session) -> list[str]:
         f"{frames['flags'].get('doubtful', 0)} of them flagged as doubtful; {frames['n_missing']} further frames were "
         f"not delivered by the camera.{known} Positions are millimetres in the arena frame, z up from the floor."
     )
+    if undone := _optics(session):
+        first += f" {undone[0].upper()}{undone[1:]}."
     return [first, *_behaviour_methods(session)]
 
 

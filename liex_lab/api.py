@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,3 +46,25 @@ def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     from liex_lab.catalog import find_sample
 
     return run_session(find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress)
+
+
+def run_tables(
+    out: str | Path,
+    animals: Sequence[str] = (),
+    *,
+    n_frames: int | None = None,
+    quick: bool = False,
+    fresh: bool = False,
+    progress: Progress = silent,
+) -> list[Path]:
+    """Every row of the paper's Tables 1-3 and its figures, written into `out`; returns what was written.
+
+    animals: () takes those with a bundled model. n_frames: only so many of each split. quick: a few minutes' run whose
+    numbers say only that everything runs. fresh: nothing kept is used, which takes hours.
+    """
+    from liex_lab.catalog import bundled_models
+    from liex_lab.dashboards.plates import draw_figures
+    from liex_lab.pipelines.tables import make_tables
+
+    return make_tables(out, animals or list(bundled_models()), n_frames=n_frames, quick=quick, fresh=fresh,
+                       draw=draw_figures, progress=progress)  # fmt: skip

@@ -25,12 +25,18 @@ def datasets_folder() -> Path:
     raise LiexError(f"the folder datasets should be in {_HERE} or beside it, but is in neither; install liex_lab again")
 
 
+def kept_results_folder() -> Path:
+    """The folder of results that took long to train for, one JSON for each animal."""
+    return datasets_folder() / "kept_results"
+
+
 def find_sample(name: str) -> Path:
     """The bundled sample recording `name`: a file or a folder of `datasets`."""
     folder = datasets_folder()
     if name and (folder / name).exists():
         return folder / name
-    known = sorted(p.name for p in folder.iterdir() if p.suffix not in {".toml", ".md"} and not p.name.startswith("."))
+    not_samples, kept = {".toml", ".md"}, kept_results_folder()
+    known = sorted(p.name for p in folder.iterdir() if p.suffix not in not_samples and p.name[0] != "." and p != kept)
     raise LiexError(f"there is no bundled sample '{name}'; there are: {', '.join(known) or 'none'}")
 
 

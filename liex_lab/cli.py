@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import subprocess
 import sys
@@ -41,8 +40,12 @@ OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folde
 TopicName = Annotated[
     str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
 ]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
+]
 AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse or hand.")]
 VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
+RowName = Annotated[str, typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
 
 
@@ -75,9 +78,7 @@ def run(
     plan: PlanName = "mouse",
     out: OutFolder = Path(),
     topic: TopicName = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
-    ] = None,
+    settings: Settings = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
 ) -> None:
     """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
@@ -98,12 +99,17 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
     topic: TopicName = None,
+    plan: PlanName = "mouse",
+    settings: Settings = None,
 ) -> None:
     """Say what is in a recording and what is wrong with it. Needs no model."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
     from liex_lab.pipelines.doctor import examine, print_report
 
     with progress_bar() as progress:
-        findings = examine(recording, fps=fps, topic=topic, progress=progress)
+        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
     if as_json:
         typer.echo(_json(findings))
     else:
@@ -155,7 +161,7 @@ def train(
 def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
-    variant: VariantName = "default",
+    variant: RowName = "default",
     n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
     spine_mm: Annotated[
         float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
@@ -185,7 +191,7 @@ def evaluate_speed(
 
             result = evaluate_recordings(progress=progress)
         else:
-            from liex_lab.pipelines.evaluate import evaluate_speed as measure
+            from liex_lab.pipelines.speed import evaluate_speed as measure
 
             result = measure(animal, progress=progress)
     _tell_numbers(result, json_file)
@@ -205,6 +211,31 @@ def evaluate_sizes(
     with progress_bar() as progress:
         result = measure(animal, n_frames=n_frames, progress=progress)
     _tell_numbers(result, json_file)
+
+
+@evaluate.command("tables")
+def evaluate_tables(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")],
+    animals: Annotated[
+        list[str] | None, typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model.")
+    ] = None,
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="Only this many frames of each split.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="See within minutes that everything runs; the numbers mean nothing.")
+    ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Train and measure every row anew, which takes hours; use no kept result.")
+    ] = False,
+) -> None:
+    """Every row of the paper's Tables 1 to 3 and its figures, measured now or kept from earlier."""
+    from liex_lab.api import run_tables
+
+    with progress_bar() as progress:
+        written = run_tables(out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress)
+    for path in written:
+        typer.echo(path)
 
 
 @evaluate.command("reference")
@@ -306,16 +337,6 @@ def _tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
 
 
 def _json(result: Any) -> str:
-    return json.dumps(_plain(result), indent=2, allow_nan=False, ensure_ascii=False)
+    from liex_lab.evaluation import plain
 
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: NumPy's numbers as Python's, and null for what is not a finite number."""
-    if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    value = value.tolist() if hasattr(value, "tolist") else value
-    if isinstance(value, list):
-        return _plain(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)

@@ -25,3 +25,7 @@ class SessionError(LiexError):
 
 class EstimationError(LiexError):
     """A recording in which the animal cannot be measured."""
+
+
+class MissingPackageError(LiexError):
+    """An optional package that is needed for what was asked and not installed."""

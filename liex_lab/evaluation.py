@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +27,8 @@ _FIGURES = (
 @dataclass(frozen=True)
 class PoseErrors:
     """Measured against true poses, n frames: error_mm (n,) mean joint error, NaN where lost; joint_mm (n, J);
-    flipped (n,); predicted_mm (n,); low_mm and high_mm (n,) the predicted 90 % interval of the error.
+    flipped (n,); predicted_mm (n,), NaN where none is predicted; low_mm and high_mm (n,) the predicted 90 % interval
+    of the error.
     """
 
     error_mm: Array
@@ -53,20 +55,21 @@ class PoseErrors:
         return PoseErrors(*(np.concatenate([getattr(p, name) for p in parts]) for name in PoseErrors.__annotations__))
 
     def summary(self) -> dict[str, Any]:
-        """The figures of `liex evaluate pose`."""
+        """The figures of `liex evaluate pose`; None for those of a prediction that was not made."""
         seen = np.isfinite(self.error_mm)
         if not seen.any():
             return dict.fromkeys(_FIGURES) | {"lost_rate": 1.0}
         error, predicted = self.error_mm[seen], self.predicted_mm[seen]
         inside = (error >= self.low_mm[seen]) & (error <= self.high_mm[seen])
+        predicts = bool(np.isfinite(predicted).all())
         return {
             "mean_joint_error_mm": float(error.mean()),
             "median_joint_error_mm": float(np.median(error)),
             "p95_joint_error_mm": float(np.quantile(error, 0.95)),
             "flip_rate": float(self.flipped[seen].mean()),
             "lost_rate": float(1.0 - seen.mean()),
-            "spearman_predicted_error": rank_correlation(predicted, error),
-            "interval90_coverage": float(inside.mean()),
+            "spearman_predicted_error": rank_correlation(predicted, error) if predicts else None,
+            "interval90_coverage": float(inside.mean()) if predicts else None,
         }
 
 
@@ -87,3 +90,15 @@ def count_reversals(heading: Array) -> int:
     """How often a heading (n,) rad turns by more than a right angle between frames; NaN frames are skipped."""
     seen = heading[np.isfinite(heading)]
     return int((np.cos(np.diff(seen)) < 0).sum())
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold: NumPy's numbers as Python's, and None for what is not a finite number."""
+    if isinstance(value, dict):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(value, list):
+        return plain(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value

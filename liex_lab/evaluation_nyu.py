@@ -23,7 +23,7 @@ _MEAN_BELOW_MM = (5, 10, 15, 20, 30, 40)
 
 def nyu_errors(answer: Array, truth: Array) -> dict[str, Any]:
     """The figures of an answer against the truth, points (n, 14, 3) mm; rows with NaN count as lost."""
-    seen = np.isfinite(answer).reshape(len(answer), -1).all(axis=1)
+    seen = np.asarray(np.isfinite(answer).all(axis=(1, 2)))
     if not seen.any():
         return {"n_frames": len(truth), "lost_rate": 1.0}
     answer, truth = answer[seen], truth[seen]

@@ -28,13 +28,21 @@ if TYPE_CHECKING:
 
 
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
+    """The recording at a path, or one that is open already, as an ideal camera in air would have made it.
+
+    Lens distortion and the water's refraction are undone whenever a frame is read.
+    """
+    from liex_lab.recordings.rectify import rectified
+
+    return rectified(open_planned(recording, plan, progress), build_water(plan))
+
+
+def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
     """The recording at a path, opened as the plan says, or one that is open already; the plan's camera overrules.
 
-    A plan that states all four intrinsics opens a recording that has none, too. Lens distortion and the water's
-    refraction are undone whenever a frame is read: what comes back is a recording of an ideal camera in air.
+    A plan that states all four intrinsics opens a recording that has none, too.
     """
     from liex_lab.recordings import open_recording
-    from liex_lab.recordings.rectify import rectified
 
     settings = plan.recording
     if isinstance(recording, str | Path):
@@ -43,7 +51,7 @@ def build_recording(recording: str | Path | Recording, plan: Plan, progress: Pro
             strict=not settings.accept_truncated, progress=progress,
         )  # fmt: skip
     recording.camera = _overruled(recording.camera, plan)
-    return rectified(recording, build_water(plan))
+    return recording
 
 
 def build_water(plan: Plan) -> Water | None:

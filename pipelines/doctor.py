@@ -4,126 +4,178 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from liex_lab.pipelines.build import build_water, open_planned
+from liex_lab.pipelines.doctor_scene import SceneLook
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
-from liex_lab.errors import LiexError
+from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
-from liex_lab.recordings import Recording, open_recording
+from liex_lab.recordings.times import DROPPED, Gap
 
-FINDINGS: Final = {  # key of the JSON: (how the report calls it, unit)
-    "format": ("format", ""),
-    "n_frames": ("frames", ""),
-    "duration_s": ("duration", "s"),
-    "rate_hz": ("rate", "frames/s"),
-    "n_gaps": ("gaps in time", ""),
-    "width": ("width", "px"),
-    "height": ("height", "px"),
-    "fx": ("focal length fx", "px"),
-    "fy": ("focal length fy", "px"),
-    "cx": ("optical axis cx", "px"),
-    "cy": ("optical axis cy", "px"),
-    "intrinsics_source": ("intrinsics from", ""),
-    "depth_min_mm": ("nearest depth", "mm"),
-    "depth_max_mm": ("farthest depth", "mm"),
-    "floor_mm": ("camera above the floor", "mm"),
-    "problems": ("problems", ""),
+if TYPE_CHECKING:
+    from liex_lab.recordings.recording import Recording
+
+FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be told are None
+    "format": "how the recording is stored",
+    "n_frames": "frames that can be read",
+    "duration_s": "from the first frame to the last",
+    "rate_hz": "one over the median step from frame to frame",
+    "jitter_ms": "standard deviation of the steps, without those across a gap",
+    "n_gaps": "places where the camera left out frames",
+    "n_missing": "frames that it left out there",
+    "n_time_faults": "stamps that were moved, for they repeat or run back, and jumps of the clock",
+    "width": "pixels in a row",
+    "height": "rows",
+    "fx": "focal length along a row, px",
+    "fy": "focal length along a column, px",
+    "cx": "column of the optical axis, px",
+    "cy": "row of the optical axis, px",
+    "intrinsics_source": "where these four come from",
+    "distortion": "of the lens, which is undone on reading; None: there is none",
+    "water": "the surface of the plan, whose refraction is undone on reading; None: there is none",
+    "depth_min_mm": "nearest reading",
+    "depth_max_mm": "farthest reading",
+    "unread_share": "of the pixels, in frames that hold any depth",
+    "floor_unread_share": "the same, of the pixels on the floor and on what stands there",
+    "noise_mm": "standard deviation of a pixel of the floor over time",
+    "floor_mm": "from the lens to the floor, perpendicular to it",
+    "floor_tilt_rad": "angle between the optical axis and the floor's perpendicular",
+    "water_depth_mm": "of the water over the floor, below the lens",
+    "arena": "shape of the floor, mm in the arena frame: see session.json",
+    "animal_length_mm": "of its outline from above, four standard deviations along the long axis; median",
+    "animal_area_mm2": "seen from above",
+    "animal_share": "of the frames looked at, in which it was found",
+    "animal_sits_still": "whether it had become a part of the background",
+    "problems": "what is wrong, and what to do about it",
 }
-_N_SAMPLED = 64  # frames looked at, spread over the recording
-_MUCH_UNREAD = 0.4  # share of the pixels
-_PLAUSIBLE_MM = (
-    100.0,
-    10_000.0,
-)  # median depth: nearer than any depth camera reads, farther than any animal is watched
-_PLAUSIBLE_FLOOR_MM = (150.0, 3000.0)
+_N_SAMPLED, _N_RAW = 96, 16  # frames looked at, spread over the recording; as many as a run learns its scene from
+_PLAUSIBLE_MM = (100.0, 10_000.0)  # median depth: nearer than any camera reads, farther than any animal is watched
 
 
 def examine(
     path: str | Path,
+    plan: Plan | None = None,
     *,
-    camera: Camera | None = None,
     fps: float | None = None,
     topic: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Look at a recording; the result has the keys of `FINDINGS`, in their order, and only JSON's own types.
+    """Look at a recording as the plan says; the result has the keys of `FINDINGS`, and only JSON's own types.
 
-    A number that cannot be told is None. A recording that is cut short is looked at as far as it goes; one that cannot
-    be opened at all raises a RecordingError.
+    fps, topic: come before the plan's. A recording that is cut short is looked at as far as it goes; one that cannot be
+    opened at all raises a RecordingError.
     """
-    with open_recording(path, camera=camera, fps=fps, topic=topic, progress=progress) as recording:
-        depth = _sample_depth(recording, progress)
-        floor_mm, no_floor = _floor(recording) if depth.median_mm is not None else (None, [])
-        lens = recording.camera
-        return {
-            "format": recording.format,
-            "n_frames": len(recording),
-            "duration_s": _finite(recording.duration_s),
-            "rate_hz": _finite(recording.rate_hz),
-            "n_gaps": len(recording.gaps),
-            "width": recording.width,
-            "height": recording.height,
+    from liex_lab.recordings.background import sample_frames, stride_for
+    from liex_lab.recordings.rectify import rectified
+
+    plan = _asked(plan or Plan(), fps, topic)
+    water = build_water(plan)
+    with open_planned(path, plan, progress) as opened:
+        progress(0, None, "looking at frames spread over the recording")
+        seen = rectified(opened, water)
+        stride = stride_for(seen, plan.animal.spine_min_mm)
+        sample = sample_frames(seen, _N_SAMPLED, stride)
+        depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
+        look = SceneLook(seen, plan, water, sample, stride)
+        if depth.median_mm is not None:
+            look.at_scene()
+        lens = opened.camera
+        found = {
+            **_time_facts(opened),
+            **{name: getattr(lens, name) for name in ("width", "height")},
             **{name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")},
             "intrinsics_source": lens.source,
-            "depth_min_mm": depth.min_mm,
-            "depth_max_mm": depth.max_mm,
-            "floor_mm": floor_mm,
-            "problems": [*recording.problems, *_time_problems(recording), *depth.problems(), *no_floor],
+            "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
+            "water": None if water is None else water.to_dict(),
+            **depth.facts(),
+            **look.facts,
+            "problems": [*seen.problems, *_time_problems(opened), *depth.problems(), *look.problems],
         }
+    return {key: found[key] for key in FINDINGS}
 
 
-def print_report(findings: dict[str, Any]) -> None:
-    """The findings as a table to read, and the problems below it."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
+def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
+    """The plan with what was asked for on the command line; what is cut short is wanted as far as it goes."""
+    settings = ["recording.accept_truncated=true"]
+    settings += [f"recording.fps={fps!r}"] if fps is not None else []
+    settings += [f"recording.topic={topic}"] if topic is not None else []
+    return plan.with_settings(settings)
 
-    table = Table(show_header=False, box=None, pad_edge=False)
-    for key, (name, unit) in FINDINGS.items():
-        if key != "problems":
-            value = findings[key]
-            table.add_row(name, Text(_readable(value)), unit if value is not None else "")
-    console = Console()
-    console.print(table)
-    if not findings["problems"]:
-        console.print("no problems found", style="green")
-    for problem in findings["problems"]:
-        console.print(Text(f"- {problem}", style="yellow"), soft_wrap=True)
+
+def _time_facts(recording: Recording) -> dict[str, Any]:
+    step = np.diff(recording.times_ns) / 1e6
+    dropped = _dropped(recording)
+    usual = step[step < 1.5 * np.median(step)] if len(step) else step
+    return {
+        "format": recording.format,
+        "n_frames": len(recording),
+        "duration_s": _finite(recording.duration_s),
+        "rate_hz": _finite(recording.rate_hz),
+        "jitter_ms": float(usual.std()) if len(usual) > 1 else None,
+        "n_gaps": len(dropped),
+        "n_missing": sum(gap.n_frames_missing for gap in dropped),
+        "n_time_faults": len(recording.faults) + len(recording.gaps) - len(dropped),
+    }
+
+
+def _dropped(recording: Recording) -> list[Gap]:
+    """The gaps that the camera left while its clock went on."""
+    return [gap for gap in recording.gaps if gap.reason == DROPPED]
+
+
+def _time_problems(recording: Recording) -> list[str]:
+    found = []
+    gaps = _dropped(recording)
+    if jumps := [gap for gap in recording.gaps if gap not in gaps]:
+        found.append(
+            f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before frame "
+            f"{jumps[0].start_frame}; nothing is measured across them"
+        )
+    if gaps:
+        missing = sum(gap.n_frames_missing for gap in gaps)
+        share = missing / (len(recording) + missing)
+        longest_s = max(gap.stop_ns - recording.times_ns[gap.start_frame - 1] for gap in gaps) / 1e9
+        places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        found.append(
+            f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest time between two "
+            f"frames is {longest_s:.2f} s; nothing is measured across a gap, but if there are many, record to a "
+            "faster disk or with fewer cameras on one USB controller"
+        )
+    if len(recording) == 1:
+        found.append("a single frame has no rate and no duration; give the whole recording")
+    return found
 
 
 class _Depths:
-    """What the sampled frames hold, added up frame by frame so that memory does not grow."""
+    """What the sampled frames hold, frame by frame so that memory does not grow."""
 
-    def __init__(self) -> None:
-        self.n_frames = self.n_empty = self.n_pixels = self.n_unread = 0
-        self.low, self.high = math.inf, 0.0
-        self._medians: list[float] = []
+    def __init__(self, frames: NDArray[np.float32]) -> None:
+        """Frames (n, H, W) mm as the camera gave them."""
+        self.n_frames, self.n_empty = len(frames), 0
+        self.low, self.high, n_unread, n_pixels = math.inf, 0.0, 0, 0
+        medians = []
+        for frame in frames:
+            read = frame[frame > 0]
+            if not read.size:
+                self.n_empty += 1
+                continue
+            n_unread, n_pixels = n_unread + frame.size - read.size, n_pixels + frame.size
+            self.low, self.high = min(self.low, float(read.min())), max(self.high, float(read.max()))
+            medians.append(float(np.median(read)))
+        self.median_mm = float(np.median(medians)) if medians else None
+        self.unread_share = n_unread / n_pixels if n_pixels else 1.0
 
-    def add(self, depth: NDArray[np.float32]) -> None:
-        read = depth[depth > 0]
-        self.n_frames += 1
-        self.n_pixels += depth.size
-        self.n_unread += depth.size - read.size
-        if not read.size:
-            self.n_empty += 1
-            return
-        self.low, self.high = min(self.low, float(read.min())), max(self.high, float(read.max()))
-        self._medians.append(float(np.median(read)))
-
-    @property
-    def min_mm(self) -> float | None:
-        return self.low if self._medians else None
-
-    @property
-    def max_mm(self) -> float | None:
-        return self.high if self._medians else None
-
-    @property
-    def median_mm(self) -> float | None:
-        return float(np.median(self._medians)) if self._medians else None
+    def facts(self) -> dict[str, Any]:
+        """The depth part of `FINDINGS`."""
+        known = self.median_mm is not None
+        return {
+            "depth_min_mm": self.low if known else None,
+            "depth_max_mm": self.high if known else None,
+            "unread_share": self.unread_share,
+        }
 
     def problems(self) -> list[str]:
         """Sentences about what the depths themselves say."""
@@ -131,12 +183,9 @@ class _Depths:
             return [f"none of the {self.n_frames} frames looked at holds any depth; check the camera and unit_mm"]
         found = []
         if self.n_empty:
-            found.append(f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all")
-        share = (self.n_unread - self.n_empty * self.n_pixels / self.n_frames) / self.n_pixels
-        if share > _MUCH_UNREAD:
             found.append(
-                f"{share:.0%} of the pixels are unread, more than {_MUCH_UNREAD:.0%}; check the camera's range, "
-                "sunlight and shiny surfaces"
+                f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all; check the camera's "
+                "cable and what covers its lens"
             )
         if not _PLAUSIBLE_MM[0] <= self.median_mm <= _PLAUSIBLE_MM[1]:
             found.append(
@@ -146,64 +195,65 @@ class _Depths:
         return found
 
 
-def _sample_depth(recording: Recording, progress: Progress) -> _Depths:
-    depths = _Depths()
-    chosen = np.unique(np.linspace(0, len(recording) - 1, min(_N_SAMPLED, len(recording))).astype(int))
-    for done, index in enumerate(chosen, start=1):
-        depths.add(recording.frame(int(index)).depth)
-        progress(done, len(chosen), "looking at frames")
-    return depths
-
-
-def _time_problems(recording: Recording) -> list[str]:
-    found = []
-    jumps = [gap for gap in recording.gaps if gap.reason == "clock_jumped"]
-    if jumps:
-        found.append(
-            f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before frame "
-            f"{jumps[0].start_frame}; nothing is measured across them"
-        )
-    if gaps := [gap for gap in recording.gaps if gap.reason != "clock_jumped"]:
-        missing = sum(gap.n_frames_missing for gap in gaps)
-        share = missing / (len(recording) + missing)
-        longest_s = max(gap.stop_ns - recording.times_ns[gap.start_frame - 1] for gap in gaps) / 1e9
-        places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-        found.append(
-            f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest time between two "
-            f"frames is {longest_s:.2f} s"
-        )
-    if len(recording) == 1:
-        found.append("a single frame has no rate and no duration")
-    return found
-
-
-def _floor(recording: Recording) -> tuple[float | None, list[str]]:
-    """Distance from the camera to the floor plane, mm; or None and the reason."""
-    from liex_lab.recordings.arena import find_floor
-    from liex_lab.recordings.foreground import learn_background
-
-    try:
-        background, *_ = learn_background(recording)
-        distance = _finite(find_floor(background, recording.camera).distance_mm)
-    except LiexError as error:
-        return None, [f"no floor: {error}"]
-    if distance is None:
-        return None, ["no floor: the plane that was found has no finite distance"]
-    low, high = _PLAUSIBLE_FLOOR_MM
-    if not low <= distance <= high:
-        return distance, [
-            f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to {high:.0f} mm; check "
-            "the unit and the camera's height"
-        ]
-    return distance, []
-
-
 def _finite(value: float) -> float | None:
     """A number JSON can hold, or None."""
     return float(value) if math.isfinite(value) else None
 
 
-def _readable(value: Any) -> str:
-    if value is None:
-        return "unknown"
-    return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+def print_report(findings: dict[str, Any]) -> None:
+    """The findings in one screen to read, and the problems below."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in lines(findings):
+        table.add_row(name, Text(value))
+    console = Console()
+    console.print(table)
+    if not findings["problems"]:
+        console.print("no problems found", style="green")
+    for problem in findings["problems"]:
+        console.print(Text(f"- {problem}", style="yellow"), soft_wrap=True)
+
+
+def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
+    """The findings as (name, text)."""
+    f = findings
+    arena, water, bent, tilt = f["arena"], f["water"], f["distortion"], f["floor_tilt_rad"]
+    shape = None
+    if arena is not None:
+        from liex_lab.recordings.walls import Arena
+
+        edge = {"wall": ", with walls", "drop": ", ends in the air"}.get(arena.get("edge", ""), "")
+        shape = f"{Arena.from_dict(arena)}{edge}"
+    degrees = None if tilt is None else f"{math.degrees(tilt):.1f}"
+    coefficients = None if bent is None else ", ".join(f"{value:g}" for value in bent["coefficients"])
+    moves = {True: "sits still", False: "moves about", None: ""}[f["animal_sits_still"]]
+    return [
+        ("format", f["format"]),
+        ("frames", f"{f['n_frames']} in {_text(f['duration_s'], 's', 2)}"),
+        ("rate", f"{_text(f['rate_hz'], 'frames/s', 2)}, steps vary by {_text(f['jitter_ms'], 'ms', 2)}"),
+        ("gaps", f"{f['n_gaps']}, {f['n_missing']} frames missing" if f["n_gaps"] else "none"),
+        ("time stamps", f"{f['n_time_faults']} could not be true" if f["n_time_faults"] else "increase as they should"),
+        ("picture", f"{f['width']} x {f['height']} px"),
+        ("intrinsics", f"fx {f['fx']:.1f}, fy {f['fy']:.1f}, cx {f['cx']:.1f}, cy {f['cy']:.1f} px"),
+        ("intrinsics from", f["intrinsics_source"]),
+        ("lens distortion", "none" if bent is None else f"{bent['model']} {coefficients}, undone on reading"),
+        ("water", "none" if water is None else f"{_text(f['water_depth_mm'], 'mm')} deep, n = "
+         f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')}; refraction undone on reading"),
+        ("depth", f"{_text(f['depth_min_mm'], 'mm')} to {_text(f['depth_max_mm'], 'mm')}, {f['unread_share']:.1%} "
+         "of the pixels unread"),
+        ("on the floor", "unknown" if f["floor_unread_share"] is None else
+         f"{f['floor_unread_share']:.1%} unread, noise {_text(f['noise_mm'], 'mm', 1)}"),
+        ("floor", "unknown" if degrees is None else
+         f"{_text(f['floor_mm'], 'mm')} from the lens, tilted by {degrees} degrees"),
+        ("arena", shape or "unknown"),
+        ("animal", "not found" if f["animal_length_mm"] is None else
+         f"{_text(f['animal_length_mm'], 'mm')} long from above, {moves}, found in {f['animal_share']:.0%} of "
+         "the frames"),
+    ]  # fmt: skip
+
+
+def _text(value: float | None, unit: str, digits: int = 0) -> str:
+    return "unknown" if value is None else f"{value:.{digits}f} {unit}"

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import platform
-import time
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, PlanError
 from liex_lab.evaluation import POSE_PROTOCOL, PoseErrors, angle_between_axes, count_reversals
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.synthetic import SyntheticSession
+    from liex_lab.recordings.crops import Foreground
+    from liex_lab.recordings.synthetic import TrueRecording
 
-_SPEED_FRAMES = 128
-_SPEED_REPEATS = 5
+Array = NDArray[np.float64]
 
 
 def estimator_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator:
@@ -37,25 +36,64 @@ def estimator_of(animal: str, variant: str, progress: Progress = silent) -> Pose
     return PoseEstimator(Model.load(cached_model(animal, variant, progress)))
 
 
-def pose_errors(
-    estimator: PoseEstimator, sessions: Sequence[SyntheticSession], plan: Plan, progress: Progress
-) -> PoseErrors:
+def subject_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator | Baseline:
+    """What `liex evaluate pose --variant` measures: a variant of the method, one of its ablations, or a baseline."""
+    from liex_lab.pipelines.baselines import BASELINES, trained_baseline
+
+    from liex_lab.baselines.ablations import PlainMean
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.estimation.method import METHODS
+
+    if variant in METHODS:
+        return estimator_of(animal, variant, progress)
+    if variant == "paper-one-pose":
+        return PoseEstimator(estimator_of(animal, "paper", progress).model, 1)
+    if variant == "paper-no-metric":
+        return PlainMean(estimator_of(animal, "paper", progress))
+    if variant in BASELINES:
+        return trained_baseline(animal, variant, progress)
+    known = ", ".join([*METHODS, "paper-one-pose", "paper-no-metric", *BASELINES])
+    raise PlanError(f"there is no variant '{variant}'; known are {known}")
+
+
+def measure(
+    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Foreground
+) -> tuple[Array, Array, Array]:
+    """Joints (n, J, 3) mm in the camera frame, their predicted error (n,) mm, NaN where the subject predicts none, and
+    the quantiles (2,) of its 90 % interval; the animal's size is found over the frames (n, H, W) mm.
+    """
+    from liex_lab.baselines.baseline import Guesses
+
+    found = subject.estimate(frames, scene, subject.find_size(frames, scene))
+    if isinstance(found, Guesses):
+        return found.joints, np.full(len(frames), np.nan), np.full(2, np.nan)
+    calibration = cast("PoseEstimator", subject).model.calibration
+    return found.chosen.pose.joints(subject.skeleton), found.chosen.error_mm, np.array(calibration.quantiles)
+
+
+def errors_of(
+    subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording], plan: Plan,
+    progress: Progress,
+) -> dict[str, PoseErrors]:  # fmt: skip
     """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
     from liex_lab.pipelines.build import build_scene
 
-    model, parts = estimator.model, []
-    quantiles = np.array(model.calibration.quantiles)
+    parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
-        scene, frames = build_scene(recording, plan, estimator.skeleton, len(recording))
-        estimates = estimator.estimate(frames, scene, estimator.find_size(frames, scene))
-        joints = estimates.chosen.pose.joints(estimator.skeleton)
-        parts.append(
-            PoseErrors.compare(
-                joints, recording.joints_camera, estimator.skeleton.n_joints - 1, estimates.chosen.error_mm, quantiles
-            )
-        )
-    return PoseErrors.join(parts)
+        scene, frames = build_scene(recording, plan, next(iter(subjects.values())).skeleton, len(recording))
+        for name, subject in subjects.items():
+            joints, predicted_mm, quantiles = measure(subject, frames, scene)
+            tip = subject.skeleton.n_joints - 1
+            parts[name].append(PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles))
+    return {name: PoseErrors.join(some) for name, some in parts.items()}
+
+
+def pose_errors(
+    subject: PoseEstimator | Baseline, sessions: Sequence[TrueRecording], plan: Plan, progress: Progress
+) -> PoseErrors:
+    """`errors_of` one subject."""
+    return errors_of({"": subject}, sessions, plan, progress)[""]
 
 
 def evaluate_pose(
@@ -72,10 +110,10 @@ def evaluate_pose(
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split(split, spine_mm=spine_mm)
-    estimator = estimator_of(animal, variant, progress)
+    subject = subject_of(animal, variant, progress)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
-    errors = pose_errors(estimator, sessions, Plan.load(animal), progress)
+    errors = pose_errors(subject, sessions, Plan.load(animal), progress)
     how = (
         f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, each with its own camera, arena, animal; "
         "the background, the floor, the blob and the animal's size are found by the product, nothing is handed over. "
@@ -100,60 +138,6 @@ def evaluate_sizes(
     return {"animal": animal, "n_frames": result["n_frames"], "error_percent_of_spine": rows,
             "ratio_to_best": {name: value / best for name, value in rows.items()},
             "worst_ratio": max(rows.values()) / best, "protocol": result["protocol"]}  # fmt: skip
-
-
-def _best_seconds(job: Callable[[], Any]) -> float:
-    """Shortest of several runs after one that compiles: the least disturbed by what else the machine does."""
-    job()
-    times = []
-    for _ in range(_SPEED_REPEATS):
-        began = time.perf_counter()
-        job()
-        times.append(time.perf_counter() - began)
-    return min(times)
-
-
-def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
-    """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate speed`."""
-    import numba
-    from liex_lab.pipelines.build import build_scene
-
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.scoring import choose
-    from liex_lab.recordings.worlds import world_of
-
-    sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
-    recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
-    plan = Plan.load(animal)
-    default, paper = estimator_of(animal, "default"), estimator_of(animal, "paper", progress)
-    scene, sample = build_scene(recording, plan, default.skeleton, len(recording))
-    size = default.find_size(sample, scene)
-    frames = sample[np.arange(_SPEED_FRAMES) % len(sample)]
-    cores = min(2, numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(cores)
-    rate: dict[str, float] = {}
-    for name, estimator, parallel in (("one", default, False), ("two", default, True), ("paper", paper, True)):
-        progress(len(rate), 3, f"timing {name}")
-        rate[name] = _SPEED_FRAMES / _best_seconds(partial(estimator.estimate, frames, scene, size, parallel))
-    crops = scene.extract(frames, size)
-    looks = scene.looks(crops)
-    rotations, positions, _, scores = default.candidates(crops, looks, size)
-    stages = {
-        "foreground": _best_seconds(lambda: scene.extract(frames, size, False)),
-        "candidates": _best_seconds(lambda: default.candidates(crops, looks, size, False)),
-        "choice": _best_seconds(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
-                                               rotations, positions, scores)),
-    }  # fmt: skip
-    return {
-        "animal": animal,
-        "frames_per_s_1core": rate["one"],
-        f"frames_per_s_{2}cores": rate["two"],
-        "ratio_to_paper": rate["two"] / rate["paper"],
-        "stages_ms": {name: 1000.0 * seconds / _SPEED_FRAMES for name, seconds in stages.items()},
-        "machine": f"{platform.processor() or platform.machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
-        "protocol": f"{_SPEED_FRAMES} rendered {recording.width} x {recording.height} frames in memory, foreground to "
-        f"final pose, best of {_SPEED_REPEATS}; ratio to the paper variant on two cores in the same run; stages on one",
-    }
 
 
 def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class Recipe:
     """
 
     seed: int = 20
-    n_images: int = 65_536
+    n_images: int = 49_152
     n_calibration: int = 6_144
     degraded_share: float = 0.5
     sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))

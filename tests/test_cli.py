@@ -17,12 +17,12 @@ import pytest
 from typer.testing import CliRunner
 
 import liex_lab
-from liex_lab import cli
+from liex_lab import api, cli
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
 VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "show", "info"]
-MEASURES = ["pose", "speed", "sizes", "reference"]
+MEASURES = ["pose", "speed", "sizes", "tables", "reference"]
 
 
 def liex(
@@ -189,13 +189,16 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 def test_the_other_measures_reach_their_jobs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     job(
+        monkeypatch, "speed",
+        evaluate_speed=lambda animal, progress: {"animal": animal, "stages_ms": {"foreground": 0.1}},
+    )  # fmt: skip
+    job(
         monkeypatch,
         "evaluate",
-        evaluate_speed=lambda animal, progress: {"animal": animal, "stages_ms": {"foreground": 0.1}},
         evaluate_sizes=lambda animal, n_frames, progress: {"n_frames": n_frames},
         evaluate_reference=lambda session, reference: {"session": str(session), "reference": str(reference)},
     )
-    speed, sizes, reference = (tmp_path / f"{name}.json" for name in MEASURES[1:])
+    speed, sizes, reference = (tmp_path / f"{name}.json" for name in ("speed", "sizes", "reference"))
     runner = CliRunner()
     runner.invoke(cli.app, ["evaluate", "speed", "--json", str(speed)])
     runner.invoke(cli.app, ["evaluate", "sizes", "--json", str(sizes)])
@@ -203,6 +206,21 @@ def test_the_other_measures_reach_their_jobs(monkeypatch: pytest.MonkeyPatch, tm
     assert json.loads(speed.read_text()) == {"animal": "mouse", "stages_ms": {"foreground": 0.1}}
     assert json.loads(sizes.read_text()) == {"n_frames": None}
     assert json.loads(reference.read_text()) == {"session": "m.liex", "reference": "r.csv"}
+
+
+def test_evaluate_tables_names_what_it_wrote(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[Any] = []
+
+    def run_tables(out: Path, animals: Any, **options: Any) -> list[Path]:
+        options.pop("progress")(1, None, "drawing")
+        seen.extend([out, list(animals), options])
+        return [out / "tables.md"]
+
+    monkeypatch.setattr(api, "run_tables", run_tables)
+    words = ["--out", str(tmp_path), "--animal", "mouse", "--animal", "fish", "--frames", "50", "--quick"]
+    result = CliRunner().invoke(cli.app, ["evaluate", "tables", *words])
+    assert result.output == f"{tmp_path / 'tables.md'}\n"
+    assert seen == [tmp_path, ["mouse", "fish"], {"n_frames": 50, "quick": True, "fresh": False}]
 
 
 def test_evaluate_speed_measures_recordings_where_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

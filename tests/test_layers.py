@@ -69,7 +69,8 @@ def test_only_the_command_line_and_the_front_door_know_the_jobs() -> None:
             assert not upwards, f"{path} imports {upwards}"
 
 
-HEAVY = {"numba", "pandas", "rerun", "sklearn", "scipy", "cv2", "pyarrow", "mcap", "foxglove", "tifffile", "open3d"}
+HEAVY = {"numba", "pandas", "rerun", "sklearn", "scipy", "cv2", "pyarrow", "mcap", "foxglove", "tifffile", "open3d",
+         "matplotlib", "torch"}  # fmt: skip
 
 
 @pytest.mark.parametrize(

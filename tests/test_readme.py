@@ -15,6 +15,7 @@ from liex_lab import cli
 from liex_lab.behaviour.columns import COLUMNS
 from liex_lab.body import Skeleton
 from liex_lab.plan import Plan
+from liex_lab.recordings.zones import read_zones
 from liex_lab.sessions.session import FILES
 from liex_lab.sessions.tables import TABLES
 from tests.conftest import REPOSITORY
@@ -66,8 +67,14 @@ def test_the_python_example_uses_what_there_is() -> None:
     assert used <= set(liex_lab.__all__)
 
 
+def test_the_zones_can_be_read(tmp_path: Path) -> None:
+    (example,) = [block for block in blocks("toml") if "[[zones]]" in block]
+    (tmp_path / "zones.toml").write_text(example, encoding="utf-8")
+    assert [zone.name for zone in read_zones(tmp_path / "zones.toml")] == ["centre", "nest"]
+
+
 def test_the_animal_of_ones_own_can_be_read(tmp_path: Path) -> None:
-    (example,) = blocks("toml")
+    (example,) = [block for block in blocks("toml") if "[[joints]]" in block]
     (tmp_path / "gerbil.toml").write_text(example, encoding="utf-8")
     gerbil = Skeleton.load(tmp_path / "gerbil.toml")
     assert (gerbil.name, gerbil.n_joints, gerbil.dof) == ("gerbil", 3, 8)

@@ -119,7 +119,7 @@ def _step(curvature: Array, gradient: Array, damping: Array, held: NDArray[np.bo
     matrix[:, index, index] += 1e-9
     matrix[held[:, :, None] | held[:, None, :]] = 0.0
     matrix[:, index, index] += held
-    return -np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None])[..., 0]
+    return -np.asarray(np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None]), float)[..., 0]
 
 
 def _moved(pose: Pose, step: Array, free: list[tuple[int, int]], lower: Array, upper: Array) -> Pose:

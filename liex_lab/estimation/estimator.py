@@ -53,6 +53,7 @@ class PoseEstimator:
     model: Model
     n_candidates: int = 0  # 0: as the model's method says
     unpruned: bool = False  # all candidates run the whole chain
+    n_joints: int = 0  # only so many joints are moved, to see what each costs; 0: all that can be
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
@@ -74,7 +75,7 @@ class PoseEstimator:
     @cached_property
     def _chain(self) -> kernels.Chain:
         s = self.skeleton
-        return kernels.Chain(s.parents, s.offsets, s.rest, s.axes, np.array(s.solved))
+        return kernels.Chain(s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None]))
 
     def _tuning(self, n_starts: int) -> kernels.Tuning:
         method = self.model.method
@@ -152,24 +153,24 @@ class PoseEstimator:
                 values[better] for values in (other_looks, found[0], found[1], found[3])
             )
         usable = crops.found
-        with threads(parallel):
-            picked = self.pick(crops.heights[usable], looks[usable], crops.moments[usable], size,
-                               rotations[usable], positions[usable], scores[usable])  # fmt: skip
+        picked = self.pick(crops.heights[usable], looks[usable], crops.moments[usable], size, rotations[usable],
+                           positions[usable], scores[usable], parallel)  # fmt: skip
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops, looks)
 
     def pick(
         self, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, rotations: Array, positions: Array,
-        scores: Array,
+        scores: Array, parallel: bool = True,
     ) -> Chosen:  # fmt: skip
         """One pose for each of n frames out of its candidates, taken into the picture where the method does so."""
         method = self.model.method
         picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
         if not method.refine_steps or not len(scores):
             return picked
-        pose = self._refiner.refine(picked.pose, heights, looks, size, method.refine_steps)
-        return replace(picked, pose=pose, fit=self._refiner.fit(pose, heights, looks, moments, size))
+        with threads(parallel):
+            pose = self._refiner.refine(picked.pose, heights, looks, size, method.refine_steps)
+            return replace(picked, pose=pose, fit=self._refiner.fit(pose, heights, looks, moments, size))
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array

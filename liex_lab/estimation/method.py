@@ -77,14 +77,14 @@ _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
     "default": Method(
-        variant="default", rounds=5, n_candidates=16, training_candidates=8,
-        regressors=GrowthPlan(12, 18, 22, 100, 0.3, 0.15, 0.3, 0.63),
-        metric=GrowthPlan(80, 9, 50, 100, 0.45, 0.1, 0.3, 0.5),
+        variant="default", rounds=5, n_candidates=20, training_candidates=8,
+        regressors=GrowthPlan(16, 18, 22, 120, 0.3, 0.15, 0.3, 0.63),
+        metric=GrowthPlan(120, 10, 50, 120, 0.45, 0.1, 0.3, 0.5),
         reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
         keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
         metric_shrinkage=0.15, mean_shift_mm=0.0,
         top_k=10, top_tau=1.0, top_radius_mm=15.0,
-        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
+        survivors=8, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
     ),
     "paper": Method(
         variant="paper", rounds=3, n_candidates=40, training_candidates=6,
@@ -105,7 +105,7 @@ _HAND: dict[str, Any] = {
     "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63), "proposal_reach_mm": 100.0,
     "explains": True, "refine_steps": 8,
     "reach_mm": 60.0, "base_lever_mm": 65.0, "joint_lever_mm": 40.0, "scale_lever_mm": 60.0, "keep_turned": 1.3,
-    "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0, 
+    "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0,
     "survivors": 8, "pruner": GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
 }  # fmt: skip
 

@@ -249,7 +249,10 @@ def _emit(name: str, several: bool) -> Any:
 
 
 @intrinsic
-def walk_one_view(typing, nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first):
+def walk_one_view(
+    typing: Any, nodes: Any, root: Any, pixels: Any, base: Any, scalar_base: Any, inverse: Any, views: Any, stride: Any,
+    side: Any, leaf: Any, first: Any,
+) -> Any:  # fmt: skip
     """Leaves of lanes first .. first + LANES - 1 in the tree at `root`, into leaf (n,) int32.
 
     nodes (N, 4) int32; inverse (n,) float32 home size over the animal's; views (9, n) float32 and stride n; side of the
@@ -260,7 +263,10 @@ def walk_one_view(typing, nodes, root, pixels, base, scalar_base, inverse, views
 
 
 @intrinsic
-def walk_views(typing, nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first):
+def walk_views(
+    typing: Any, nodes: Any, root: Any, pixels: Any, base: Any, scalar_base: Any, inverse: Any, views: Any, stride: Any,
+    side: Any, leaf: Any, first: Any,
+) -> Any:  # fmt: skip
     """`walk_one_view` for nodes that choose among the views (n, V, 9) of a sample; stride is 9 V."""
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_views", True)

@@ -13,12 +13,12 @@ from liex_lab.recordings.times import Times, median_step, start_of_day
 
 STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
 METADATA = "metadata.json"
-AZURE, KINECT_V2, OTHER = "Azure Kinect", "Kinect v2", "other"
+AZURE, KINECT, OTHER = "Azure Kinect", "Kinect v2", "other"  # cameras, as far as they are told apart
 
 _CAMERA_KEYS = ("camera", "cameratype", "cameramodel", "device", "devicename", "devicemodel", "sensor")
 _CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is found counts
-    "azure": AZURE, "k4a": AZURE, "femto": AZURE, "kinectv2": KINECT_V2, "kinect2": KINECT_V2, "kinectone": KINECT_V2,
-    "kinectforwindowsv2": KINECT_V2,
+    "azure": AZURE, "k4a": AZURE, "femto": AZURE, "kinectv2": KINECT, "kinect2": KINECT, "kinectone": KINECT,
+    "kinectforwindowsv2": KINECT,
 }  # fmt: skip
 _PLAUSIBLE_HZ = (0.5, 2000.0)
 
@@ -27,7 +27,7 @@ _PLAUSIBLE_HZ = (0.5, 2000.0)
 class Metadata:
     """What metadata.json says.
 
-    size: (width, height), None when unstated; dtype: of the stored depths; camera: `AZURE`, `KINECT_V2`, `OTHER` or
+    size: (width, height), None when unstated; dtype: of the stored depths; camera: `AZURE`, `KINECT`, `OTHER` or
     None when it does not say, and camera_name: its words; facts: for `Recording.metadata`; problems: sentences.
     """
 

@@ -37,12 +37,28 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
     """
     import cv2
 
+    if not _sums_agree(data):  # the decoder would find it too, and write about it into the terminal
+        return None
     try:
         picture: NDArray[Any] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:  # of an empty buffer, and of sizes beyond OpenCV's own limits
         return None
     kind = (3, np.dtype(np.uint8)) if colour else (2, np.dtype(np.uint16))
     return picture if picture is not None and (picture.ndim, picture.dtype) == kind else None
+
+
+def _sums_agree(data: NDArray[np.uint8]) -> bool:
+    """Whether every chunk up to the last agrees with its check sum."""
+    view, at = data.data, len(_SIGNATURE)
+    while at + 12 <= len(view):
+        (length,) = struct.unpack_from(">I", view, at)
+        end = at + 12 + length
+        if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+            return False
+        if bytes(view[at + 4 : at + 8]) == b"IEND":
+            return True
+        at = end
+    return False
 
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:

@@ -80,6 +80,9 @@ class Foreground(Protocol):
     def misfit(self, crops: Crops) -> Array:
         """How unlike the animal each crop (n) is."""
 
+    def every(self, step: int) -> Foreground:
+        """The same with every `step`-th pixel along rows and columns."""
+
 
 def view_of(looks: Array) -> SE3:
     """T_view_camera (n) of looks (n, 17)."""

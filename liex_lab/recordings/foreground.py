@@ -172,6 +172,15 @@ class Scene:
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
 
+    def every(self, step: int) -> Scene:
+        """The same with every `step`-th pixel along rows and columns."""
+        camera, cut = self.camera.every(step), (slice(None, None, step), slice(None, None, step))
+        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
+        return replace(
+            self, camera=camera, floor=floor, background=np.ascontiguousarray(self.background[cut]),
+            limit=np.ascontiguousarray(self.limit[cut]), on_floor=np.ascontiguousarray(self.on_floor[cut]),
+        )  # fmt: skip
+
     def misfit(self, crops: Crops) -> Array:
         """How unlike the animal each crop (n) is in area and volume: the square of a number of standard deviations."""
         area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)

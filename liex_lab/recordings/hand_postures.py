@@ -26,7 +26,7 @@ _BLEND_SHARE = 0.3  # of the seen ones lie between two
 
 @dataclass(frozen=True)
 class HandPostures:
-    """A mixture of K kinds of postures and M of orientations. Angles in rad, D free angles in the skeleton's order.
+    """A mixture of K kinds of postures and M of orientation. Angles in rad, D free angles in the skeleton's order.
 
     share (K,); mean (K, D); axes (K, A, D): principal deviations, one standard deviation long; rest (K, D): standard
     deviation of what they leave. turn_share (M,); turn (M, 3, 3): T_view_palm, the view's z axis pointing at the

@@ -23,8 +23,8 @@ from liex_lab.recordings.hand_labels import N_FIRST_PERSON, NYU_CAMERA, REFERENC
 from liex_lab.recordings.hand_postures import draw_seen, draw_wide
 from liex_lab.recordings.nearest import sight_rotations
 from liex_lab.recordings.postures import SIZE_RANGE
-from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.sensors import KINECT_V2_SENSOR, Sensor
+from liex_lab.recordings.synthetic import TrueRecording
 from liex_lab.recordings.windows import BLOCK, PER_SESSION, TrainingWindows, _degrade
 
 Array = NDArray[np.float64]
@@ -50,11 +50,8 @@ _FLAT = np.array([0.0, 0.0, 1.0])
 _FLOOR_MM = 1300.0  # where the plane stands that is taken for the arena's floor
 
 
-class HandSession(Recording):
-    """A virtual recording of one person's hand, and its truth; the same attributes as `SyntheticSession`.
-
-    pose (n): root T_camera_root, angles, scale; joints_camera and joints_arena (n, J, 3) mm: the person's own joints.
-    """
+class HandSession(TrueRecording):
+    """A virtual recording of one person's hand; the joints are the person's own."""
 
     def __init__(self, name: str, skeleton: Skeleton, sensor: Sensor, cast: stage.HandCast) -> None:
         n = len(cast.seeds)
@@ -135,7 +132,7 @@ class HandWorld:
         size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
         low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind[each]]
         angles, turns = draw_wide(rng, skeleton, n)
-        places = stage.draw_places(rng, intrinsics[each], picture[each], low, high)
+        places = stage.draw_places(rng, intrinsics[each], picture[each].astype(float), low, high)
         pose = stage.hold_out(rng, skeleton, angles, turns, size, places)
         cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics[each], parameters[each], _THING_SHARE,
                               PER_SESSION)  # fmt: skip
@@ -177,7 +174,7 @@ class HandWorld:
         picture = np.broadcast_to(np.array([camera.width, camera.height]), (n, 2)).copy()
         low, high = np.full((2, n), np.array(stage.DISTANCE_MM)[:, None])
         pose = stage.hold_out(rng, self.skeleton, angles, turns, size,
-                              stage.draw_places(rng, intrinsics, picture, low, high))  # fmt: skip
+                              stage.draw_places(rng, intrinsics, picture.astype(float), low, high))  # fmt: skip
         parameters = np.repeat(NYU_SENSOR.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
         cast = stage.assemble(rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1)
         return HandSession(name, self.skeleton, NYU_SENSOR, cast)
@@ -221,7 +218,8 @@ def gesture_session(
     angles, turns = draw_seen(rng, skeleton, keys)
     c = sensor.camera
     intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n_frames, 4)).copy()
-    middle = stage.draw_places(rng, intrinsics[:1], np.array([[c.width, c.height]]), *np.array([[550.0], [850.0]]))
+    picture = np.array([[c.width, c.height]], float)
+    middle = stage.draw_places(rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0]))
     places = middle * rng.uniform(0.93, 1.07, (keys, 1)) + rng.normal(0.0, 15.0, (keys, 3))
     at, share = _beat(rng, n_frames, keys)
     step = so3.log(np.swapaxes(turns[:-1], 1, 2) @ turns[1:])[at]

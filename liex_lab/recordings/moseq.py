@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -14,9 +15,16 @@ from numpy.typing import NDArray
 from liex_lab.camera import KINECT_V2, Camera, Lens
 from liex_lab.errors import RecordingError
 from liex_lab.progress import Progress, silent
-from liex_lab.recordings import _moseq_files as beside
 from liex_lab.recordings._azure import azure_camera, mode_of, read_calibration
-from liex_lab.recordings._moseq_files import METADATA, STAMPS, Metadata, read_metadata, read_stamps
+from liex_lab.recordings._moseq_files import (
+    AZURE,
+    KINECT,
+    METADATA,
+    STAMPS,
+    Metadata,
+    read_metadata,
+    read_stamps,
+)
 from liex_lab.recordings._pictures import Stack
 from liex_lab.recordings._track import DepthTrack
 from liex_lab.recordings.archive import Unpacked, remove_tree, unpack
@@ -181,8 +189,8 @@ class _Session:
     def _size_of_camera(self) -> tuple[int, int] | None:
         if isinstance(self.stated_camera, Camera):
             return self.stated_camera.width, self.stated_camera.height
-        size = (self.camera_file.width, self.camera_file.height)
-        return size if size[0] and size[1] else None  # type: ignore[return-value]
+        width, height = self.camera_file.width, self.camera_file.height
+        return (width, height) if width and height else None
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
         """That of a Kinect v2, unless the stamps say that another camera's size fits and this one does not."""
@@ -198,7 +206,7 @@ class _Session:
         return _KINECT_V2_SIZE
 
     def _recording(
-        self, name: str, sources: list[Path], stack: Stack, track: DepthTrack | None, close: Any
+        self, name: str, sources: list[Path], stack: Stack, track: DepthTrack | None, close: Callable[[], None]
     ) -> Recording:
         camera = self._camera(stack, track)
         times = self._times(len(stack), track)
@@ -223,10 +231,10 @@ class _Session:
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
         kind = self._which_camera(track)
-        if kind == beside.KINECT_V2 and (width, height) == _KINECT_V2_SIZE:
+        if kind == KINECT and (width, height) == _KINECT_V2_SIZE:
             self._say_typical("Kinect v2")
             return KINECT_V2
-        if kind == beside.AZURE and mode is not None:
+        if kind == AZURE and mode is not None:
             self._say_typical(f"Azure Kinect in the mode {mode.name}")
             return azure_camera(mode, None)
         whose = (
@@ -240,8 +248,8 @@ class _Session:
     def _which_camera(self, track: DepthTrack | None) -> str | None:
         """The camera as the files name it; where they do not, only a Kinect v2 has pictures of its size."""
         if track is not None and any(name.startswith("K4A_") for name in track.tags):
-            return beside.AZURE
-        return self.metadata.camera or beside.KINECT_V2
+            return AZURE
+        return self.metadata.camera or KINECT
 
     def _say_typical(self, camera: str) -> None:
         self.problems.append(

@@ -20,6 +20,7 @@ from liex_lab.threads import threads
 Array = NDArray[np.float64]
 
 RANGE_MM = (250.0, 1600.0)  # nearer and farther than this nothing is a hand
+_FLAT = np.array([0.0, 0.0, 1.0])  # across the optical axis
 _AREA_SD, _VOLUME_SD = 0.45, 0.45  # of the logarithms, from posture to posture of one hand
 
 
@@ -46,7 +47,7 @@ class NearestScene:
         """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was learned."""
         sample = sample_frames(recording, n_frames)
         camera = recording.camera
-        scene = NearestScene(camera, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1000.0, camera), view, *range_mm)
+        scene = NearestScene(camera, Floor.from_plane(_FLAT, 1000.0, camera), view, *range_mm)
         crops = scene.extract(sample, 1.0)
         if not crops.found.any():
             raise EstimationError(
@@ -54,7 +55,7 @@ class NearestScene:
                 f"between {range_mm[0]:g} and {range_mm[1]:g} mm; check the depth unit, foreground.near_mm and far_mm"
             )
         seen = crops.moments[crops.found]
-        floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), float(np.median(crops.distance[crops.found])), camera)
+        floor = Floor.from_plane(_FLAT, float(np.median(crops.distance[crops.found])), camera)
         return replace(scene, floor=floor, area_mm2=float(np.median(seen[:, 1])),
                        volume_mm3=float(np.median(seen[:, 2]))), sample  # fmt: skip
 
@@ -81,6 +82,11 @@ class NearestScene:
         with threads(parallel):
             return cut_nearest(depths, self._intrinsics(n), sizes, self.view, (self.near_mm, self.far_mm), camera_view,
                                rank)  # fmt: skip
+
+    def every(self, step: int) -> NearestScene:
+        """The same with every `step`-th pixel along rows and columns."""
+        camera = self.camera.every(step)
+        return replace(self, camera=camera, floor=Floor.from_plane(_FLAT, self.floor.distance_mm, camera))
 
     def _intrinsics(self, n: int) -> Array:
         c = self.camera

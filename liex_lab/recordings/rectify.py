@@ -1,8 +1,8 @@
 """True millimetres on reading: a recording through a bent lens or a water surface, as an ideal pinhole would see it.
 
 Everything behind this door works with an ideal pinhole camera in air. A recording without distortion and water is
-handed on untouched. A bent lens becomes a straight one with the same focal lengths and picture size. For the water see
-`Water.without`: the ideal camera stands somewhat higher than the real one.
+handed on untouched. A bent lens becomes a straight one with the same focal lengths, its picture so much larger that it
+holds what the bent one held. For the water see `Water.without`: the ideal camera stands higher than the real one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.water import Water
 
 _MUCH_LOST = 0.05  # share of a picture's pixels that leave it
+_MAX_GROWTH = 0.15  # of a picture's width or height, at each side
 
 
 def rectified(recording: Recording, water: Water | None = None) -> Recording:
@@ -47,18 +48,45 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
 
 def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
     """The ideal pinhole to which pictures of this camera are carried."""
-    straight = replace(camera, distortion=None)
+    straight = straight_camera(camera)
     return straight if water is None else water.without(straight)
+
+
+def straight_camera(camera: Camera) -> Camera:
+    """The same camera with a straight lens: its picture grows at each side by as much as the bent one's edge went in.
+
+    Up to `_MAX_GROWTH`, for the far corners of a fisheye lens would be at infinity. Sizes stay multiples of four.
+    """
+    straight = replace(camera, distortion=None)
+    if camera.distortion is None:
+        return straight
+    size = (camera.width, camera.height)
+    grown: list[tuple[int, int]] = []
+    for axis in (0, 1):
+        along = np.linspace(0.0, size[1 - axis] - 1.0, 65)
+        before, after = (
+            np.stack([np.full(65, end), along][:: 1 - 2 * axis], axis=-1) for end in (0.0, size[axis] - 1.0)
+        )
+        low, high = (straight.project(camera.unproject(edge, 1.0))[:, axis] for edge in (before, after))
+        most = _MAX_GROWTH * size[axis]
+        room = [np.where(np.isfinite(off), off, most).max() for off in (-low, high - size[axis] + 1.0)]
+        start, stop = (int(np.ceil(min(max(value, 0.0), most))) for value in room)
+        grown.append((start, stop + -(size[axis] + start + stop) % 4))
+    (left, right), (top, bottom) = grown
+    return replace(
+        straight, cx=camera.cx + left, cy=camera.cy + top, width=camera.width + left + right,
+        height=camera.height + top + bottom,
+    )  # fmt: skip
 
 
 def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], Depth]:
     """What turns a depth picture (H, W) mm of this camera into that of its `ideal_camera`."""
     source = None if camera.distortion is None else lookup_table(camera)
-    laws = None if water is None else pixel_laws(replace(camera, distortion=None), water)
+    laws = None if water is None else pixel_laws(straight_camera(camera), water)
 
     def undo(depth: Depth) -> Depth:
         if source is not None:
-            straight = np.empty_like(depth)
+            straight = np.empty(source.shape, np.float32)
             kernels.look_up(depth, source, straight)
             depth = straight
         if laws is not None:
@@ -72,12 +100,13 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
 
 
 def lookup_table(camera: Camera) -> NDArray[np.int32]:
-    """For every pixel (H, W) of the ideal picture the pixel of the bent one that lies nearest, row * W + column; or -1.
+    """For every pixel of the straight picture the pixel of the bent one that lies nearest, row * width + column; or -1.
 
-    The other way round would leave holes where the ideal picture is the larger one. Depth along the optical axis is
+    The other way round would leave holes where the straight picture is the larger one. Depth along the optical axis is
     the same in both, and is never mixed from neighbours, which would put points between the animal and the floor.
     """
-    seen = np.floor(camera.project(replace(camera, distortion=None).unproject(_pixels(camera), 1.0)) + 0.5)
+    straight = straight_camera(camera)
+    seen = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
     inside = _inside(seen, camera)
     seen = np.where(inside[..., None], seen, 0).astype(np.int32)
     return np.where(inside, seen[..., 1] * camera.width + seen[..., 0], -1).astype(np.int32)
@@ -104,9 +133,9 @@ def share_lost(camera: Camera) -> float:
     """The share of a bent picture's pixels that have no place in the straight one, told from every eighth."""
     if camera.distortion is None:
         return 0.0
-    straight = replace(camera, distortion=None)
+    straight = straight_camera(camera)
     uv = straight.project(camera.unproject(_pixels(camera)[::8, ::8], 1.0))
-    return float(1.0 - _inside(uv, camera).mean())
+    return float(1.0 - _inside(uv, straight).mean())
 
 
 def _inside(uv: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:

@@ -14,8 +14,12 @@ Times = NDArray[np.int64]
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
 CLOCK_JUMP_NS = 60 * 10**9  # no camera drops frames for a minute: it was stopped, or its clock was set
 _SURE = 5  # frames on either side that tell a lasting jump of the clock from a few stamps out of order
+_LONGEST_STEP_NS = 10**9
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
 _PLAUSIBLE_START_NS = 946_684_800 * 10**9  # the year 2000: earlier stamps count from something else than 1970
+
+
+DROPPED, JUMPED = "camera_dropped", "clock_jumped"
 
 
 @dataclass(frozen=True)
@@ -32,10 +36,9 @@ class Gap:
     start_ns: int
     stop_ns: int
     n_frames_missing: int
-    reason: str = "camera_dropped"
+    reason: str = DROPPED
 
 
-JUMPED = "clock_jumped"
 FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `Settled.faults` counts
 _REPEATED, _OUT_OF_ORDER, _JUMPED = 1, 2, 3  # their places in it
 
@@ -59,21 +62,28 @@ def median_step(times_ns: Times) -> int:
 
 
 def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
-    """The places where more than 1.5 steps of `step_ns` lie between two frames; 'clock_jumped' if over a minute."""
+    """The places where more than 1.5 steps of `step_ns` lie between two frames.
+
+    Where it is more than a minute the camera was stopped, or its clock set: how many frames are missing, nobody knows,
+    and one is counted.
+    """
     if step_ns <= 0:
         return []
     dt = np.diff(times_ns)
-    return [
-        Gap(
-            start_frame=int(i) + 1,
-            stop_frame=int(i) + 1,
-            start_ns=int(times_ns[i]) + step_ns,
-            stop_ns=int(times_ns[i + 1]),
-            n_frames_missing=round(int(dt[i]) / step_ns) - 1,
-            reason=JUMPED if dt[i] > CLOCK_JUMP_NS else "camera_dropped",
+    found = []
+    for i in np.flatnonzero(dt > GAP_FACTOR * step_ns):
+        jumped = dt[i] > CLOCK_JUMP_NS
+        found.append(
+            Gap(
+                start_frame=int(i) + 1,
+                stop_frame=int(i) + 1,
+                start_ns=int(times_ns[i]) + step_ns,
+                stop_ns=int(times_ns[i + 1]),
+                n_frames_missing=1 if jumped else round(int(dt[i]) / step_ns) - 1,
+                reason=JUMPED if jumped else DROPPED,
+            )
         )
-        for i in np.flatnonzero(dt > GAP_FACTOR * step_ns)
-    ]
+    return found
 
 
 def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> list[Gap]:
@@ -94,13 +104,13 @@ def settle(times_ns: Times) -> Settled:
 
     A clock that was set back, or wrapped around, while frames went on coming is let go on from where it was, as if one
     frame were missing there: how long the jump really took, nobody knows. After that the most stamps that can stay do
-    stay, exactly (the longest chain that increases), so that one wild stamp does not drag its neighbours along; each of
-    the others moves to the nearest nanosecond that fits between those that stay.
+    stay, exactly (the longest chain that increases), so that one wild stamp does not drag its neighbours along; the
+    others are spread evenly between those that stay, for that is where a camera that runs on takes its pictures.
     """
     if np.all(np.diff(times_ns) > 0):
         return Settled(times_ns, np.zeros(len(times_ns), np.uint8), None)
     joined, jumps = _join_clocks(times_ns)
-    times = _least_moved(joined)
+    times = _fewest_moved(joined)
     moved = times != joined
     faults = np.where(moved, np.where(np.abs(times - joined) > CLOCK_JUMP_NS, _JUMPED, _OUT_OF_ORDER), 0)
     repeated = np.zeros(len(times), bool)
@@ -120,7 +130,8 @@ def settle(times_ns: Times) -> Settled:
         largest_ms = float(np.abs(times - joined).max()) / 1e6
         sentences.append(
             f"time stamps do not increase: {int(moved.sum())} of {len(times)} are repeated or out of order; "
-            f"frames were kept in file order and these stamps moved as little as possible, at most {largest_ms:.3f} ms"
+            "frames were kept in file order and these stamps spread between their neighbours, moved by "
+            f"{largest_ms:.3f} ms at most"
         )
     return Settled(times, faults.astype(np.uint8), "; ".join(sentences))
 
@@ -152,17 +163,32 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
     return times_ns + np.cumsum(steps), np.array(jumps, np.int64)
 
 
-def _least_moved(times_ns: Times) -> Times:
-    """The stamps made strictly increasing by moving as few of them as possible, each to the nearest place."""
+def _fewest_moved(times_ns: Times) -> Times:
+    """The stamps made strictly increasing by moving as few of them as possible, evenly between those that stay."""
     # Integers that must increase by at least 1 are integers minus their rank that must not decrease.
-    rank = np.arange(len(times_ns), dtype=np.int64)
-    slack = times_ns - rank
-    keep = _longest_nondecreasing(slack.tolist())
-    settled, ceiling = slack.copy(), _next_kept(slack, keep)
-    for i in np.flatnonzero(~np.isin(rank, keep)):
-        floor = int(settled[i - 1]) if i else ceiling[0]
-        settled[i] = min(max(int(slack[i]), floor), ceiling[i])
-    return settled + rank
+    slack = times_ns - np.arange(len(times_ns), dtype=np.int64)
+    keep = _first_of_equal(times_ns, slack, _longest_nondecreasing(slack.tolist()))
+    settled = times_ns.copy()
+    kept = times_ns[keep]
+    step = min(median_step(kept) or 1, _LONGEST_STEP_NS)
+    settled[: keep[0]] = int(kept[0]) - step * np.arange(int(keep[0]), 0, -1)
+    settled[keep[-1] + 1 :] = int(kept[-1]) + step * np.arange(1, len(times_ns) - int(keep[-1]))
+    for n in np.flatnonzero(np.diff(keep) > 1):
+        i, j, start, stop = int(keep[n]), int(keep[n + 1]), int(kept[n]), int(kept[n + 1])
+        settled[i + 1 : j] = [start + (stop - start) * k // (j - i) for k in range(1, j - i)]
+    return settled
+
+
+def _first_of_equal(times_ns: Times, slack: Times, keep: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The chain with the first of equal stamps in place of a later one: what repeats is the stale one."""
+    chosen = keep.copy()
+    for n, k in enumerate(keep.tolist()):
+        first, after = k, int(chosen[n - 1]) + 1 if n else 0
+        while first > after and times_ns[first - 1] == times_ns[k]:
+            first -= 1
+        if n + 1 == len(keep) or slack[keep[n + 1]] >= slack[first]:
+            chosen[n] = first
+    return chosen
 
 
 def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
@@ -183,13 +209,6 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
         chain.append(i)
         i = int(before[i])
     return np.array(chain[::-1], np.int64)
-
-
-def _next_kept(slack: Times, keep: NDArray[np.int64]) -> list[int]:
-    """For every index the value of the next kept stamp at or after it; the limit after the last."""
-    position = np.searchsorted(keep, np.arange(len(slack)))
-    values = np.append(slack[keep], LIMIT_NS)
-    return [int(v) for v in values[position]]
 
 
 def match_counts(n_frames: int, times_ns: Times, frames_from: str, times_from: str) -> tuple[int, str | None]:

@@ -21,6 +21,7 @@ _FIT_SHARE, _FIT_MM = 0.025, 4.0  # an outline this near to a shape, of its size
 _BAND_MM = 60.0  # beyond the outline, in which a wall is looked for
 _WALL_MM = 20.0  # and how high it has to be there, or how deep a drop
 _SIDE_SHARE = 0.3  # of each side of a rectangle must be in view
+_N_CIRCLES = 150  # tried
 _MAX_POINTS = 720  # of the outline
 
 
@@ -54,6 +55,15 @@ class Arena:
         inside = np.array(self.half_mm) - np.abs(off @ _turn(self.yaw_rad or 0.0))
         beyond = np.linalg.norm(np.maximum(-inside, 0.0), axis=-1)
         return np.asarray(np.where(beyond > 0, -beyond, inside.min(axis=-1)))
+
+    def outline_mm(self) -> Array:
+        """Corners (n, 2) mm of its outline, for drawing; (0, 2) for an unknown shape."""
+        if self.centre_mm is None:
+            return np.empty((0, 2))
+        if self.radius_mm is not None:
+            return np.array(self.centre_mm) + self.radius_mm * circle_points(96)
+        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * np.array(self.half_mm)
+        return np.asarray(np.array(self.centre_mm) + corners @ _turn(self.yaw_rad or 0.0).T)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json, rounded to what can be known; what is unknown is left out."""
@@ -142,15 +152,27 @@ def _share_in_view(hull: Array, width: int, height: int) -> float:
 
 
 def fit_circle(points: Array) -> tuple[Array, float, float]:
-    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of them may be astray."""
-    some = points
-    for _ in range(6):
+    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of them may be astray.
+
+    First, out of circles through three points each, the one with the least median distance; then least squares.
+    """
+    a, b, c = np.moveaxis(points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0)
+    p, q = b - a, c - a
+    twice = 2.0 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    usable = np.abs(twice) > 1e-9
+    p, q, a, twice = p[usable], q[usable], a[usable], twice[usable]
+    pp, qq = (p * p).sum(axis=1), (q * q).sum(axis=1)
+    off = np.stack([q[:, 1] * pp - p[:, 1] * qq, p[:, 0] * qq - q[:, 0] * pp], axis=1) / twice[:, None]
+    distance = np.linalg.norm(points[:, None] - (a + off), axis=2) - np.linalg.norm(off, axis=1)
+    best = np.abs(distance).T[np.median(np.abs(distance), axis=0).argmin()]
+    some = points[best <= 3.0 * np.median(best) + 1e-6]
+    for _ in range(3):
         design = np.concatenate([2.0 * some, np.ones((len(some), 1))], axis=1)
         x, y, c = np.linalg.lstsq(design, (some**2).sum(axis=1), rcond=None)[0]
         centre, radius = np.array([x, y]), float(np.sqrt(max(c + x * x + y * y, 1e-9)))
-        off = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
-        some = points[off <= max(3.0 * float(np.median(off)), 1e-6)]
-    return centre, radius, float(np.median(off))
+        best = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+        some = points[best <= 3.0 * np.median(best) + 1e-6]
+    return centre, radius, float(np.median(best))
 
 
 def fit_rectangle(points: Array) -> tuple[Array, Array, float, float]:
@@ -214,6 +236,12 @@ def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels:
         return "unknown"
     highest, lowest = np.nanmax(height[:, known], axis=0), np.nanmin(height[:, known], axis=0)
     return "wall" if np.median(highest) > _WALL_MM else "drop" if np.median(lowest) < -_WALL_MM else "unknown"
+
+
+def circle_points(n: int) -> Array:
+    """Points (n, 2) of the unit circle."""
+    angle = 2.0 * np.pi * np.arange(n) / n
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _turn(yaw: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ from liex_lab.errors import LiexError
 from liex_lab.recordings import synthetic, walking, windows
 from liex_lab.recordings.habits import Habits, MouseHabits
 from liex_lab.recordings.hand_world import HandWorld, find_reference
-from liex_lab.recordings.synthetic import SyntheticSession
+from liex_lab.recordings.synthetic import SyntheticSession, TrueRecording
 from liex_lab.recordings.windows import TrainingWindows
 
 
@@ -42,10 +42,10 @@ class World(Protocol):
     ) -> Iterator[TrainingWindows]:
         """Blocks of training images from block `first` on; see `windows.training_blocks`."""
 
-    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> Sequence[TrueRecording]:
         """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing it."""
 
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
         """A recording in which one animal moves; settings as in `walking.walking_session`."""
 
 

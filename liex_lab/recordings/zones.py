@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from liex_lab.camera import Camera
 from liex_lab.errors import PlanError
 from liex_lab.recordings.arena import Floor
-from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.walls import Arena, circle_points
 
 Array = NDArray[np.float64]
 
@@ -49,9 +49,26 @@ class Zone:
             inside ^= crosses & (xy[:, 0] < x0 + (xy[:, 1] - y0) * (x1 - x0) / (y1 - y0))
         return inside
 
+    def outline_mm(self) -> Array:
+        """Corners (n, 2) mm of its outline, for drawing."""
+        if self.circle_mm is None:
+            return np.array(self.polygon_mm)
+        x, y, radius = self.circle_mm
+        return np.array([x, y]) + radius * circle_points(64)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json."""
         return {name: value for name, value in vars(self).items() if value is not None}
+
+    @staticmethod
+    def from_dict(numbers: dict[str, Any]) -> Zone:
+        """The zone that `to_dict` wrote."""
+        circle, polygon = numbers.get("circle_mm"), numbers.get("polygon_mm")
+        return Zone(
+            str(numbers["name"]),
+            None if circle is None else (float(circle[0]), float(circle[1]), float(circle[2])),
+            None if polygon is None else _pairs(np.array(polygon, float)),
+        )
 
 
 def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
@@ -77,8 +94,7 @@ class DrawnZone:
         points = np.array(self.points)
         if self.unit == "px":
             if self.radius is not None:  # a circle in the picture is none on a tilted floor
-                angle = 2.0 * np.pi * np.arange(64) / 64
-                points = points + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+                points = points + self.radius * circle_points(64)
             return Zone(self.name, polygon_mm=_pairs(self._on_floor(points, camera, floor)))
         if self.relative_to is not None:
             if arena.centre_mm is None:

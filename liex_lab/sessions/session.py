@@ -13,6 +13,7 @@ from liex_lab.camera import Camera
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.zones import Zone
 from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
 from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
@@ -146,10 +147,10 @@ class Session:
         """The shape of the floor; open where it is not known."""
         return Arena.from_dict(self.metadata.get("arena", {"kind": "open"}))
 
-    @property
-    def zone_names(self) -> list[str]:
-        """The names of the zones that were drawn."""
-        return [str(zone["name"]) for zone in self.metadata.get("zones", [])]
+    @cached_property
+    def zones(self) -> list[Zone]:
+        """The zones that were drawn."""
+        return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
     @property
     def plan(self) -> str:

@@ -138,7 +138,7 @@ BOUTS = columns(
 GAPS = columns(
     "gaps", *_WHO, *_SPAN,
     ("n_frames_missing", "int64", "", "frames without a pose, or never delivered by the camera; 0 where only a time "
-     "stamp was moved"),
+     "stamp was moved, 1 where the clock jumped, for how many it were nobody knows"),
     ("reason", "string", "", "camera_dropped: never recorded, start_frame = stop_frame = the next frame; clock_jumped: "
      "the camera was stopped, or its clock set, before the frame; stamp_repeated, stamp_out_of_order: this frame's own "
      "time stamp could not be true and was moved; no_depth: recorded without any depth; tracker_lost: nothing in the "

@@ -12,8 +12,11 @@ from liex_lab.dashboards import figures
 from liex_lab.dashboards.report import methods, render, write_report
 
 from liex_lab.recordings.times import find_gaps, median_step
+from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.zones import Zone
 from liex_lab.sessions import Session
 from liex_lab.sessions.rrd import PALETTE
+from liex_lab.water import Water
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(4.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
@@ -89,6 +92,20 @@ def test_the_methods_state_what_was_done(session):
     text = " ".join(methods(session))
     for said in ("liex_lab", "model mouse", "abababab", "112 of 114", "6 further frames", "40 mm", "0.33 s"):
         assert said in text, said
+
+
+def test_walls_zones_and_what_was_undone_are_shown(tmp_path):
+    water = Water(450.0, 1.333, ranging="light_field")
+    bent = {"model": "kannala_brandt", "coefficients": [0.125, 0.0, 0.0, 0.0]}
+    optics = {"distortion": bent, "water": water.to_dict()}
+    bowl = Arena("round", (0.0, 0.0), 250.0, None, None, 0.5, 1.0, "wall")
+    nest = Zone("nest", polygon_mm=((0.0, 0.0), (50.0, 0.0), (50.0, 50.0)))
+    session = write(tmp_path / "c.liex", MOUSE, optics=optics, arena=bowl, zones=(nest,))
+    page = render(session)
+    assert page.count('<polygon class="outline"') == 2
+    for said in ("round, radius 250 mm; zones: nest", "kannala_brandt 0.125", "450 mm below the lens", "<title>nest"):
+        assert said in page, said
+    assert "ideal camera in air" in " ".join(methods(session))
 
 
 def test_a_session_without_behaviour_has_a_report_too(tmp_path):

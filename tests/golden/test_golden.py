@@ -11,9 +11,10 @@ from liex_lab.dashboards.report import render
 
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
+from liex_lab.recordings.walls import UNKNOWN
 from liex_lab.sessions import Session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
-from tests.golden.write import CAMERA, HERE, TABLES, contents
+from tests.golden.write import ARENA, CAMERA, HERE, TABLES, ZONES, contents
 
 NUMBERS = sorted(int(path.name.removeprefix("session_").removesuffix(".tar.gz")) for path in HERE.glob("*.tar.gz"))
 
@@ -30,7 +31,8 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 def test_every_schema_has_its_golden_session() -> None:
     assert list(range(1, SCHEMA_VERSION + 1)) == NUMBERS
-    assert sum(path.stat().st_size for path in HERE.glob("session_1.*")) < 170_000
+    for number in NUMBERS:
+        assert sum(path.stat().st_size for path in HERE.glob(f"session_{number}.*")) < 170_000
 
 
 def test_every_table_is_read_with_its_columns_and_values(golden: Session) -> None:
@@ -59,6 +61,13 @@ def test_camera_place_plan_and_depth_are_read(golden: Session) -> None:
     with open_recording(golden.path / "session.mcap") as recording:
         assert recording.times_ns.tolist() == golden.frames["time_ns"].tolist()
         assert len(recording.gaps) == 1
+
+
+def test_arena_and_zones_are_read_where_the_session_knows_them(golden: Session) -> None:
+    known = golden.metadata["schema_version"] >= 2
+    assert golden.arena == (ARENA if known else UNKNOWN)
+    assert tuple(golden.zones) == (ZONES if known else ())
+    assert ("zone_centre_s" in golden.summary.columns) == known
 
 
 def test_the_report_of_an_old_session_can_be_made_again(golden: Session) -> None:

@@ -17,11 +17,17 @@ import pandas as pd
 from liex_lab.camera import Camera
 from liex_lab.plan import Plan
 from liex_lab.recordings.times import find_gaps, median_step
+from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.zones import Zone
 from liex_lab.sessions import Session
+from liex_lab.water import Water
 from tests.sessions.walking_mouse import WalkingMouse, write
 
 HERE = Path(__file__).parent
 TABLES = ("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions", "summary")
+ARENA = Arena("round", (5.0, -3.0), 210.0, None, None, 0.4, 0.95, "wall")
+ZONES = (Zone("centre", (5.0, -3.0, 148.0)), Zone("east", polygon_mm=((0.0, -250.0), (250.0, -250.0), (0.0, 250.0))))
+WATER = Water(500.0)
 CAMERA = Camera(71.6, 71.6, 39.5, 29.5, 80, 60, source="typical PrimeSense, an eighth of its size")
 
 
@@ -53,7 +59,8 @@ def main(number: int) -> None:
             Path(folder) / f"session_{number}", mouse, chunk=5, plan_toml=Plan.load("mouse").to_toml(),
             gaps=find_gaps(mouse.times_ns, median_step(mouse.times_ns)), problems=["written for a test"],
             model={"name": "mouse", "sha256": "ab" * 32}, subject={"subject_id": "m01"},
-            session_start_time="2026-01-05T10:00:00+01:00",
+            session_start_time="2026-01-05T10:00:00+01:00", optics={"distortion": None, "water": WATER.to_dict()},
+            arena=ARENA, zones=ZONES,
         )  # fmt: skip
         archive.write_bytes(packed(session.path))
         expected.write_text(json.dumps(contents(session), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,26 +30,25 @@ class Plate:
 
     def depth(self, camera: Camera, water: Water | None = None) -> Array:
         """What the camera reports (H, W) mm, without noise; 0 where its lens sees nothing."""
-        v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
-        ray = camera.unproject(np.stack([u, v], axis=-1), 1.0)
-        start, way = np.zeros(3), ray
-        if water is not None:
-            start, way = bent_down(ray, water)
-        points = self.hit(start, way)
-        if water is None:
-            return np.nan_to_num(points[..., 2])
-        xy, apparent = seen(points, water.normal, water.height_mm, water.refractive_index, water.ranging, 0.01)
-        assert np.nanmax(np.abs(xy - ray[..., :2])) < 1e-6, "the way back is the way there"
-        return np.nan_to_num(apparent)
-
-    def hit(self, start: Array, way: Array) -> Array:
-        """The first point (..., 3) of lines that begin at `start` and go along `way`: on the square or on the floor."""
-        top, floor = (start + way * ((z - start[..., 2]) / way[..., 2])[..., None]
-                      for z in (self.floor_mm - self.high_mm, self.floor_mm))  # fmt: skip
+        top, near = plane(camera, water, self.floor_mm - self.high_mm)
+        _, far = plane(camera, water, self.floor_mm)
         c, s = np.cos(self.turn), np.sin(self.turn)
-        off = top[..., :2] - np.array(self.centre)
-        inside = np.abs(off @ np.array([[c, -s], [s, c]])).max(axis=-1) < self.side_mm / 2
-        return np.where(inside[..., None], top, floor)
+        off = np.abs((top - np.array(self.centre)) @ np.array([[c, -s], [s, c]])).max(axis=-1)
+        return np.where(off < self.side_mm / 2, near, far)
+
+
+@lru_cache(maxsize=8)
+def plane(camera: Camera, water: Water | None, z: float) -> tuple[Array, Array]:
+    """The plane at depth z mm: the place (x, y) mm (H, W, 2) under every pixel, and the depth (H, W) mm reported."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
+    ray = camera.unproject(np.stack([u, v], axis=-1), 1.0)
+    if water is None:
+        return ray[..., :2] * z, np.where(np.isfinite(ray[..., 0]), z, 0.0)
+    start, way = bent_down(ray, water)
+    points = start + way * ((z - start[..., 2]) / way[..., 2])[..., None]
+    xy, apparent = seen(points, water.normal, water.height_mm, water.refractive_index, water.ranging, 0.01)
+    assert np.nanmax(np.abs(xy - ray[..., :2])) < 1e-6, "the way back is the way there"
+    return points[..., :2], np.nan_to_num(apparent)
 
 
 def bent_down(ray: Array, water: Water) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ def ray_to(point: Array, lens: Array, normal: Array, distance_mm: float, n: floa
     flat = offset - (offset @ normal)[..., None] * normal
     reach = np.linalg.norm(flat, axis=-1)
     low, high = np.zeros_like(reach), reach / height + 1e-12  # tangents of the angle in air
-    for _ in range(100):
+    for _ in range(48):
         tangent = 0.5 * (low + high)
         sine = tangent / np.sqrt(1.0 + tangent**2) / n
         short = height * tangent + depth * sine / np.sqrt(1.0 - sine**2) < reach

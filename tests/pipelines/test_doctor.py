@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.doctor import FINDINGS, examine, print_report
+from liex_lab.pipelines.doctor import FINDINGS, examine, lines, print_report
 
-from liex_lab.camera import Camera
+from liex_lab.camera import Camera, Distortion
 from liex_lab.errors import RecordingError
+from liex_lab.plan import Plan
+from liex_lab.recordings.arena import Floor
+from liex_lab.water import Water
+from tests.oracles.plate import Plate, bent_down
+from tests.oracles.refraction import seen
 from tests.recordings.oni_files import depth_builder
 from tests.recordings.writers import (
     Frames,
@@ -25,8 +33,10 @@ from tests.recordings.writers import (
 )
 
 KEYS = [
-    "format", "n_frames", "duration_s", "rate_hz", "n_gaps", "width", "height", "fx", "fy", "cx", "cy",
-    "intrinsics_source", "depth_min_mm", "depth_max_mm", "floor_mm", "problems",
+    "format", "n_frames", "duration_s", "rate_hz", "jitter_ms", "n_gaps", "n_missing", "n_time_faults", "width",
+    "height", "fx", "fy", "cx", "cy", "intrinsics_source", "distortion", "water", "depth_min_mm", "depth_max_mm",
+    "unread_share", "floor_unread_share", "noise_mm", "floor_mm", "floor_tilt_rad", "water_depth_mm", "arena",
+    "animal_length_mm", "animal_area_mm2", "animal_share", "animal_sits_still", "problems",
 ]  # fmt: skip
 CAMERA = Camera(140.0, 141.0, 79.5, 59.5, 160, 120)
 
@@ -35,28 +45,105 @@ def frames(n: int = 12, floor_mm: int = 700) -> Frames:
     return depth_frames(n, 160, 120, floor_mm=floor_mm)
 
 
-def examined(path: Path) -> dict[str, object]:
+def examined(path: Path, *settings: str) -> dict[str, Any]:
     """The findings, which JSON must be able to hold as they are."""
-    findings = examine(path)
+    findings = examine(path, Plan().with_settings(settings))
     assert list(findings) == KEYS == list(FINDINGS)
     assert json.loads(json.dumps(findings, allow_nan=False)) == findings
+    assert all("\n" not in problem for problem in findings["problems"])
     return findings
 
 
-def problems(path: Path) -> str:
-    return " | ".join(examine(path)["problems"])
+def problems(path: Path, *settings: str) -> str:
+    return " | ".join(examined(path, *settings)["problems"])
+
+
+def plates(folder: Path, plates: list[Plate], water: Water | None = None, camera: Camera = CAMERA, **more: Any) -> Path:
+    """A recording of a square plate that goes from place to place, with a little noise."""
+    rng = np.random.default_rng(0)
+    pictures = [plate.depth(camera, water) + rng.normal(0, 0.7, (camera.height, camera.width)) for plate in plates]
+    return write_png_folder(folder, np.rint(pictures).astype(np.uint16), camera, **more)
+
+
+def walk(side_mm: float = 60.0, floor_mm: float = 600.0, n: int = 20) -> list[Plate]:
+    return [Plate(floor_mm, side_mm, 25.0, (9.0 * k - 90.0, 40.0 * np.sin(k))) for k in range(n)]
 
 
 def test_a_sound_recording_has_its_facts_told_and_no_problem(tmp_path: Path) -> None:
     findings = examined(write_mcap(tmp_path / "r.mcap", frames(), CAMERA))
-    assert (findings["format"], findings["n_frames"], findings["n_gaps"]) == ("mcap", 12, 0)
+    assert (findings["format"], findings["n_frames"], findings["n_gaps"], findings["n_missing"]) == ("mcap", 12, 0, 0)
     assert (findings["width"], findings["height"], findings["fx"], findings["cy"]) == (160, 120, 140.0, 59.5)
     assert findings["rate_hz"] == pytest.approx(30, rel=1e-4)
     assert findings["duration_s"] == pytest.approx(11 / 30, rel=1e-4)
+    assert findings["jitter_ms"] == pytest.approx(0, abs=1e-3)
     assert (findings["depth_min_mm"], findings["depth_max_mm"]) == (669.0, 701.0)
+    assert findings["unread_share"] == pytest.approx(0.03, abs=0.005)
     assert findings["floor_mm"] == pytest.approx(700, abs=1)
+    assert findings["floor_tilt_rad"] == pytest.approx(0, abs=0.01)
     assert findings["intrinsics_source"] == "CameraCalibration on /camera/calibration"
+    assert (findings["distortion"], findings["water"], findings["water_depth_mm"]) == (None, None, None)
+    assert findings["arena"]["kind"] == "open"
     assert findings["problems"] == []
+
+
+def test_the_animal_is_measured_without_a_model(tmp_path: Path) -> None:
+    findings = examined(plates(tmp_path / "r", walk(60.0)))
+    assert findings["animal_length_mm"] == pytest.approx(4 * 60 / np.sqrt(12), rel=0.03)
+    assert findings["animal_area_mm2"] == pytest.approx(3600, rel=0.1)
+    assert findings["animal_share"] == 1.0
+    assert findings["animal_sits_still"] is False
+    assert findings["noise_mm"] == pytest.approx(0.7, abs=0.1)
+    assert findings["floor_unread_share"] == 0.0
+    assert findings["problems"] == []
+
+
+def test_an_animal_that_sits_still_is_told(tmp_path: Path) -> None:
+    findings = examined(plates(tmp_path / "r", walk(60.0)[:1] * 20))
+    assert findings["animal_sits_still"] is True
+    assert findings["animal_length_mm"] == pytest.approx(4 * 60 / np.sqrt(12), rel=0.05)
+    assert "hardly leaves its place" in findings["problems"][0]
+
+
+def test_millimetres_that_do_not_fit_the_animal_are_told_with_their_factor(tmp_path: Path) -> None:
+    """Focal lengths ten times too short make everything ten times as large."""
+    path = plates(tmp_path / "r", walk(60.0))
+    told = problems(path, "camera.fx=14", "camera.fy=14.1")
+    assert "what moves is about 6" in told
+    assert "wrong by a factor of about 10" in told
+    assert "--plan" in told
+
+
+def test_an_empty_arena_is_told(tmp_path: Path) -> None:
+    findings = examined(plates(tmp_path / "r", [Plate(600.0, 60.0, 0.0)] * 12))
+    assert findings["animal_length_mm"] is None
+    assert any("no animal was found" in problem for problem in findings["problems"])
+
+
+def test_a_slip_in_the_zones_is_told(tmp_path: Path) -> None:
+    (tmp_path / "zones.toml").write_text('[[zones]]\nname = "a"\ncircle = { centre = [0, 0], radius = -1 }')
+    path = plates(tmp_path / "r", walk(60.0))
+    assert "a positive number, got -1" in problems(path, f"arena.zones={tmp_path / 'zones.toml'}")
+    assert "there is no file" in problems(path, "arena.zones=none.toml")
+
+
+def test_jitter_and_missing_frames_are_told_apart(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    times = np.array(even_times(20)) + rng.integers(-3_000_000, 3_000_000, 20)
+    times[10:] += 3 * 33_333_333
+    findings = examined(write_png_folder(tmp_path / "r", frames(20), CAMERA, times.tolist()))
+    assert (findings["n_gaps"], findings["n_missing"]) == (1, 3)
+    assert findings["jitter_ms"] == pytest.approx(np.sqrt(2) * 6 / np.sqrt(12), rel=0.4)
+
+
+def test_what_the_clock_did_is_told(tmp_path: Path) -> None:
+    times = even_times(30)
+    times[7] = times[6]
+    times[15:] = [t + 3600 * 10**9 for t in times[15:]]
+    findings = examined(write_png_folder(tmp_path, frames(30), CAMERA, times))
+    assert (findings["n_gaps"], findings["n_time_faults"]) == (0, 2)
+    told = " ".join(findings["problems"])
+    assert "1 of 30 are repeated or out of order" in told
+    assert "the camera was stopped, or its clock set, in 1 places, the first before frame 15" in told
 
 
 def test_a_primesense_recording_says_where_its_intrinsics_come_from(tmp_path: Path) -> None:
@@ -100,16 +187,73 @@ def test_a_wrong_unit_is_noticed(tmp_path: Path, unit_mm: float, median: str) ->
     assert "unit_mm" in told
 
 
-def test_much_unread_is_told(tmp_path: Path) -> None:
-    stored = frames()
-    stored[:, :60] = 0
-    assert "of the pixels are unread" in problems(write_png_folder(tmp_path / "r", stored, CAMERA))
+def test_unread_pixels_count_where_the_animal_can_be(tmp_path: Path) -> None:
+    beside, among = frames(), frames()
+    beside[:, :60] = 0
+    among[np.random.default_rng(0).random(among.shape) < 0.3] = 0
+    assert "unread" not in problems(write_png_folder(tmp_path / "r", beside, CAMERA))
+    assert "of the pixels on the floor are unread" in problems(write_png_folder(tmp_path / "s", among, CAMERA))
+
+
+def test_a_lens_that_is_bent_is_told_and_undone(tmp_path: Path) -> None:
+    bent = replace(CAMERA, distortion=Distortion.of("plumb_bob", [-0.15, 0.02]))
+    findings = examined(plates(tmp_path / "r", walk(), None, bent, distortion=[-0.15, 0.02]))
+    assert findings["distortion"]["coefficients"][:2] == [-0.15, 0.02]
+    assert findings["floor_mm"] == pytest.approx(600, abs=1)
+    assert findings["problems"] == []
+
+
+def test_water_is_told_and_undone(tmp_path: Path) -> None:
+    water = Water(400.0, 1.333)
+    path = plates(tmp_path / "r", walk(), water)
+    findings = examined(path, "water.height_mm=400")
+    assert findings["water"] == water.to_dict()
+    assert findings["water_depth_mm"] == pytest.approx(200, abs=2)
+    assert findings["floor_mm"] == pytest.approx(600, abs=2)
+    assert findings["fx"] == CAMERA.fx
+    assert findings["problems"] == []
+    assert "the floor is not below it" in problems(path, "water.height_mm=700")
+
+
+def test_a_camera_tilted_against_the_water_is_told_how_to_say_so(tmp_path: Path) -> None:
+    """A level tank under a tilted camera: the floor comes out tilted against the surface until the plan says it."""
+    water = Water(400.0, 1.333, 0.1, -0.06)
+    n = water.normal
+    v, u = np.mgrid[0:120, 0:160].astype(float)
+    start, way = bent_down(CAMERA.unproject(np.stack([u, v], -1), 1.0), water)
+    floor = start + way * ((560.0 - start @ n) / (way @ n))[..., None]
+    depth = seen(floor, n, 400.0, 1.333, "light_field", 0.01)[1]
+    rng = np.random.default_rng(0)
+    path = write_png_folder(
+        tmp_path / "r", np.rint(depth + rng.normal(0, 0.5, (8, 120, 160))).astype(np.uint16), CAMERA
+    )
+    told = problems(path, "water.height_mm=400")
+    x, y = re.findall(r"water\.tilt_[xy]_rad=(-?\d\.\d+)", told)
+    assert float(x) == pytest.approx(0.1, abs=0.04)
+    assert float(y) == pytest.approx(-0.06, abs=0.03)
+    settings = ("water.height_mm=400", f"water.tilt_x_rad={x}", f"water.tilt_y_rad={y}")
+    assert "against the water's surface" not in problems(path, *settings)
+
+
+def test_a_camera_that_looks_from_the_side_is_told(tmp_path: Path) -> None:
+    floor = Floor.from_plane(np.array([np.sin(0.4), 0.0, np.cos(0.4)]), 600.0, CAMERA)
+    pictures = np.repeat(np.rint(floor.depth(160, 120))[None], 6, axis=0).astype(np.uint16)
+    findings = examined(write_png_folder(tmp_path / "r", pictures, CAMERA))
+    assert findings["floor_tilt_rad"] == pytest.approx(0.4, abs=0.01)
+    assert any("looks down at 23 degrees from straight" in problem for problem in findings["problems"])
+
+
+def test_a_noisy_camera_is_told(tmp_path: Path) -> None:
+    noisy = np.rint(700 + np.random.default_rng(0).normal(0, 6.0, (40, 120, 160))).astype(np.uint16)
+    findings = examined(write_png_folder(tmp_path / "r", noisy, CAMERA))
+    assert findings["noise_mm"] == pytest.approx(6.0, rel=0.1)
+    assert any("from frame to frame" in problem for problem in findings["problems"])
 
 
 def test_a_recording_of_nothing_has_no_numbers_but_a_sentence(tmp_path: Path) -> None:
     findings = examined(write_png_folder(tmp_path / "r", np.zeros((3, 120, 160), np.uint16), CAMERA))
     assert (findings["depth_min_mm"], findings["depth_max_mm"], findings["floor_mm"]) == (None, None, None)
-    assert any("none of the 3 frames" in str(p) for p in findings["problems"])  # type: ignore[attr-defined]
+    assert any("none of the 3 frames" in problem for problem in findings["problems"])
 
 
 def test_empty_frames_are_counted_apart_from_unread_pixels(tmp_path: Path) -> None:
@@ -124,7 +268,7 @@ def test_where_no_floor_is_it_says_so(tmp_path: Path) -> None:
     rough = np.random.default_rng(0).integers(400, 4000, (1, 120, 160)).repeat(4, axis=0).astype(np.uint16)
     findings = examined(write_png_folder(tmp_path / "r", rough, CAMERA))
     assert findings["floor_mm"] is None
-    assert any("floor" in str(p) for p in findings["problems"])  # type: ignore[attr-defined]
+    assert any("no floor" in problem for problem in findings["problems"])
 
 
 def test_one_frame_has_no_rate(tmp_path: Path) -> None:
@@ -155,8 +299,10 @@ def test_the_report_names_everything_in_lines_that_can_be_read(
     findings = examine(write_png_folder(tmp_path / "r", frames(1), CAMERA))
     print_report(findings)
     printed = capsys.readouterr().out
-    for name, _ in list(FINDINGS.values())[:-1]:
+    assert len(printed.splitlines()) < 24, "one screen"
+    for name, value in lines(findings):
         assert name in printed
+        assert value[:40] in printed
     assert "unknown" in printed  # the rate of a single frame
     assert "nan" not in printed.lower().split()
     assert "- a single frame has no rate" in printed
@@ -168,3 +314,6 @@ def test_a_real_session(reference_data: Path) -> None:
     findings = examined(reference_data / "mouse_kinect2" / "session_20170125.tar.gz")
     assert (findings["n_frames"], findings["n_gaps"]) == (300, 3)
     assert findings["floor_mm"] == pytest.approx(673.5, abs=10)
+    assert findings["arena"]["kind"] == "round"
+    assert 40 < findings["animal_length_mm"] < 110
+    assert (findings["animal_share"], findings["animal_sits_still"]) == (1.0, False)

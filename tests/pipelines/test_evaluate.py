@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.pipelines import evaluate
+from liex_lab.pipelines import evaluate, speed
 
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
@@ -45,7 +45,7 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two recordings of 10 small frames stand for every split, toy models for every variant; what was asked for."""
     asked: list[str] = []
 
-    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 40, *_: Any) -> list[SyntheticSession]:
         asked.append(f"{name} {spine_mm}")
         return [
             SyntheticSession.draw([5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}")
@@ -115,12 +115,14 @@ def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(small
         return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
     monkeypatch.setattr(synthetic, "test_split", one_of_640)
-    monkeypatch.setattr(evaluate, "_SPEED_FRAMES", 8)
-    monkeypatch.setattr(evaluate, "_SPEED_REPEATS", 1)
-    result = evaluate.evaluate_speed("mouse")
+    monkeypatch.setattr(speed, "N_FRAMES", 8)
+    monkeypatch.setattr(speed, "N_REPEATS", 1)
+    result = speed.evaluate_speed("mouse")
     assert set(result) >= SPEED_KEYS
     assert set(result["stages_ms"]) == {"foreground", "candidates", "choice"}
     assert all(value > 0 for value in result["stages_ms"].values())
+    assert set(result["cost_ms"]["joints"]) == {"1", "2", "4"}
+    assert set(result["cost_ms"]["pixels"]) == {"320 x 240", "640 x 480"}
     assert result["ratio_to_paper"] > 0
     assert result["frames_per_s_1core"] > 0
     assert json.loads(json.dumps(result, allow_nan=False)) == result

@@ -257,7 +257,7 @@ FORMATS = (
         before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format(
-        "mcap-png", lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png"),
+        "mcap-png", lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png", chunk_size=4096),
         before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format(
@@ -266,12 +266,14 @@ FORMATS = (
     ),
     Format(
         "mcap-ros2",
-        lambda f, s: write_ros_mcap(f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4),
+        lambda f, s: write_ros_mcap(
+            f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4, chunk_size=4096
+        ),
         before(_mcap_message_ends, ".mcap"), n_damaged=60,
     ),
     Format("bag-lz4", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
     Format(
-        "bag-bz2", lambda f, s: write_bag(f / "recording.bag", s, compression="bz2", kind="png"),
+        "bag-bz2", lambda f, s: write_bag(f / "recording.bag", s, compression="bz2", kind="png", chunk_bytes=4096),
         before(_bag_ends, ".bag"), n_damaged=60,
     ),
     Format(

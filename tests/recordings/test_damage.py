@@ -62,7 +62,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def damage(rng: np.random.Generator, path: Path) -> Damage:
-    """Change one file of a recording: cut it, turn bits, blank a stretch, make a number in it absurd, add, drop or repeat some."""
+    """Change one file of a recording: cut it, turn bits, blank a stretch, make a number absurd, add or drop bytes."""
     files = files_of(path)
     sizes = np.array([file.stat().st_size for file in files], float)
     # mostly what holds the depth, sometimes what lies beside it

@@ -25,9 +25,9 @@ from tests.recordings.writers import SMALL, cut, depth_frames, write_archive, wr
 STORED = depth_frames(30)
 
 
-@pytest.mark.parametrize("gop", [1, 12, 250])
-def test_an_avi_gives_any_picture_at_any_time(tmp_path: Path, gop: int) -> None:
-    folder = write_video_session(tmp_path, STORED, gop=gop)
+@pytest.mark.parametrize(("gop", "level"), [(1, 3), (12, 3), (250, 3), (12, 1)])
+def test_an_avi_gives_any_picture_at_any_time(tmp_path: Path, gop: int, level: int) -> None:
+    folder = write_video_session(tmp_path, STORED, gop=gop, level=level)
     rng = np.random.default_rng(1)
     with open_recording(folder, strict=True) as recording:
         for index in [29, 0, 1, 2, 13, 12, 11, 28, 29, *rng.integers(0, 30, 40).tolist()]:
@@ -116,6 +116,21 @@ def test_a_recorder_that_was_stopped_leaves_a_file_that_reads(tmp_path: Path) ->
         content[at : at + 4] = bytes(4)
     (tmp_path / "a.avi").write_bytes(content[: content.index(b"idx1")])
     with open_recording(tmp_path / "a.avi", camera=SMALL) as recording:
+        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+
+
+def test_an_avi_of_more_than_a_gigabyte_goes_on_in_a_second_part(tmp_path: Path) -> None:
+    content = write_avi(tmp_path / "depth.avi", STORED).read_bytes()
+    at = start = content.index(b"movi") + 4
+    for _ in range(13):
+        at += 8 + int.from_bytes(content[at + 4 : at + 8], "little")
+        at += at % 2
+    end = content.index(b"idx1")
+    more = b"AVIX" + b"LIST" + (4 + end - at).to_bytes(4, "little") + b"movi" + content[at:end]
+    first = content[: start - 8] + (4 + at - start).to_bytes(4, "little") + content[start - 4 : at]
+    first = first[:4] + (len(first) - 8).to_bytes(4, "little") + first[8:]
+    (tmp_path / "depth.avi").write_bytes(first + b"RIFF" + len(more).to_bytes(4, "little") + more)
+    with open_recording(tmp_path, camera=SMALL, strict=True) as recording:
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
 
 

@@ -17,13 +17,16 @@ FACTORY = (0.5122697949409485, 0.49451231956481934, 0.4921168386936188, 0.492166
 UNKNOWN_SIZE = b"\x01" + b"\xff" * 7
 
 
-def write_avi(path: Path, frames: Frames, fps: int = 30, gop: int = 12, pixels: str = "gray16le") -> Path:
-    """FFV1 in AVI, one key picture in `gop`."""
+def write_avi(
+    path: Path, frames: Frames, fps: int = 30, gop: int = 12, pixels: str = "gray16le", level: int = 3
+) -> Path:
+    """FFV1 in AVI, one key picture in `gop`; level 3 has check sums and level 1 none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("ffv1", rate=fps)
         stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pixels
         stream.time_base, stream.gop_size = Fraction(1, fps), gop
+        stream.options = {"level": str(level), "slicecrc": str(int(level == 3))}
         for k, stored in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(stored, format=pixels)
             frame.pts = k

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from liex_lab.geometry import so3
-from liex_lab.recordings.times import find_gaps, median_step
+from liex_lab.recordings.times import find_faults, find_gaps, median_step, settle
 from liex_lab.sessions.rows import Rows, nearness, stop_times, stretches
 from liex_lab.sessions.tables import GAPS, ROTATIONS, to_pandas
 from tests.sessions.walking_mouse import WalkingMouse, steady
@@ -29,6 +31,25 @@ def test_a_dropped_and_a_lost_stretch_become_two_half_open_gaps():
     np.testing.assert_allclose(gaps["stop_s"] - gaps["start_s"], [6 / 30, 3 / 30], atol=1e-8)
     assert rows.missing_before()[20] == 6
     assert rows.missing_before().sum() == 6
+
+
+def test_stamps_that_were_moved_have_rows_of_their_own():
+    mouse = WalkingMouse(steady(2.0))
+    times = mouse.times_ns.copy()
+    times[10] = times[9]
+    times[40:] += 3600 * 10**9
+    found = settle(times)
+    step = median_step(found.times_ns)
+    track = replace(mouse.track(), times_ns=found.times_ns)
+    faults = [*find_gaps(found.times_ns, step), *find_faults(found.times_ns, step, found.faults)]
+    rows = Rows(track, np.arange(len(times)), "s", "m", faults)
+    gaps = to_pandas(GAPS, rows.gaps())
+    assert list(gaps["reason"]) == ["stamp_repeated", "clock_jumped"]
+    assert list(gaps["n_frames_missing"]) == [0, 1]
+    assert int(gaps["start_frame"].iloc[1]) == int(gaps["stop_frame"].iloc[1]) == 40
+    assert (int(gaps["start_frame"].iloc[0]), int(gaps["stop_frame"].iloc[0])) == (10, 11)
+    assert gaps["start_s"].iloc[0] == pytest.approx(1 / 3, abs=1e-6)
+    assert rows.missing_before()[40] == 1
 
 
 def test_a_stretch_without_a_pose_at_the_very_end_stops_one_step_after_the_last_frame():

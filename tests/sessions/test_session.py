@@ -51,7 +51,8 @@ def test_a_session_says_where_it_comes_from(session):
 def test_a_recording_and_a_plan_tell_where_a_session_comes_from():
     recording = Recording(
         name="day1", format="synthetic", camera=MOUSE.camera, times_ns=np.delete(MOUSE.times_ns, [5, 6]),
-        read=lambda row: MOUSE.frame(row).depth, metadata={"subject_id": "m07", "session_start_time": START},
+        read=lambda row: MOUSE.frame(row).depth,
+        metadata={"subject_id": "m07", "session_start_time": START, "profile": {"name": "raytrix-u16-10um"}},
     )  # fmt: skip
     plan = Plan().with_settings(["session.group=control"])
     floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 700.0, MOUSE.camera)
@@ -60,6 +61,7 @@ def test_a_recording_and_a_plan_tell_where_a_session_comes_from():
     assert origin.session_start_time == START
     assert [gap.n_frames_missing for gap in origin.gaps] == [2]
     assert len(origin.input_sha256) == 64
+    assert origin.document()["input"]["profile"] == {"name": "raytrix-u16-10um"}
     assert origin.document()["plan"]["session"]["group"] == "control"
     np.testing.assert_allclose(origin.T_arena_camera.matrix, MOUSE.T_arena_camera.matrix, atol=1e-12)
 
@@ -79,7 +81,7 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
         tmp_path / "c.liex", mouse, arena=bowl, zones=(half, Zone("middle", (0.0, 0.0, 20.0))), optics=optics
     )
     assert session.arena == bowl
-    assert session.zone_names == ["upper", "middle"]
+    assert session.zones == [half, Zone("middle", (0.0, 0.0, 20.0))]
     assert session.metadata["camera"]["optics"] == optics
     assert session.camera == mouse.camera
     frames = session.frames
@@ -99,7 +101,7 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
 
 def test_a_session_without_walls_and_zones_says_so(session):
     assert session.arena == UNKNOWN
-    assert session.zone_names == []
+    assert session.zones == []
     assert session.frames["wall_distance_mm"].isna().all()
     assert (session.frames["zone"] == "").all()
     assert not [name for name in session.summary.columns if name.startswith("zone_")]

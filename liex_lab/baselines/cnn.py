@@ -1,0 +1,209 @@
+"""CNN, the paper's second baseline: an AlexNet that regresses all joints from one patch (Lie-X section 5.2).
+
+The paper takes AlexNet as trained on ImageNet and trains it on for 50 epochs of its 95,000 to 104,000 images. Here it
+is trained from scratch: weights that come from photographs cannot be had where this is built, and the budget is that
+of two CPU cores (`CnnPlan`). What follows from that: batch normalisation after every convolution, without which an
+AlexNet hardly learns from scratch in so few steps; no dropout, since no image is seen more than a few times; fully
+connected layers of 1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column), at a
+`width` of its numbers of channels. Products are of bfloat16 numbers, which such CPUs as have them do in half the time.
+The loss is the mean distance of the joints, in half sides of the patch.
+
+torch is an optional dependency: `pip install 'liex_lab[cnn]'`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.baselines.baseline import DAMAGE, Guesses, in_camera_frame, see
+from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets_of
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import MissingPackageError, ModelError
+from liex_lab.estimation.training import Tell, TrainingSet
+from liex_lab.recordings.crops import Foreground
+from liex_lab.threads import threads
+
+if TYPE_CHECKING:
+    import torch
+
+Array = NDArray[np.float64]
+
+_BATCH = 64
+
+
+@dataclass(frozen=True)
+class CnnPlan:
+    """The budget: about seven minutes of two cores with bfloat16 for 40,960 images. width: of AlexNet's own numbers of
+    channels, halved to see more images in that time; connected: neurons of the two hidden layers; epochs: times that
+    every image is seen; the step size rises to `rate` and falls to nothing.
+    """
+
+    width: float = 0.5
+    connected: int = 1024
+    epochs: int = 3
+    rate: float = 1e-3
+    decay: float = 0.01
+
+
+def require_torch() -> None:
+    """Raises MissingPackageError where torch is not installed."""
+    from importlib.util import find_spec
+
+    if find_spec("torch") is None:
+        raise MissingPackageError("the CNN baseline needs torch, which is not installed; pip install 'liex_lab[cnn]'")
+
+
+def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
+    """The network for three channels of 224 x 224."""
+    from torch import nn
+
+    def convolution(before: int, after: int, size: int, stride: int, padding: int) -> list[nn.Module]:
+        layer = nn.Conv2d(before, after, size, stride, padding, bias=False)
+        return [layer, nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
+
+    a, b, c, d, e = (round(plan.width * channels) for channels in (64, 192, 384, 256, 256))
+    net = nn.Sequential(
+        *convolution(3, a, 11, 4, 2), nn.MaxPool2d(3, 2),
+        *convolution(a, b, 5, 1, 2), nn.MaxPool2d(3, 2),
+        *convolution(b, c, 3, 1, 1), *convolution(c, d, 3, 1, 1), *convolution(d, e, 3, 1, 1), nn.MaxPool2d(3, 2),
+        nn.Flatten(),
+        nn.Linear(36 * e, plan.connected), nn.ReLU(inplace=True),
+        nn.Linear(plan.connected, plan.connected), nn.ReLU(inplace=True),
+        nn.Linear(plan.connected, n_outputs),
+    )  # fmt: skip
+    net.to(memory_format=torch_layout())
+    return net
+
+
+def low_precision() -> torch.autocast:
+    """Within the block, convolutions and products are of bfloat16 numbers."""
+    import torch
+
+    return torch.autocast("cpu", torch.bfloat16)
+
+
+def torch_layout() -> Any:
+    """Channels last, which a CPU convolves about a third faster."""
+    import torch
+
+    return torch.channels_last
+
+
+@contextmanager
+def torch_threads(parallel: bool) -> Iterator[None]:
+    """Within the block torch runs on one thread unless `parallel`."""
+    import torch
+
+    before = torch.get_num_threads()
+    if not parallel:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Cnn:
+    """The trained network at work. It says joints, not a pose: nothing holds its bones at their lengths."""
+
+    skeleton: Skeleton
+    net: torch.nn.Sequential
+
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
+        """1: the network knows nothing of size."""
+        return 1.0
+
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
+        """Joints of frames (n, H, W) mm in the camera frame."""
+        crops, looks = see(depths, scene, parallel)
+        joints = np.full((len(looks), self.skeleton.n_joints, 3), np.nan)
+        rows = np.flatnonzero(crops.found)
+        for start in range(0, len(rows), _BATCH):
+            part = rows[start : start + _BATCH]
+            joints[part] = self.joints(crops.heights[part], looks[part], parallel)
+        return Guesses(joints, crops.found, crops)
+
+    def joints(self, heights: NDArray[np.int16], looks: Array, parallel: bool = True) -> Array:
+        """Joints (n, J, 3) mm in the camera frame of animals whose height maps (n, S, S) were cut by looks (n, 17)."""
+        import torch
+
+        with threads(parallel), torch_threads(parallel), torch.no_grad(), low_precision():
+            frames = frames_of(heights, looks)
+            told = self.net.eval()(_channels(patches_of(heights, looks, frames)))
+        return joints_of(told.float().numpy(), looks, frames)
+
+    def to_bytes(self) -> bytes:
+        """The weights as the bytes of an .npz without pickle."""
+        packed = io.BytesIO()
+        np.savez(packed, **{name: values.numpy() for name, values in self.net.state_dict().items()})
+        return packed.getvalue()
+
+    @staticmethod
+    def load(path: Path, skeleton: Skeleton, plan: CnnPlan) -> Cnn:
+        """The network with the weights in a file of `to_bytes`. Raises ModelError."""
+        import torch
+
+        net = alexnet(3 * skeleton.n_joints, plan)
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                net.load_state_dict({name: torch.from_numpy(archive[name]) for name in archive.files})
+        except DAMAGE as error:
+            said = str(error).splitlines()[0]
+            raise ModelError(f"{path} does not hold the CNN's weights ({said}); remove it and train again") from None
+        return Cnn(skeleton, net)
+
+
+def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
+    """Patches (n, 224, 224) of 0-255, as the network wants them: three equal channels, about -1 to 1."""
+    import torch
+
+    grey = torch.from_numpy((patches - 127.5) / 127.5)
+    return grey[:, None].expand(-1, 3, -1, -1).contiguous(memory_format=torch_layout())
+
+
+def train_cnn(data: TrainingSet, skeleton: Skeleton, plan: CnnPlan, rng: np.random.Generator, tell: Tell) -> Cnn:
+    """Train from scratch with AdamW and one cycle of the step size."""
+    import torch
+
+    require_torch()
+    torch.manual_seed(int(rng.integers(2**31)))
+    animals = np.flatnonzero(data.animal)
+    net = alexnet(3 * skeleton.n_joints, plan)
+    steps = plan.epochs * (len(animals) // _BATCH)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=plan.rate, weight_decay=plan.decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, plan.rate, total_steps=max(steps, 1), pct_start=0.15)
+    net.train()
+    done = 0
+    for _ in range(plan.epochs):
+        order = rng.permutation(animals)
+        for start in range(0, len(order) - _BATCH + 1, _BATCH):
+            tell(done / steps, "CNN")
+            loss = _loss(net, data, order[start : start + _BATCH])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            done += 1
+    return Cnn(skeleton, net)
+
+
+def _loss(net: torch.nn.Sequential, data: TrainingSet, rows: NDArray[np.int64]) -> torch.Tensor:
+    """Mean distance of the joints of some images, in half sides of their patches."""
+    import torch
+
+    heights, looks = data.images.heights[rows], data.images.looks[rows]
+    frames = frames_of(heights, looks)
+    wanted = torch.from_numpy(targets_of(in_camera_frame(data.truth.positions[rows], looks), looks, frames))
+    with low_precision():
+        told = net(_channels(patches_of(heights, looks, frames)))
+    off = (told.float() - wanted).reshape(len(rows), -1, 3)
+    return torch.sqrt((off**2).sum(-1) + 1e-8).mean()

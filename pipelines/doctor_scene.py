@@ -1,0 +1,194 @@
+"""What `liex doctor` sees in the pictures: floor, noise, arena, water, and the animal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from liex_lab.pipelines.build import build_zones
+from numpy.typing import NDArray
+
+from liex_lab.errors import EstimationError, PlanError
+from liex_lab.plan import Plan
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.arena import Floor
+    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.water import Water
+
+_PLAUSIBLE_FLOOR_MM = (150.0, 3000.0)
+_MUCH_TILT_RAD = math.radians(15.0)
+_LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over it, to this
+_MUCH_UNREAD = 0.2  # share of the pixels on the floor
+_MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
+_STILL_SHARE = 0.4  # of the animal's area was in the background
+_WIDER = 20.0  # an animal whose size the plan does not allow is looked for down to and up to this factor
+
+KEYS = (
+    "floor_unread_share", "noise_mm", "floor_mm", "floor_tilt_rad", "water_depth_mm", "arena", "animal_length_mm",
+    "animal_area_mm2", "animal_share", "animal_sits_still",
+)  # fmt: skip
+
+
+@dataclass
+class SceneLook:
+    """The scene and the animal in a sample (n, H, W) mm of every `stride`-th pixel; fills facts and problems."""
+
+    seen: Recording
+    plan: Plan
+    water: Water | None
+    sample: NDArray[np.float32]
+    stride: int
+    facts: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(KEYS))
+    problems: list[str] = field(default_factory=list)
+
+    def at_scene(self) -> None:
+        """Floor, noise, arena, water; and then the animal."""
+        from liex_lab.recordings.arena import Floor, find_floor
+        from liex_lab.recordings.background import floor_patch, floor_region, learn_background
+        from liex_lab.recordings.walls import find_arena
+
+        background, *_ = learn_background(self.sample)
+        grid = self.seen.camera.every(self.stride)
+        try:
+            floor = find_floor(background, grid)
+        except EstimationError as error:
+            self.problems.append(f"no floor: {error}")
+            return
+        patch = floor_patch(background, floor.depth(grid.width, grid.height))
+        noise = _noise(self.sample, patch)
+        region = floor_region(background, floor.depth(grid.width, grid.height))
+        read = [frame[region] > 0 for frame in self.sample if frame.any()]
+        unread = 1.0 - float(np.mean(read))
+        self.facts |= {"noise_mm": noise, "floor_unread_share": unread}
+        arena = find_arena(background, floor, grid)
+        self.facts["arena"] = arena.to_dict()
+        try:
+            for zone in build_zones(self.plan):
+                zone.placed(
+                    self.seen.camera, Floor.from_plane(floor.normal, floor.distance_mm, self.seen.camera), arena
+                )
+        except PlanError as error:
+            self.problems.append(str(error))
+        if unread > _MUCH_UNREAD:
+            self.problems.append(
+                f"{unread:.0%} of the pixels on the floor are unread, more than {_MUCH_UNREAD:.0%}; check the camera's "
+                "range, sunlight, and surfaces that shine or swallow infrared light"
+            )
+        if noise is not None and noise > _MUCH_NOISE * self.plan.foreground.min_height_mm:
+            self.problems.append(
+                f"the floor's depth varies by {noise:.1f} mm from frame to frame, and a pixel counts as the animal "
+                f"from {self.plan.foreground.min_height_mm:g} mm above it; bring the camera nearer, keep sunlight out, "
+                "or raise foreground.min_height_mm"
+            )
+        self._at_floor(floor)
+        self._at_animal(background)
+
+    def _at_floor(self, floor: Floor) -> None:
+        up = np.zeros(3) if self.water is None else self.water.lift_mm
+        distance = float(floor.distance_mm - up @ floor.normal)  # from the real lens
+        tilt = math.acos(min(1.0, float(floor.normal[2])))
+        self.facts |= {"floor_mm": distance, "floor_tilt_rad": tilt}
+        low, high = _PLAUSIBLE_FLOOR_MM
+        if not low <= distance <= high:
+            self.problems.append(
+                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to {high:.0f} mm; "
+                "check the unit and the camera's height"
+            )
+        if tilt > _MUCH_TILT_RAD:
+            self.problems.append(
+                f"the camera looks down at {math.degrees(tilt):.0f} degrees from straight, and poses are learned up to "
+                "10; turn it to look straight down"
+            )
+        if self.water is not None:
+            self._at_water(self.water, floor, distance)
+
+    def _at_water(self, water: Water, floor: Floor, distance: float) -> None:
+        cosine = float(floor.normal @ water.normal)
+        deep = distance / cosine - water.height_mm
+        self.facts["water_depth_mm"] = deep
+        if deep <= 0:
+            self.problems.append(
+                f"the plan puts the water's surface {water.height_mm:.0f} mm below the lens, but the floor is not "
+                "below it; measure water.height_mm again, or leave it out if there is no water"
+            )
+        elif (angle := math.acos(min(1.0, cosine))) > _LEVEL_RAD:
+            tilts = np.arctan2(-floor.normal[:2], floor.normal[2])
+            self.problems.append(
+                f"the floor is tilted by {math.degrees(angle):.1f} degrees against the water's surface; if the tank's "
+                f"floor is level, the camera is tilted: set water.tilt_x_rad={tilts[0]:.3f} and "
+                f"water.tilt_y_rad={tilts[1]:.3f}, and look again"
+            )
+
+    def _at_animal(self, background: NDArray[np.float32]) -> None:
+        """Find the animal as a run would; where none of the plan's size is, look for one of another size."""
+        from liex_lab.body.skeleton import Skeleton
+        from liex_lab.recordings.foreground import Scene
+        from liex_lab.recordings.recording import Recording
+
+        animal, foreground = self.plan.animal, self.plan.foreground
+        memory = Recording(
+            name=self.seen.name, format="sample", camera=self.seen.camera.every(self.stride),
+            times_ns=np.arange(len(self.sample)), read=lambda k: self.sample[k],
+        )  # fmt: skip
+        view = Skeleton.load(animal.skeleton).view
+        expected = (animal.spine_min_mm, animal.spine_max_mm)
+        for factor in (1.0, _WIDER):
+            sizes = (expected[0] / factor, expected[1] * factor)
+            try:
+                scene, sample = Scene.learn(memory, sizes, len(self.sample), foreground.min_height_mm, view)
+            except EstimationError as error:
+                missing = error
+                continue
+            crops = scene.extract(sample, 1.0)
+            length = 4.0 * float(np.median(crops.moments[crops.found, 6]))
+            if factor == 1.0:
+                self._tell_animal(scene, background, length, float(crops.found.mean()))
+            else:
+                self._tell_wrong_size(length, expected)
+            return
+        self.problems.append(str(missing))
+
+    def _tell_animal(self, scene: Scene, background: NDArray[np.float32], length: float, share: float) -> None:
+        raised = scene.background - background[:: scene.stride, :: scene.stride]
+        covered = scene.on_floor & (raised > self.plan.foreground.min_height_mm) & (raised < scene.background)
+        area = float((scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy))
+        still = area > _STILL_SHARE * scene.area_mm2
+        self.facts |= {
+            "animal_length_mm": length, "animal_area_mm2": scene.area_mm2, "animal_share": share,
+            "animal_sits_still": still,
+        }  # fmt: skip
+        if still:
+            self.problems.append(
+                "the animal hardly leaves its place, so that it is a part of the background; it was told from the bare "
+                "floor instead, so check its outline in the replay, or add some seconds of the empty arena"
+            )
+        if share < 0.8:
+            self.problems.append(
+                f"the animal was found in only {share:.0%} of the frames looked at; cut off the time before it came "
+                "and after it left, and check that the whole arena is in view"
+            )
+
+    def _tell_wrong_size(self, length: float, expected: tuple[float, float]) -> None:
+        self.problems.append(
+            f"what moves is about {length:.0f} mm long, but the plan expects an animal with a spine of {expected[0]:g} "
+            f"to {expected[1]:g} mm; if the animal is of that size, the millimetres are wrong by a factor of about "
+            f"{length / math.sqrt(expected[0] * expected[1]):.2g} (check unit_mm and the focal lengths), else set "
+            "animal.spine_min_mm and animal.spine_max_mm or name another --plan"
+        )
+
+
+def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:
+    """Standard deviation mm of pixels over time, from frame to frame of the sample (n, H, W) mm; None if not known.
+
+    Two thirds of the differences are smaller than one standard deviation of theirs, whatever walks through the others.
+    """
+    changes = [
+        np.abs(after - before)[(before > 0) & (after > 0)]
+        for before, after in zip(sample[:-1:4, where], sample[1::4, where], strict=False)
+    ]
+    known = np.concatenate(changes) if changes else np.empty(0)
+    return float(np.percentile(known, 68.3)) / math.sqrt(2.0) if len(known) else None

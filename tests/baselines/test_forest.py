@@ -1,0 +1,168 @@
+"""The paper's regression forest: its coordinates are a pose, its votes are counted, and it learns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liex_lab.baselines import _forest as kernels
+from liex_lab.baselines.ablations import PlainMean
+from liex_lab.baselines.baseline import see
+from liex_lab.baselines.forest import ForestPlan, RegressionForest, coordinates, levers, train_forests
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import ModelError
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.method import METHODS
+from liex_lab.forests.grow import GrowthPlan
+from liex_lab.geometry import SE3, so3
+from tests.estimation.toy import FLOOR, SCENE, Toy, toy_mice, trained, training_set, unseen
+
+PAPER = METHODS["paper"]
+SMALL = ForestPlan(
+    GrowthPlan(7, 20, 8, 60, 0.5, 0.0, 0.0, 0.63), GrowthPlan(12, 20, 5, 60, 0.5, 0.0, 0.0, 0.63), training_points=8
+)
+
+
+@pytest.fixture(scope="module")
+def grown() -> RegressionForest:
+    toy = toy_mice(500, 1)
+    return train_forests(training_set(toy, PAPER), toy.skeleton, SMALL, np.random.default_rng(0), lambda *_: None)
+
+
+def true_joints(toy: Toy) -> np.ndarray:
+    """(n, J, 3) mm in the camera frame."""
+    return FLOOR.T_arena_camera.inverse() @ toy.joints
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_a_lever_is_how_far_a_small_step_moves_the_joints(animal):
+    skeleton = Skeleton.load(animal)
+    lever, step, home = levers(skeleton), 1e-6, Pose.home(skeleton)
+    rest = home.joints(skeleton)
+    moved = []
+    for k in range(6):
+        twist = np.zeros(6)
+        twist[k] = step
+        moved.append(Pose(SE3.exp(twist), home.angles, home.scale))
+    moved.append(Pose(home.root, home.angles, np.exp(np.array(step))))
+    for j in skeleton.solved[1:]:
+        for axis in np.flatnonzero(skeleton.axes[j]):
+            angles = home.angles.copy()
+            angles[j, axis] = step
+            moved.append(Pose(home.root, angles, home.scale))
+    by_hand = [np.sqrt(((p.joints(skeleton) - rest) ** 2).sum(-1).mean()) / step for p in moved]
+    assert len(lever) == len(by_hand)
+    free = np.array(by_hand) > 0.05 * skeleton.length
+    np.testing.assert_allclose(lever[free], np.array(by_hand)[free], rtol=1e-4)
+    assert (lever[~free] <= np.maximum(0.05 * skeleton.length, 1.0) + 1e-9).all()
+
+
+def test_the_true_coordinates_unfold_to_the_true_pose():
+    toy = toy_mice(5, 8)
+    data, skeleton = training_set(toy, PAPER), toy.skeleton
+    rng = np.random.default_rng(0)
+    places = data.truth.positions[:, 0] + rng.normal(0, 10, (5, 3))
+    turn = so3.log(data.truth.rotations[:, 0])[:, 2]
+    headings = np.arctan2(data.truth.rotations[:, 0, 1, 0], data.truth.rotations[:, 0, 0, 0]) + rng.normal(0, 0.5, 5)
+    assert np.abs(turn).max() > 1.0  # they look in all directions
+    values = coordinates(data, skeleton, np.arange(5, dtype=np.int32), places, headings)
+    for k in range(5):
+        rotations, positions = np.empty((skeleton.n_joints, 3, 3)), np.empty((skeleton.n_joints, 3))
+        scale = kernels.unfold(values[k], levers(skeleton), places[k], headings[k], skeleton.parents, skeleton.offsets,
+                               skeleton.rest, skeleton.axes, rotations, positions)  # fmt: skip
+        np.testing.assert_allclose(positions, data.truth.positions[k], atol=1e-6)
+        assert scale == pytest.approx(data.truth.scale[k])
+
+
+@given(n_points=st.integers(1, 40), phase=st.floats(0.0, 0.999))
+def test_points_lie_on_the_animal_and_are_spread_over_all_of_it(n_points, phase):
+    data = training_set(toy_mice(1, 3), PAPER)
+    heights, look = data.images.heights[0], data.images.looks[0]
+    points = np.full((n_points, 3), np.nan)
+    kernels.animal_points(heights, look, phase, points)
+    z = look[13] - points[:, 2]  # the paper's view is upright: y and z are turned over
+    column = (look[0] * points[:, 0] / z + look[2] - look[14]) / look[16]
+    row = (-look[1] * points[:, 1] / z + look[3] - look[15]) / look[16]
+    at = np.rint(row).astype(int), np.rint(column).astype(int)
+    np.testing.assert_allclose([row, column], at, atol=1e-6)
+    np.testing.assert_allclose(heights[at] / 16, points[:, 2], atol=1e-6)
+    assert (heights[at] > 0).all()
+    ranks = np.cumsum(heights.ravel() > 0)[at[0] * heights.shape[1] + at[1]]
+    assert np.abs(np.diff(ranks) - (heights > 0).sum() / n_points).max(initial=0.0) <= 1.0
+
+
+@given(heading=st.floats(-np.pi, np.pi), n_wrong=st.integers(0, 8))
+def test_the_heading_is_that_of_the_majority(heading, n_wrong):
+    rng = np.random.default_rng(n_wrong)
+    angles = np.concatenate([heading + rng.normal(0, 0.1, 20), heading + np.pi + rng.normal(0, 0.1, n_wrong)])
+    votes = 30 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    assert abs(np.angle(np.exp(1j * (kernels.heading_of(votes) - heading)))) < 0.15
+
+
+def test_it_measures_mice_that_it_has_not_seen(grown):
+    toy = unseen()
+    guesses = grown.estimate(toy.depths, SCENE, grown.find_size(toy.depths, SCENE))
+    assert guesses.found.all()
+    error = np.linalg.norm(guesses.joints - true_joints(toy), axis=-1).mean(axis=1)
+    middle = np.linalg.norm(true_joints(toy) - true_joints(toy).mean(axis=1, keepdims=True), axis=-1).mean()
+    assert np.median(error) < 6.0 < middle  # far better than the animal's centre for every joint
+    assert (error < 12.0).mean() > 0.75
+
+
+def test_one_core_gives_what_two_give_and_a_second_training_the_same_forest(grown):
+    toy = toy_mice(40, 4)
+    one, two = (grown.estimate(toy.depths, SCENE, 1.0, parallel).joints for parallel in (False, True))
+    np.testing.assert_array_equal(one, two)
+    few = toy_mice(60, 1)
+    data = training_set(few, PAPER)
+    a, b = (train_forests(data, few.skeleton, SMALL, np.random.default_rng(3), lambda *_: None) for _ in range(2))
+    assert a.to_bytes() == b.to_bytes()
+
+
+def test_bones_keep_their_proportions(grown):
+    toy = toy_mice(20, 4)
+    joints, home = grown.estimate(toy.depths, SCENE, 1.0).joints, np.linalg.norm(toy.skeleton.offsets[1:], axis=-1)
+    bones = np.linalg.norm(np.diff(joints, axis=1), axis=-1) / home
+    np.testing.assert_allclose(bones, bones[:, :1] * np.ones(4), rtol=1e-6)
+
+
+def test_a_frame_without_an_animal_is_nan_and_its_neighbours_are_not(grown):
+    depths = toy_mice(3, 4).depths.copy()
+    depths[1] = FLOOR.depth(depths.shape[2], depths.shape[1])
+    guesses = grown.estimate(depths, SCENE, 1.0)
+    assert guesses.found.tolist() == [True, False, True]
+    assert np.isnan(guesses.joints[1]).all()
+    assert np.isfinite(guesses.joints[[0, 2]]).all()
+
+
+def test_a_file_gives_the_forest_back_and_a_damaged_one_is_told_in_a_sentence(grown, tmp_path):
+    path, toy = tmp_path / "rf.npz", toy_mice(5, 4)
+    path.write_bytes(grown.to_bytes())
+    again = RegressionForest.load(path, grown.skeleton, grown.plan)
+    np.testing.assert_array_equal(
+        again.estimate(toy.depths, SCENE, 1.0).joints, grown.estimate(toy.depths, SCENE, 1.0).joints
+    )
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ModelError, match="train again") as told:
+        RegressionForest.load(path, grown.skeleton, grown.plan)
+    assert "\n" not in str(told.value)
+
+
+def test_the_plain_mean_is_the_mean_of_all_candidates():
+    estimator = PoseEstimator(trained("paper").model)
+    toy = toy_mice(8, 4)
+    crops, looks = see(toy.depths, SCENE, True)
+    _, positions, _, _ = estimator.candidates(crops, looks, 1.0)
+    guesses = PlainMean(estimator).estimate(toy.depths, SCENE, 1.0)
+    np.testing.assert_allclose(
+        guesses.joints, (positions.mean(axis=1) - [0, 0, 1] * looks[:, None, 13:14]) * [1, -1, -1], atol=1e-9
+    )
+    one = replace(estimator, n_candidates=1)
+    alone = PlainMean(one).estimate(toy.depths, SCENE, 1.0).joints
+    chosen = one.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(toy.skeleton)
+    np.testing.assert_allclose(alone, chosen, atol=1e-6)  # of one candidate there is nothing to choose
