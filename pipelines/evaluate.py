@@ -84,7 +84,7 @@ def errors_of(
         scene, frames = build_scene(recording, plan, next(iter(subjects.values())).skeleton, len(recording))
         for name, subject in subjects.items():
             joints, predicted_mm, quantiles = measure(subject, frames, scene)
-            tip = subject.skeleton.n_joints - 1
+            tip = subject.skeleton.tip
             parts[name].append(PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles))
     return {name: PoseErrors.join(some) for name, some in parts.items()}
 
@@ -109,15 +109,13 @@ def evaluate_pose(
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
 
-    sessions = world_of(Skeleton.load(animal)).test_split(split, spine_mm=spine_mm)
+    world = world_of(Skeleton.load(animal))
+    sessions = world.test_split(split, spine_mm=spine_mm)
     subject = subject_of(animal, variant, progress)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
     errors = pose_errors(subject, sessions, Plan.load(animal), progress)
-    how = (
-        f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, each with its own camera, arena, animal; "
-        "the background, the floor, the blob and the animal's size are found by the product, nothing is handed over. "
-    )
+    how = f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, {world.protocol}"
     return {"animal": animal, "split": split, "variant": variant, "n_frames": len(errors.error_mm),
             **errors.summary(), "protocol": how + POSE_PROTOCOL}  # fmt: skip
 

@@ -45,7 +45,11 @@ class Recipe:
 AREA_MM2 = 1070.0  # of a home-sized mouse seen from above; only ranks the blobs of a training window
 
 RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
-_OWN: dict[tuple[str, str], Recipe] = {}  # of an animal and a variant, where it is not the mouse's
+# of an animal and a variant, where it is not the mouse's
+_OWN: dict[tuple[str, str], Recipe] = {
+    ("hand", "default"): Recipe(n_images=24_576, n_calibration=4_096, sizes=((0.0, 320),)),
+    ("hand", "paper"): Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 320),)),
+}
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
@@ -81,6 +85,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     from liex_lab.estimation.calibration import calibrate
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
+    from liex_lab.recordings.worlds import world_of
 
     rng = np.random.default_rng(recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
@@ -97,7 +102,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
-        "images": "rendered from a seed; no recording of an animal was used",
+        "images": world_of(skeleton).sources,
     }  # fmt: skip
     model = Model(cascade, metric, None, table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_calibration:

@@ -185,6 +185,11 @@ class Skeleton:
         return bool((self.parents == np.arange(-1, self.n_joints - 1)).all())
 
     @cached_property
+    def tip(self) -> int:
+        """The joint whose direction from the base says which way the animal lies: a chain's last, a tree's second."""
+        return self.n_joints - 1 if self.is_chain else int(self.next_joint[0])
+
+    @cached_property
     def solved(self) -> list[int]:
         """The joints that move and so need a regressor, base first."""
         return [0] + [j for j in range(1, self.n_joints) if self.axes[j].any()]

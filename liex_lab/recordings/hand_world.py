@@ -100,12 +100,24 @@ class HandWorld:
 
     @property
     def protocol(self) -> str:
-        """Where the test postures come from."""
+        """What to say of the test splits beside figures measured on them."""
+        how = (
+            "each of another person's right hand before an NYU camera; the hand and its size are found by the product, "
+            "nothing is handed over; flips are told by the direction from the palm to the wrist. "
+        )
         if self.reference is None:
-            return "Postures: drawn from statistics of one person's hand, on which training pictures are drawn, too. "
+            return f"{how}Postures: drawn from statistics of one person's hand, as part of the training pictures are. "
         return (
-            f"Postures: fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on, a person whom no "
-            "training picture is drawn after. "
+            f"{how}Postures: fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on, a person after "
+            "whom no training picture is drawn. "
+        )
+
+    @property
+    def sources(self) -> str:
+        """What the training images were made from."""
+        return (
+            "rendered from a seed; postures partly drawn from statistics of labelled points of the NYU Hand Pose test "
+            f"frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
         )
 
     def training_blocks(

@@ -26,6 +26,14 @@ class World(Protocol):
     def splits(self) -> tuple[str, ...]:
         """The names of the test splits."""
 
+    @property
+    def protocol(self) -> str:
+        """What to say of the test splits beside figures measured on them."""
+
+    @property
+    def sources(self) -> str:
+        """What the training images were made from, for a model's card."""
+
     def training_blocks(
         self,
         seed: int,
@@ -60,6 +68,19 @@ class RenderedWorld:
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
         return self.habits.skeleton
+
+    @property
+    def protocol(self) -> str:
+        """What to say of the test splits beside figures measured on them."""
+        return (
+            "each with its own camera, arena, animal; the background, the floor, the blob and the animal's size are "
+            "found by the product, nothing is handed over. "
+        )
+
+    @property
+    def sources(self) -> str:
+        """What the training images were made from."""
+        return "rendered from a seed; no recording of an animal was used"
 
     def training_blocks(self, seed: int, n_blocks: int, **settings: Any) -> Iterator[TrainingWindows]:
         """Blocks of training images."""
