@@ -114,6 +114,9 @@ class RecordingOptions(_Table):
     accept_truncated: bool = Field(
         False, description="true: use the whole frames of a recording that ends in the middle of one"
     )
+    mirrored: bool = Field(
+        False, description="true: exchange left and right, for pictures that come mirrored, or to measure a left hand"
+    )
 
 
 class Foreground(_Table):

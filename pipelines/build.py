@@ -30,11 +30,12 @@ if TYPE_CHECKING:
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
     """The recording at a path, or one that is open already, as an ideal camera in air would have made it.
 
-    Lens distortion and the water's refraction are undone whenever a frame is read.
+    Lens distortion, the water's refraction and a mirror are undone whenever a frame is read.
     """
-    from liex_lab.recordings.rectify import rectified
+    from liex_lab.recordings.rectify import mirrored, rectified
 
-    return rectified(open_planned(recording, plan, progress), build_water(plan))
+    seen = rectified(open_planned(recording, plan, progress), build_water(plan))
+    return mirrored(seen) if plan.recording.mirrored else seen
 
 
 def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
