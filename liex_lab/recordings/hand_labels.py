@@ -14,6 +14,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
+from liex_lab.recordings.nyu import JOINT_FILE, read_nyu_joints
 
 Array = NDArray[np.float64]
 
@@ -39,6 +40,7 @@ POINTS: dict[str, dict[str, float]] = {
     "wrist_b": {"wrist_left": 1.0},
     "palm": {"palm": 1.0},
 }
+NYU_IDS = (0, 3, 6, 9, 12, 15, 18, 21, 24, 25, 27, 30, 31, 32)  # of the data set's 36 points, from 0
 _LITTLE_WRIST, _THUMB_WRIST = 11, 12
 _START_BEND = 0.3  # rad: a straight finger does not know which way to bend
 
@@ -67,10 +69,16 @@ class NyuReference:
 
     @staticmethod
     def load(folder: str | Path) -> NyuReference:
-        """From the folder that holds nyu_test_14joints.npz. Raises LiexError."""
+        """From the folder that holds nyu_test_14joints.npz, or else the data set's own joint_data.mat, which holds no
+        answers. Raises LiexError.
+        """
         path = Path(folder) / REFERENCE_FILE
+        if not path.is_file() and (Path(folder) / JOINT_FILE).is_file():
+            return NyuReference(uvd_to_mm(read_nyu_joints(Path(folder)).uvd[:, NYU_IDS]), {})
         if not path.is_file():
-            raise LiexError(f"the NYU reference should be a folder with {REFERENCE_FILE}, but there is no {path}")
+            raise LiexError(
+                f"the NYU reference should be a folder with {REFERENCE_FILE} or {JOINT_FILE}, but {folder} has neither"
+            )
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as table:
                 truth = uvd_to_mm(table["groundtruth_uvd"])
