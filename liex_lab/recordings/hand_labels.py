@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,7 +85,7 @@ class NyuReference:
                 truth = uvd_to_mm(table["groundtruth_uvd"])
                 found = {name.removesuffix("_uvd"): uvd_to_mm(table[name]) for name in table.files if "_uvd" in name}
                 names = [str(name) for name in table["joint_names"]]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise LiexError(f"{path} is not a whole file of NYU labels ({error}); copy it anew") from None
         if names != list(POINTS) or truth.shape[1:] != (len(POINTS), 3):
             raise LiexError(f"{path} should label {', '.join(POINTS)}, in this order, but labels {', '.join(names)}")
