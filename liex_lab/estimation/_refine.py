@@ -18,26 +18,32 @@ _ROOT = 7  # twist of the base and log of the scale come before the angles
 
 
 @njit(cache=True)
+def _closer(nearest, r, c, a, b):
+    """Let pixel (r, c) take over what is nearest to its neighbour (a, b), where that is nearer."""
+    if a < 0 or b < 0 or a >= nearest.shape[0] or b >= nearest.shape[1]:
+        return
+    known = (nearest[r, c, 0] - r) ** 2 + (nearest[r, c, 1] - c) ** 2
+    if (nearest[a, b, 0] - r) ** 2 + (nearest[a, b, 1] - c) ** 2 < known:
+        nearest[r, c, 0], nearest[r, c, 1] = nearest[a, b, 0], nearest[a, b, 1]
+
+
+@njit(cache=True)
 def nearest_readings(heights, nearest):
-    """For every crop pixel the nearest one on the animal: nearest (S, S, 2) rows and columns, by two sweeps."""
+    """For every crop pixel the nearest one on the animal: nearest (S, S, 2) rows and columns (Danielsson 1980)."""
     side = heights.shape[0]
     for r in range(side):
         for c in range(side):
             nearest[r, c, 0] = r if heights[r, c] > 0 else -10000
             nearest[r, c, 1] = c if heights[r, c] > 0 else -10000
     for sweep in range(2):
-        for k in range(side * side):
-            at = k if sweep == 0 else side * side - 1 - k
-            r, c = at // side, at % side
-            best = (nearest[r, c, 0] - r) ** 2 + (nearest[r, c, 1] - c) ** 2
-            for n in range(4):
-                dr, dc = (0, -1, -1, -1)[n], (-1, -1, 0, 1)[n]
-                a, b = (r + dr, c + dc) if sweep == 0 else (r - dr, c - dc)
-                if 0 <= a < side and 0 <= b < side:
-                    off = (nearest[a, b, 0] - r) ** 2 + (nearest[a, b, 1] - c) ** 2
-                    if off < best:
-                        best = off
-                        nearest[r, c, 0], nearest[r, c, 1] = nearest[a, b, 0], nearest[a, b, 1]
+        for k in range(side):
+            r, before = (k, k - 1) if sweep == 0 else (side - 1 - k, side - k)
+            for c in range(side):
+                for b in range(c - 1, c + 2):
+                    _closer(nearest, r, c, before, b)
+                _closer(nearest, r, c, r, c - 1)
+            for c in range(side - 2, -1, -1):
+                _closer(nearest, r, c, r, c + 1)
 
 
 @njit(cache=True)
@@ -112,9 +118,11 @@ def turning_axes(free, angles, rotations, axes):
 
 
 @njit(cache=True)
-def ball_slope(b, ball, ball_joints, ball_share, moves, free, axes, rotations, positions, slope):
-    """Derivative (3, P) of a ball's middle by base twist, log scale and free angles. moves (J, F): which angles turn a
-    joint's frame.
+def ball_slope(
+    b, ball, ball_joints, ball_offsets, ball_share, moves, free, axes, rotations, positions, scale, slope
+):  # fmt: skip
+    """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles. moves (J, F): which
+    angles turn a joint's frame.
     """
     slope[:] = 0.0
     x0, y0, z0 = ball[0] - positions[0, 0], ball[1] - positions[0, 1], ball[2] - positions[0, 2]
@@ -128,11 +136,15 @@ def ball_slope(b, ball, ball_joints, ball_share, moves, free, axes, rotations, p
         share = ball_share[b] if e == 1 else 1.0 - ball_share[b]
         if share == 0.0:
             continue
+        end = np.empty(3)
+        for i in range(3):
+            end[i] = positions[j, i]
+            for k in range(3):
+                end[i] += scale * rotations[j, i, k] * ball_offsets[b, e, k]
         for f in range(len(free)):
             if moves[j, f]:
                 a = free[f, 0]
-                # the end lies near the ball: the lever of the ball itself serves for both ends of a bone
-                x, y, z = ball[0] - positions[a, 0], ball[1] - positions[a, 1], ball[2] - positions[a, 2]
+                x, y, z = end[0] - positions[a, 0], end[1] - positions[a, 1], end[2] - positions[a, 2]
                 ax, ay, az = axes[f, 0], axes[f, 1], axes[f, 2]
                 slope[0, _ROOT + f] += share * (ay * z - az * y)
                 slope[1, _ROOT + f] += share * (az * x - ax * z)
@@ -265,7 +277,8 @@ def refine_one(
         place_balls(rotations, positions, scale, ball_joints, ball_offsets, ball_share, balls)
         turning_axes(free, angles, rotations, axes)
         for b in range(n_own):
-            ball_slope(b, balls[b], ball_joints, ball_share, moves, free, axes, rotations, positions, slopes[b])
+            ball_slope(b, balls[b], ball_joints, ball_offsets, ball_share, moves, free, axes, rotations, positions,
+                       scale, slopes[b])  # fmt: skip
         gradient, curvature = np.zeros(n_values), np.zeros((n_values, n_values))
         _gather(heights, look, nearest, points, balls, ball_radius * scale, n_own, slopes, robust, beside_weight,
                 gradient, curvature)  # fmt: skip
