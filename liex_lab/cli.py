@@ -43,7 +43,7 @@ TopicName = Annotated[
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
 ]
-AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse or hand.")]
+AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")]
 VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
 RowName = Annotated[str, typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
@@ -144,16 +144,20 @@ def convert(
 
 @app.command()
 def train(
-    animal: Annotated[str, typer.Argument(metavar="ANIMAL", help="fish, mouse or hand.")],
+    animal: Annotated[str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, or a skeleton's .toml file.")],
     variant: VariantName = "default",
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz.")] = None,
     workers: Annotated[int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")] = 0,
+    n_images: Annotated[
+        int | None, typer.Option("--images", min=512, help="Pictures to train on, for a quick look.")
+    ] = None,
 ) -> None:
     """Make an animal's model from rendered pictures; the same again, byte for byte, whenever it is run."""
     from liex_lab.pipelines.train import train_model
 
     with progress_bar() as progress:
-        model = train_model(animal, variant, out or Path(f"{animal}.npz"), workers=workers, progress=progress)
+        path = out or Path(f"{Path(animal).stem}.npz")
+        model = train_model(animal, variant, path, workers=workers, n_images=n_images, progress=progress)
     typer.echo(f"model: {model}")
 
 
@@ -162,6 +166,7 @@ def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
     variant: RowName = "default",
+    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
     n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
     spine_mm: Annotated[
         float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
@@ -172,7 +177,7 @@ def evaluate_pose(
     from liex_lab.pipelines.evaluate import evaluate_pose as measure
 
     with progress_bar() as progress:
-        result = measure(animal, split, variant, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
+        result = measure(animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
     _tell_numbers(result, json_file)
 
 

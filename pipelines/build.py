@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import PlanError
-from liex_lab.plan import Plan
+from liex_lab.plan import Plan, known_plans
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
     from liex_lab.water import Water
+
+
+_SPANS = (0.6, 1.8)  # of the home length: how small and how large an animal of the user's own may be
 
 
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
@@ -85,17 +88,38 @@ def _overruled(camera: Camera, plan: Plan) -> Camera:
     return replace(camera, **{"source": "plan", **stated}) if stated else camera
 
 
+def plan_of(animal: str) -> Plan:
+    """The bundled plan of an animal, or one for the animal of a skeleton's TOML."""
+    from liex_lab.body.skeleton import Skeleton
+
+    if animal in known_plans():
+        return Plan.load(animal)
+    skeleton = Skeleton.load(animal)
+    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
+    return Plan.from_table(
+        {
+            "animal": {"name": skeleton.name, "skeleton": animal, "spine_min_mm": low, "spine_max_mm": high},
+            "foreground": {"min_height_mm": skeleton.view.min_height_mm},
+            "estimation": {"model": f"{Path(animal).stem}.npz"},
+        }
+    )
+
+
 def build_estimator(plan: Plan) -> PoseEstimator:
     """The estimator of the plan's animal."""
+    from liex_lab.body.skeleton import Skeleton
     from liex_lab.catalog import find_model
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
 
     model = Model.load(find_model(plan.estimation.model))
-    if model.skeleton.name != plan.animal.skeleton:
+    wanted = plan.animal.skeleton
+    if wanted.endswith(".toml"):  # a file of the user's own: what matters is the animal in it
+        wanted = Skeleton.load(wanted).name
+    if model.skeleton.name != wanted:
         raise PlanError(
             f"the model '{plan.estimation.model}' was made for the skeleton {model.skeleton.name}, but the plan says "
-            f"{plan.animal.skeleton}; set estimation.model to a model of the {plan.animal.skeleton}"
+            f"{plan.animal.skeleton}; set estimation.model to a model of the {wanted}"
         )
     return PoseEstimator(model, plan.estimation.n_candidates or 0)
 
@@ -121,7 +145,8 @@ def build_scene(
     animal, foreground = plan.animal, plan.foreground
     if skeleton.view.foreground == FOREGROUNDS[1]:
         return NearestScene.learn(recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm))
-    return Scene.learn(recording, (animal.spine_min_mm, animal.spine_max_mm), n_frames, foreground.min_height_mm)
+    sizes = (animal.spine_min_mm, animal.spine_max_mm)
+    return Scene.learn(recording, sizes, n_frames, foreground.min_height_mm, skeleton.view)
 
 
 def build_provenance(

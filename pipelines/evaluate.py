@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from liex_lab.pipelines.build import plan_of
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError
@@ -22,22 +23,32 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_SIZES_MM = {"mouse": (45.0, 65.0, 80.0, 100.0), "fish": (18.0, 25.0, 32.0, 45.0)}
+_SIZES = (0.75, 1.0, 1.25, 1.5)  # of other animals, over their home length
 
-def estimator_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator:
-    """The estimator of a variant: the bundled model, or one that is trained now and kept in the user's cache."""
+
+def estimator_of(
+    animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
+) -> PoseEstimator:
+    """The estimator of a model file, or of a variant: the bundled model, or one trained now and kept in the cache."""
     from liex_lab.pipelines.train import cached_model
 
-    from liex_lab.catalog import find_model
+    from liex_lab.catalog import bundled_models, find_model
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
 
-    if variant == "default":
-        return PoseEstimator(Model.load(find_model(animal)))
+    if model is not None or (variant == "default" and animal in bundled_models()):
+        return PoseEstimator(Model.load(find_model(model or animal)))
     return PoseEstimator(Model.load(cached_model(animal, variant, progress)))
 
 
-def subject_of(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator | Baseline:
-    """What `liex evaluate pose --variant` measures: a variant of the method, one of its ablations, or a baseline."""
+def subject_of(
+    animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
+) -> PoseEstimator | Baseline:
+    """What `liex evaluate pose --variant` measures: a variant of the method, one of its ablations, or a baseline.
+
+    model: of another file than the animal's own.
+    """
     from liex_lab.pipelines.baselines import BASELINES, trained_baseline
 
     from liex_lab.baselines.ablations import PlainMean
@@ -45,7 +56,7 @@ def subject_of(animal: str, variant: str, progress: Progress = silent) -> PoseEs
     from liex_lab.estimation.method import METHODS
 
     if variant in METHODS:
-        return estimator_of(animal, variant, progress)
+        return estimator_of(animal, variant, progress, *(() if model is None else (model,)))
     if variant == "paper-one-pose":
         return PoseEstimator(estimator_of(animal, "paper", progress).model, 1)
     if variant == "paper-no-metric":
@@ -101,35 +112,46 @@ def evaluate_pose(
     split: str = "clean",
     variant: str = "default",
     *,
+    model: str | Path | None = None,
     n_frames: int | None = None,
     spine_mm: float | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The figures of one split and variant; `liex evaluate pose`."""
+    """The figures of one split and variant; `liex evaluate pose`. model: of another file than the animal's own."""
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
 
     world = world_of(Skeleton.load(animal))
     sessions = world.test_split(split, spine_mm=spine_mm)
-    subject = subject_of(animal, variant, progress)
+    subject = subject_of(animal, variant, progress, model)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
-    errors = pose_errors(subject, sessions, Plan.load(animal), progress)
+    errors = pose_errors(subject, sessions, plan_of(animal), progress)
     how = f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, {world.protocol}"
     return {"animal": animal, "split": split, "variant": variant, "n_frames": len(errors.error_mm),
             **errors.summary(), "protocol": how + POSE_PROTOCOL}  # fmt: skip
 
 
+def sizes_of(animal: str) -> tuple[float, ...]:
+    """From how small to how large animals of a kind are, mm."""
+    from liex_lab.body.skeleton import Skeleton
+
+    if animal in _SIZES_MM:
+        return _SIZES_MM[animal]
+    home = Skeleton.load(animal).length
+    return tuple(round(factor * home, 1) for factor in _SIZES)
+
+
 def evaluate_sizes(
     animal: str = "mouse",
-    spines_mm: Sequence[float] = (45.0, 65.0, 80.0, 100.0),
+    spines_mm: Sequence[float] | None = None,
     *,
     n_frames: int | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Mean joint error in per cent of the spine for animals of several sizes, the size estimated and not given."""
     rows = {}
-    for spine in spines_mm:
+    for spine in spines_mm or sizes_of(animal):
         result = evaluate_pose(animal, "clean", "default", n_frames=n_frames, spine_mm=spine, progress=progress)
         rows[f"{spine:g}"] = 100.0 * result["mean_joint_error_mm"] / spine
     best = min(rows.values())

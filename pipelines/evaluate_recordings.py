@@ -106,7 +106,7 @@ def evaluate_recordings(
 
 def _rendered(progress: Progress) -> tuple[Camera, NDArray[np.float32]]:
     """Depth (n, H, W) mm of a rendered recording of 640 x 480 pixels."""
-    from liex_lab.recordings.walking import open_synthetic
+    from liex_lab.recordings.virtual import open_synthetic
 
     recording = open_synthetic("synthetic:walk?seed=5&frames=30&sensor=primesense")
     frames = []

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -94,16 +93,17 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
 
 def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
     """Frames of a rendered recording, as many as are timed, and the scene learned from it."""
-    from liex_lab.pipelines.build import build_scene
+    from liex_lab.pipelines.build import build_scene, plan_of
 
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
     recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
-    plan = Plan.load(animal)
+    plan = plan_of(animal)
     scene, sample = build_scene(recording, plan, estimator.skeleton, 96)
-    frames = sample[np.arange(N_FRAMES) % len(sample)]
+    frames = recording.depths(0, min(len(recording), N_FRAMES))  # whole ones, which those of the sample need not be
+    frames = frames[np.arange(N_FRAMES) % len(frames)]
     return _Footage(recording.name, frames, scene, estimator.find_size(sample, scene))
 
 
@@ -139,7 +139,7 @@ def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
     looks = scene.looks(crops, default.model.method.camera_view)
     rotations, positions, _, scores = default.candidates(crops, looks, size)
     return {
-        "foreground": _ms(lambda: scene.extract(frames, size, False)),
+        "foreground": _ms(lambda: scene.extract(frames, size, False, default.model.method.camera_view)),
         "candidates": _ms(lambda: default.candidates(crops, looks, size, False)),
         "choice": _ms(lambda: default.pick(crops.heights, looks, crops.moments, size, rotations, positions, scores,
                                            False)),

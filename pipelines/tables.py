@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from liex_lab.pipelines.build import plan_of
 
 from liex_lab.catalog import MODELS
 from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation import PoseErrors, plain
-from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def measured_rows(
 
     rows: dict[str, dict[str, Any]] = {name: {"splits": {}} for name in subjects}
     for split, sessions in tests.items():
-        for name, errors in errors_of(subjects, sessions, Plan.load(animal), progress).items():
+        for name, errors in errors_of(subjects, sessions, plan_of(animal), progress).items():
             rows[name]["splits"][split] = {**_numbers(errors), "first_joints_mm": first_joints(sessions)}
     progress(0, None, "timing")
     for name, rate in rates_of(animal, subjects, next(iter(tests.values()))).items():
@@ -216,9 +216,10 @@ def rates_of(
     from liex_lab.pipelines.build import build_scene
     from liex_lab.pipelines.speed import best_seconds
 
-    recording, plan = max(sessions[:2], key=lambda session: session.width), Plan.load(animal)
-    scene, sample = build_scene(recording, plan, subjects["default"].skeleton, 96)
-    frames = sample[np.arange(_RATE_FRAMES) % len(sample)]
+    recording, plan = max(sessions[:2], key=lambda session: session.width), plan_of(animal)
+    scene, sample = build_scene(recording, plan, next(iter(subjects.values())).skeleton, 96)
+    frames = recording.depths(0, min(len(recording), _RATE_FRAMES))
+    frames = frames[np.arange(_RATE_FRAMES) % len(frames)]
     cores = min(2, numba.config.NUMBA_NUM_THREADS)
     before = numba.get_num_threads()
     numba.set_num_threads(cores)

@@ -6,8 +6,7 @@ import hashlib
 import json
 import os
 import sys
-import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,28 +36,52 @@ class Recipe:
 
     seed: int = 20
     n_images: int = 49_152
-    n_calibration: int = 6_144
+    n_calibration: int = 24_576
     degraded_share: float = 0.5
     sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
 
 
-AREA_MM2 = 1070.0  # of a home-sized mouse seen from above; only ranks the blobs of a training window
+_CALIBRATION = 1  # number of the calibration's own random numbers, so that it can be made again by itself
+_AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
 RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
+_OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
+_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # of an animal and a variant, where it is not the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
+    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_calibration=4_096, sizes=_FISH_SIZES),
+    ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
     ("hand", "default"): Recipe(n_images=24_576, n_calibration=4_096, sizes=((0.0, 320),)),
     ("hand", "paper"): Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 320),)),
 }
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
-    """How much the variant is trained on for an animal."""
-    return _OWN.get((skeleton.name, variant), RECIPES[variant])
+    """How much the variant is trained on for an animal; for one of the user's own, sizes around its home length."""
+    from liex_lab.recordings.worlds import GenericWorld, world_of
+
+    world = world_of(skeleton)
+    if not isinstance(world, GenericWorld):
+        return _OWN.get((skeleton.name, variant), RECIPES[variant])
+    sizes = tuple((factor * skeleton.length, world.window_px(factor * skeleton.length)) for factor in _OWN_SIZES)
+    images = {name: getattr(_OWN["fish", variant], name) for name in ("n_images", "n_calibration", "degraded_share")}
+    return Recipe(**images, sizes=sizes if variant == "default" else sizes[:1])
 
 
-def train_model(animal: str, variant: str, out: str | Path, *, workers: int = 0, progress: Progress = silent) -> Path:
-    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path."""
+def train_model(
+    animal: str,
+    variant: str,
+    out: str | Path,
+    *,
+    workers: int = 0,
+    n_images: int | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path.
+
+    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of that to calibrate on,
+    instead of what the recipe says.
+    """
     import numba
 
     from liex_lab.body.skeleton import Skeleton
@@ -67,7 +90,10 @@ def train_model(animal: str, variant: str, out: str | Path, *, workers: int = 0,
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     skeleton = Skeleton.load(animal)
-    model = make_model(skeleton, method_of(variant, skeleton), recipe_of(variant, skeleton), progress)
+    recipe = recipe_of(variant, skeleton)
+    if n_images is not None:
+        recipe = replace(recipe, n_images=n_images, n_calibration=n_images // 4)
+    model = make_model(skeleton, method_of(variant, skeleton), recipe, progress)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     content = model.to_bytes()
@@ -81,7 +107,6 @@ def train_model(animal: str, variant: str, out: str | Path, *, workers: int = 0,
 
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
     """Algorithm 2, the learned metric, and its calibration on images that no tree has seen."""
-    from liex_lab.body.skeleton import PRESETS
     from liex_lab.estimation.calibration import calibrate
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
@@ -98,17 +123,16 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     progress(steps - 2, steps, "growing forests: the learned metric")
     metric = train_metric(data, cascade, candidates, rng)
     pruner = train_pruner(data, cascade, candidates, rng)
-    table = tomllib.loads((PRESETS / f"{skeleton.name}.toml").read_text(encoding="utf-8"))
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
         "images": world_of(skeleton).sources,
     }  # fmt: skip
-    model = Model(cascade, metric, None, table, Calibration(area_mm2=area), card, pruner)
+    model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
         unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)
-        model = calibrate(model, unseen, rng)
+        model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
     return model
 
 
@@ -138,25 +162,28 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
     """Training images of what the foreground found in the windows, with the truth in their view frames."""
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.foreground import SPREADS, Windows
     from liex_lab.recordings.nearest import NearestWindows
 
-    size = windows.spine_mm / skeleton.length
+    size, origin = windows.spine_mm / skeleton.length, windows.origin.astype(float)
     shown = size if method.session_size else np.ones(len(size))
-    origin = windows.origin.astype(float)
-    parts = []
-    for rank in (0, 1):
-        if skeleton.view.foreground == FOREGROUNDS[1]:
-            held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
-            crops, looks = held.extract(shown, method.camera_view, rank)
-        else:
-            cut = Windows(windows.depth, windows.background, windows.intrinsics, origin, windows.floor)
-            crops, looks = cut.extract(shown, AREA_MM2 * size**2, camera_view=method.camera_view, rank=rank)
-        parts.append(with_truth(skeleton, windows, crops, looks))
-    return TrainingSet.join(parts)
+    if skeleton.view.foreground == FOREGROUNDS[1]:
+        held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
+        cuts = [held.extract(shown, method.camera_view, rank) for rank in (0, 1)]
+    else:
+        depth, background = (
+            picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+            for picture in (windows.depth, windows.background)
+        )
+        cut = Windows(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+        area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
+        # a scene learned from a recording knows how much its readings spread
+        least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+        cuts = [cut.extract(shown, area, least, method.camera_view, rank) for rank in (0, 1)]
+    return TrainingSet.join([with_truth(skeleton, method, windows, crops, looks) for crops, looks in cuts])
 
 
-def with_truth(skeleton: Skeleton, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
+def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
     """Training images of blobs that were cut from the windows, with the truth in their view frames."""
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
@@ -166,17 +193,29 @@ def with_truth(skeleton: Skeleton, windows: TrainingWindows, crops: Crops, looks
 
     T_view_camera = view_of(looks)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
-    rotations = pose.frames(skeleton).rotation
-    joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
-    off = np.linalg.norm(crops.moments[:, 3:5] - joints.mean(axis=1)[:, :2], axis=1)
+    frames = pose.frames(skeleton)
+    joints = frames.translation
+    if windows.own_bones:
+        joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
+    middle = joints.mean(axis=1)
+    off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
+    if method.camera_view:  # what is beside it in depth is another thing as well
+        off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
     animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
     good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
     return TrainingSet(
         ImageSet(crops.heights[good], looks[good], crops.moments[good]),
-        Truth(rotations[good], joints[good], pose.scale[good]),
+        Truth(frames.rotation[good], joints[good], pose.scale[good]),
         (windows.spine_mm / skeleton.length)[good],
         animal[good],
     )
+
+
+def home_area_mm2(skeleton: Skeleton) -> float:
+    """About the area of a home-sized animal seen from above."""
+    from liex_lab.body.surface import Surface
+
+    return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
 
 
 def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
@@ -187,7 +226,7 @@ def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path
 
     skeleton = Skeleton.load(animal)
     method, recipe = method_of(variant, skeleton), recipe_of(variant, skeleton)
-    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe)}
+    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe), "skeleton": skeleton.table}
     key = hashlib.sha256(json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()).hexdigest()[:12]
     path = cache_folder() / f"{skeleton.name}-{variant}-{key}.npz"
     return path if path.is_file() else train_model(animal, variant, path, progress=progress)

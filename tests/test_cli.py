@@ -182,7 +182,7 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
     words = ["--animal", "mouse", "--split", "hard", "--variant", "paper", "--frames", "50", "--spine-mm", "65"]
     result = CliRunner().invoke(cli.app, ["evaluate", "pose", *words, "--json", str(file)])
     assert result.exit_code == 0, result.output
-    assert seen == ["mouse", "hard", "paper", {"n_frames": 50, "spine_mm": 65.0}]
+    assert seen == ["mouse", "hard", "paper", {"model": None, "n_frames": 50, "spine_mm": 65.0}]
     assert json.loads(file.read_text())["curve"] == [0, 1]
     assert "mean over joints [mm]" in result.output, "brackets are text, not markup"
 
@@ -262,9 +262,14 @@ def test_run_hands_the_topic_to_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch) -> None:
-    job(monkeypatch, "train", train_model=lambda animal, variant, out, workers, progress: (out, variant, workers))
+    def train(animal: str, variant: str, out: Path, workers: int, n_images: int | None, progress: Any) -> Any:
+        return out, variant, workers, n_images
+
+    job(monkeypatch, "train", train_model=train)
     result = CliRunner().invoke(cli.app, ["train", "mouse", "--variant", "paper", "--workers", "2"])
-    assert result.output == f"model: {(Path('mouse.npz'), 'paper', 2)}\n"
+    assert result.output == f"model: {(Path('mouse.npz'), 'paper', 2, None)}\n"
+    result = CliRunner().invoke(cli.app, ["train", "datasets/snake.toml", "--images", "512"])
+    assert result.output == f"model: {(Path('snake.npz'), 'default', 0, 512)}\n"
 
 
 def test_errors_of_a_job_come_through(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,10 +30,12 @@ class BodyPoints:
 
     @staticmethod
     def of(joints: list[str]) -> BodyPoints:
-        """The parts by name, or along the chain: first joint, last but one, last."""
+        """The parts by name, or along the chain: first joint, last but one, last; a chain may begin at the head."""
         if {"rump", "neck", "nose"} <= set(joints):
             back = tuple(name for name in joints if name not in ("rump", "nose"))
             return BodyPoints("rump", "neck", "nose", back)
+        if joints[0] == "head":
+            joints = joints[::-1]
         return BodyPoints(joints[0], joints[max(len(joints) - 2, 0)], joints[-1], tuple(joints[1:-1]) or (joints[0],))
 
 

@@ -251,6 +251,8 @@ def _capsule(first, last, first_radius, last_radius, frame, out, start):
         length += frame[1, axis] ** 2
         frame[3, axis] = 0.0
     length = math.sqrt(length)
+    if length < 1e-9:  # joints that coincide: a ball
+        frame[1, 0] = 1.0
     _normalise(frame, 1)
     frame[3, 2 if abs(frame[1, 2]) < 0.9 else 0] = 1.0
     _cross(frame, 3, 1, 2)

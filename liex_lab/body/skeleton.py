@@ -6,7 +6,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ REFERENCE_MM = 52.834  # home length of the mouse: lengths that hold for every a
 VIEWS = ("floor", "camera")
 FOREGROUNDS = ("background", "nearest")
 _BEHIND_MM, _SMOOTH_MM = 120.0, 2.0  # of an animal of the reference length
+_MIN_HEIGHT_MM = 7.0
 _AREA = (0.12, 1.3)
 
 
@@ -37,14 +38,15 @@ class View:
     frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
     behind_mm (at home size) behind its mean depth, for one that swims or is held up. smooth_mm: readings this near to
     one another, at home size, are averaged. area: the smallest and the largest area seen from above, of the squared
-    length. foreground: 'background', it stands out from a scene that is otherwise still, or 'nearest', nothing is
-    nearer to the camera.
+    length. min_height_mm: what stands out from the background by less is not the animal. foreground: 'background', it
+    stands out from a scene that is otherwise still, or 'nearest', nothing is nearer to the camera.
     """
 
     frame: str = VIEWS[0]
     behind_mm: float = _BEHIND_MM
     smooth_mm: float = _SMOOTH_MM
     area: tuple[float, float] = _AREA
+    min_height_mm: float = _MIN_HEIGHT_MM
     foreground: str = FOREGROUNDS[0]
 
     @staticmethod
@@ -62,13 +64,17 @@ class View:
             raise LiexError(f"{origin}: [view] frame is one of {', '.join(VIEWS)}, got {frame!r}")
         if not (isinstance(area, list) and [_is_number(a) for a in area] == [True, True] and 0 < area[0] < area[1]):
             raise LiexError(f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got {area}")
-        lengths = {"behind_mm": _BEHIND_MM * relative_size, "smooth_mm": _SMOOTH_MM * relative_size}
+        lengths = {
+            "behind_mm": _BEHIND_MM * relative_size,
+            "smooth_mm": _SMOOTH_MM * relative_size,
+            "min_height_mm": _MIN_HEIGHT_MM,
+        }
         for key, usual in lengths.items():
             value = table.get(key, usual)
             if not (_is_number(value) and value > 0):
                 raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
-        return View(frame, lengths["behind_mm"], lengths["smooth_mm"], (float(area[0]), float(area[1])), foreground)
+        return View(frame=frame, area=(float(area[0]), float(area[1])), foreground=foreground, **lengths)
 
 
 MOUSE_VIEW = View()
@@ -81,7 +87,8 @@ class Skeleton:
     Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a joint away from
     its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame into the joint's at home; `axes`
     (J, 3) says which of roll, pitch and yaw the joint can do; `limits` (J, 3, 2) rad. The base joint, 0, has all six
-    degrees of freedom. Parents precede their children. surface: the [surface] table, see `Surface.of`.
+    degrees of freedom. Parents precede their children. surface: the [surface] table, see `Surface.of`; table: the whole
+    TOML.
     """
 
     name: str
@@ -93,6 +100,7 @@ class Skeleton:
     limits: Array
     surface: dict[str, Any]
     view: View
+    table: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
@@ -144,6 +152,7 @@ class Skeleton:
             limits=np.radians([row.limits for row in rows]),
             surface=table.get("surface", {}),
             view=View.from_table(table.get("view", {}), relative_size, origin),
+            table=table,
         )
 
     @property

@@ -67,6 +67,17 @@ class Surface:
         """The leading faces that belong to the trunk."""
         return 2 * (len(self.stations) - 2) * _skin.BODY_SEGMENTS if self.shape is not None else len(self.faces)
 
+    @property
+    def area_mm2(self) -> float:
+        """About the area of the home pose seen from above."""
+        if self.capsules is not None:
+            home = Pose.home(self.skeleton).joints(self.skeleton)
+            first, last = (home[self.capsules.joints[:, k]] for k in range(2))
+            along = np.linalg.norm((last - first)[:, :2], axis=-1)
+            return float((along * self.capsules.radii.sum(axis=-1)).sum())
+        assert self.shape is not None
+        return float(np.trapezoid(2.0 * self.shape.half_width, self.stations * self.skeleton.length))
+
     def vertices(
         self,
         pose: Pose,

@@ -51,13 +51,13 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C, of the base and of the other joints; reach mm of the offsets; levers (3,) of base, joints and scale;
-    bandwidth mm of the mean shift, 0 for the mean; how many candidates outlive the base joint.
+    """Rounds C, of the base and of the other joints; reach (J,) mm of the offsets from each joint; levers (3,) of base,
+    joints and scale; bandwidth mm of the mean shift, 0 for the mean; how many candidates outlive the base joint.
     """
 
     base_rounds: int
     rounds: int
-    reach: float
+    reach: Any
     levers: Any
     bandwidth: float
     keep: int
@@ -154,7 +154,7 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
     view, scalars = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32)
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
-        fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach, view)
+        fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
         for c in range(VIEW):
             lanes.views[c * n_lanes + s] = view[c]
         fill_scalars(rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars)
@@ -169,14 +169,28 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
         for joint in range(n_joints):
-            fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach, view)
+            fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
         fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)
         _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
-            explain_pose(heights[i], looks[i], moments[i, 5], rotations[i, k], positions[i, k], scales[i, k], size,
-                         body.unit_mm, body.n_own, body.joints, body.offsets, body.share, body.radius, fit)
+            explain_pose(
+                heights[i],
+                looks[i],
+                moments[i, 5],
+                rotations[i, k],
+                positions[i, k],
+                scales[i, k],
+                size,
+                body.unit_mm,
+                body.n_own,
+                body.joints,
+                body.offsets,
+                body.share,
+                body.radius,
+                fit,
+            )
             _write_scalars(lanes, s, N_SCALARS, fit)
 
 

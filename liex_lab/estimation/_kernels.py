@@ -49,11 +49,13 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     scalars[4] = _MM_UNIT * (rotation[0, 0] * dx + rotation[1, 0] * dy) / size
     scalars[5] = _MM_UNIT * (rotation[0, 1] * dx + rotation[1, 1] * dy) / size
     scalars[6] = _MM_UNIT * position[2] / size
-    scalars[7] = _LOG_UNIT * rotation[2, 0]
-    scalars[8] = _LOG_UNIT * rotation[2, 1]
-    # the sine of twice the angle from the joint's heading to the long axis, without asking for the heading's angle
     c, s = rotation[0, 0], rotation[1, 0]
     norm = max(c * c + s * s, 1e-12)
+    # how steeply the joint rises, over the back where its slope along the long axis is known (else 0)
+    rise = moments[8] * (np.cos(moments[5]) * c + np.sin(moments[5]) * s) / np.sqrt(norm)
+    scalars[7] = _LOG_UNIT * (rotation[2, 0] - rise)
+    scalars[8] = _LOG_UNIT * rotation[2, 1]
+    # the sine of twice the angle from the joint's heading to the long axis, without asking for the heading's angle
     twice = np.sin(2.0 * moments[5]) * (c * c - s * s) - np.cos(2.0 * moments[5]) * 2.0 * s * c
     scalars[9] = _LOG_UNIT * twice / norm * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
     scalars[10] = _LOG_UNIT * np.log(scale / size)
@@ -154,11 +156,13 @@ def place_all(j, parents, offsets, rest, scale, rotations, positions):
 
 @njit(cache=True, parallel=True)
 def look_all(joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars):
-    """Views (n, V, 9) of the given joints and scalars (n, N_SCALARS) of the first of them, for a batch."""
+    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars (n, N_SCALARS) of
+    the first of them, for a batch.
+    """
     for s in prange(scale.size):
         i = image[s]
         for v in range(joints.size):
-            fill_view(rotations[s, joints[v]], positions[s, joints[v]], looks[i], size[s], reach, views[s, v])
+            fill_view(rotations[s, joints[v]], positions[s, joints[v]], looks[i], size[s], reach[v], views[s, v])
         if scalars.shape[1] > 0:
             fill_scalars(rotations[s, joints[0]], positions[s, joints[0]], scale[s], moments[i], size[s], scalars[s])
 

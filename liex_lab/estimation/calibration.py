@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
-from liex_lab.estimation.scoring import LEAST_MM, clue_samples
+from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, clue_samples
 from liex_lab.estimation.training import TrainingSet, quantised
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
@@ -22,7 +22,7 @@ _SIZE_SD = 0.05  # how far off (log) the size of a session is, once it has been 
 _DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
 _GROUP = 50  # images share a size guess, as the frames of a recording do
 _EXPECTATION = GrowthPlan(
-    n_trees=60, max_depth=5, min_leaf=40, n_tests=60, one_probe_share=0.0, scalar_share=1.0, depth_share=0.3,
+    n_trees=120, max_depth=6, min_leaf=40, n_tests=60, one_probe_share=0.0, scalar_share=1.0, depth_share=0.3,
     bag_share=0.5,
 )  # fmt: skip
 _SHRINKAGE = 0.12
@@ -89,18 +89,22 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     """
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
-    target = np.minimum(error, _CAP_MM * model.skeleton.relative_size)[:, None].astype(np.float32)
+    capped = np.minimum(error, _CAP_MM * model.skeleton.relative_size)
+    # errors differ by factors: in millimetres the few that are lost would decide what the forest looks at
+    target = (LOG_UNIT * np.log(capped))[:, None].astype(np.float32)
     n = len(error)
     fold, predicted = rng.permutation(n) % _FOLDS, np.empty(n)
     for k in range(_FOLDS):
         seen, unseen = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
         forest = boost_forest(_rows(trial.clues, seen), target[seen], _EXPECTATION, _SHRINKAGE, rng)
-        predicted[unseen] = predict(forest, _rows(trial.clues, unseen))[:, 0]
-    predicted = np.maximum(predicted, LEAST_MM * model.skeleton.relative_size)
+        predicted[unseen] = np.exp(predict(forest, _rows(trial.clues, unseen))[:, 0] / LOG_UNIT)
+    gain = capped.mean() / predicted.mean()  # from the middle of what to expect to its mean
+    predicted = np.maximum(gain * predicted, LEAST_MM * model.skeleton.relative_size)
     low, high = np.quantile(error / predicted, [0.05, 0.95])
-    expectation = quantised(boost_forest(_rows(trial.clues, np.arange(n)), target, _EXPECTATION, _SHRINKAGE, rng))
+    shifted = target + np.float32(LOG_UNIT * np.log(gain))
+    expectation = quantised(boost_forest(_rows(trial.clues, np.arange(n)), shifted, _EXPECTATION, _SHRINKAGE, rng))
     design = np.stack([np.ones(n), trial.score, trial.spread], axis=1)
-    line, *_ = np.linalg.lstsq(design, target[:, 0], rcond=None)
+    line, *_ = np.linalg.lstsq(design, capped, rcond=None)
     calibration = Calibration(
         offset=float(line[0]),
         slope=float(line[1]),
@@ -109,5 +113,6 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
         joint_share=tuple(float(x) for x in np.median(trial.joint_error, axis=0) / np.median(error)),
         doubtful_mm=float(np.quantile(predicted, _DOUBTFUL_SHARE)),
         area_mm2=model.calibration.area_mm2,
+        logarithmic=True,
     )
     return replace(model, expectation=expectation, calibration=calibration)

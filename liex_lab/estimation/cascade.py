@@ -91,7 +91,8 @@ class Cascade:
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
         kernels.look_all(
-            np.array(joints), images.looks, images.moments, candidates.image, candidates.size, self.method.reach_mm,
+            np.array(joints), images.looks, images.moments, candidates.image, candidates.size,
+            self.method.reaches(self.skeleton.n_joints)[joints],
             candidates.rotations, candidates.positions, candidates.scale, views, scalars,
         )  # fmt: skip
         inverse_size = (1.0 / candidates.size).astype(np.float32)

@@ -36,14 +36,11 @@ _MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weig
 
 @dataclass(frozen=True)
 class Estimates:
-    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as `Chosen`; found (n,); looks
-    (n, 17): how the crops were cut.
-    """
+    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as `Chosen`; found (n,)."""
 
     chosen: Chosen
     found: NDArray[np.bool_]
     crops: Crops
-    looks: Array
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,7 @@ class PoseEstimator:
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.Tuning(
-            method.rounds_of(0), method.rounds, method.reach_mm,
+            method.rounds_of(0), method.rounds, method.reaches(self.skeleton.n_joints),
             np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
             min(keep or n_starts, n_starts),
         )  # fmt: skip
@@ -157,7 +154,7 @@ class PoseEstimator:
                            positions[usable], scores[usable], parallel)  # fmt: skip
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops, looks)
+        return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops)
 
     def pick(
         self, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, rotations: Array, positions: Array,

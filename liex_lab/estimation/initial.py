@@ -14,6 +14,7 @@ _BEHIND = 0.42  # of the body length: the base starts this far from the centroid
 _HIGH = 0.2  # of the body length: the base starts this high above the floor
 _LOW = 0.05  # of the body length: the base of an animal in the camera view starts this far below its mean height
 _JITTER = (0.12, 0.7)  # rad: spread of the headings of a long thin animal, and what a round one adds
+_JITTER_RISE = 0.03  # rad, at most
 _JITTER_MM = 2.0  # of the places, for an animal of the reference length
 
 
@@ -30,11 +31,12 @@ def start_poses(
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n animals.
 
-    moments (n, 8) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of the animal over home.
+    moments (n, 9) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of the animal over home.
     axis_start: along the animal's long axis, every other start the other way round, the more spread out the rounder
     the animal looks (METHOD lesson 8). Otherwise the paper's start: any heading in (-pi, pi), the base at the centroid
-    and at the animal's mean height, bones scaled by 0.9 to 1.1. camera_view: heights are not those above a floor.
-    home_turn: rotation vector by which the home pose lies otherwise than seen from above, as a palm that is shown.
+    and at the animal's mean height, bones scaled by 0.9 to 1.1. camera_view: heights are not those above a floor, and
+    such an animal, started along its axis, rises or sinks as its back does. home_turn: rotation vector by which the
+    home pose lies otherwise than seen from above, as a palm that is shown.
     """
     n, k = size.shape
     starts = np.broadcast_to(starts, (n, k, 4))
@@ -61,6 +63,20 @@ def start_poses(
     rotation[..., 0, 0], rotation[..., 0, 1] = np.cos(heading), -np.sin(heading)
     rotation[..., 1, 0], rotation[..., 1, 1] = np.sin(heading), np.cos(heading)
     rotation[..., 2, 2] = 1.0
+    if axis_start and camera_view:
+        rise = np.arctan(moments[:, None, 8]) * (1.0 - 2.0 * (np.arange(k) % 2)) + _JITTER_RISE * starts[..., 3]
+        rotation = rotation @ _lifted(rise)
+        # the base lies ahead of or behind the middle of the animal
+        position[..., 2] -= behind * np.sin(rise)
     if any(home_turn):
         rotation = rotation @ so3.exp(np.array(home_turn))
     return rotation, position, scale
+
+
+def _lifted(rise: Array) -> Array:
+    """Rotations (..., 3, 3) that lift a body's front by `rise` (...) rad."""
+    rotation = np.zeros((*rise.shape, 3, 3))
+    rotation[..., 0, 0], rotation[..., 0, 2] = np.cos(rise), -np.sin(rise)
+    rotation[..., 2, 0], rotation[..., 2, 2] = np.sin(rise), np.cos(rise)
+    rotation[..., 1, 1] = 1.0
+    return rotation

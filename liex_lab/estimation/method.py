@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.forests.grow import GrowthPlan
@@ -44,6 +47,7 @@ class Method:
     scale_lever_mm: float = 50.0
     survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
     pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
+    base_reach_mm: float = 0.0  # offsets reach this far from the base joint; 0: as far as from the others
     home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotation vector by which starts are turned out of the home pose
     proposals: GrowthPlan | None = None  # trees that say where a start may be, for an animal of any orientation
     proposal_reach_mm: float = 0.0  # offsets of their features reach this far from the animal's centre
@@ -55,9 +59,15 @@ class Method:
         """Rounds of a joint."""
         return self.base_rounds or self.rounds if joint == 0 else self.rounds
 
+    def reaches(self, n_joints: int) -> NDArray[np.float64]:
+        """How far (J,) mm offsets reach from each joint."""
+        reach = np.full(n_joints, self.reach_mm)
+        reach[0] = self.base_reach_mm or self.reach_mm
+        return reach
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the model file and its card."""
-        return asdict(self)
+        """Plain values, for the model file and its card; what only some animals have is left out where it is unset."""
+        return {name: value for name, value in asdict(self).items() if name not in _UNSET or value != _UNSET[name]}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Method:
@@ -67,12 +77,16 @@ class Method:
         plain["metric"] = GrowthPlan(**plain["metric"])
         if plain.get("pruner"):
             plain["pruner"] = GrowthPlan(**plain["pruner"])
-        plain["home_turn"] = tuple(plain.get("home_turn", (0.0, 0.0, 0.0)))
+        plain["home_turn"] = tuple(plain.get("home_turn", _UNSET["home_turn"]))
         if plain.get("proposals") is not None:
             plain["proposals"] = GrowthPlan(**plain["proposals"])
         return Method(**plain)
 
 
+_UNSET: dict[str, Any] = {
+    "home_turn": (0.0, 0.0, 0.0), "proposals": None, "proposal_reach_mm": 0.0, "base_rounds": 0, "refine_steps": 0,
+    "explains": False,
+}  # fmt: skip
 _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
@@ -112,6 +126,10 @@ _HAND: dict[str, Any] = {
 
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
+    ("fish", "default"): {
+        "rounds": 3, "training_candidates": 5, "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
+        "reach_mm": 12.5, "keep_off_mm": 4.0, "top_tau": 0.25, "top_radius_mm": 4.5, "base_lever_mm": 10.0,
+    },
     ("fish", "paper"): {
         "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
     },
@@ -122,8 +140,8 @@ _OWN: dict[tuple[str, str], dict[str, Any]] = {
     },
 }  # fmt: skip
 _LENGTHS = (
-    "reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm", "joint_lever_mm",
-    "scale_lever_mm",
+    "reach_mm", "base_reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm",
+    "joint_lever_mm", "scale_lever_mm",
 )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ class Calibration:
     error = offset + slope * score + spread_slope * spread, mm at home size; quantiles (2,): the ratio of true to
     predicted error that 5 % and 95 % of the images stay below; joint_share (J,): each joint's error over the mean;
     doubtful_mm: a predicted error above this, at home size, is flagged; area_mm2: usual area of a home-sized animal
-    seen from above.
+    seen from above; logarithmic: the expectation forest predicts LOG_UNIT times the logarithm of the error.
     """
 
     offset: float = 0.0
@@ -46,6 +46,7 @@ class Calibration:
     joint_share: tuple[float, ...] = ()
     doubtful_mm: float = 10.0
     area_mm2: float = 1300.0
+    logarithmic: bool = False
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def views_along_axis(images: ImageSet, size: Array, reach_mm: float) -> tuple[Sa
     # which way is which: some foregrounds know where an animal's long axis points
     ways = (1000.0 - 2000.0 * (np.arange(N_WAYS * m) % N_WAYS)).astype(np.float32)
     kernels.look_all(
-        np.zeros(1, np.int64), images.looks, images.moments, image, each, reach_mm, rotation[:, None],
+        np.zeros(1, np.int64), images.looks, images.moments, image, each, np.array([reach_mm]), rotation[:, None],
         position[:, None], each, views, scalars,
     )  # fmt: skip
     told = np.column_stack([scalars, ways])

@@ -67,4 +67,3 @@ class Refiner:
             np.full(n, size), b.unit_mm, b.n_own, b.joints, b.offsets, b.share, b.radius, out,
         )  # fmt: skip
         return out.astype(float)
-

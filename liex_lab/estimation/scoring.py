@@ -17,6 +17,7 @@ from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
 
+LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
 # at the reference length: the least error that is ever expected, and what stands for the score of the opposite
 # direction where no candidate points there
 LEAST_MM, _NO_OPPOSITE_MM = 0.1, 40.0
@@ -118,7 +119,8 @@ def with_expected_error(chosen: Chosen, model: Model, moments: Array, looks: Arr
     n = len(chosen.score)
     samples = clue_samples(chosen, model.skeleton, moments, looks, size)
     least = LEAST_MM * model.skeleton.relative_size
-    error = np.maximum(predict(model.expectation, samples)[:n, 0].astype(float), least) * size
+    said = predict(model.expectation, samples)[:n, 0].astype(float)
+    error = np.maximum(np.exp(said / LOG_UNIT) if model.calibration.logarithmic else said, least) * size
     scale = error / chosen.error_mm
     return replace(chosen, error_mm=error, sd_mm=chosen.sd_mm * scale[:, None])
 
@@ -138,7 +140,7 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
             10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
             5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
             moments[:, 6] / whole, moments[:, 7] / whole, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
-            *chosen.fit.T / 50,
+            *chosen.sd_root.T[3:] / whole, 10 * chosen.sd_angles.sum(axis=(1, 2)), *chosen.fit.T / 50,
         ],
         axis=1,
     )  # fmt: skip

@@ -80,7 +80,7 @@ def open_recording(
 ) -> Recording:
     """Open a depth recording of any format; frames are read when asked for.
 
-    path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual mouse (see `open_synthetic`); camera:
+    path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see `open_synthetic`); camera:
     comes before whatever the files state, a `Lens` for pictures of any size; fps: used only where the files hold no
     time stamps; topic: of an MCAP file or a ROS bag with several depth topics; strict: refuse a recording that is cut
     short, instead of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an
@@ -107,7 +107,7 @@ def open_recording(
 
 def _open(path: Path, how: _How) -> Recording:
     if str(path).startswith("synthetic:"):
-        from liex_lab.recordings.walking import open_synthetic
+        from liex_lab.recordings.virtual import open_synthetic
 
         return open_synthetic(str(path), how.camera)
     if not path.exists():

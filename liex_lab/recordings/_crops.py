@@ -8,16 +8,17 @@ from numba import njit, prange
 from liex_lab.recordings import _segment as segment
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
+BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
 
 @njit(cache=True, parallel=True)
-def blob_areas(depths, limit, on_floor, mm2_per_px, areas):
+def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
     """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
     for k in prange(depths.shape[0]):
         labels = np.empty((depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32)
         blobs = np.empty((segment.MAX_BLOBS, 7))
-        for slot in range(segment.label_blobs(depths[k], limit, on_floor, labels, blobs)):
+        for slot in range(segment.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)):
             if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
                 areas[k, slot] = blob_area(blobs[slot], mm2_per_px)
 
@@ -62,27 +63,26 @@ def extract_one(
     labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
     blobs = np.empty((segment.MAX_BLOBS, 7))
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
-    n_found = segment.label_blobs(depth, limit, on_floor, labels, blobs)
+    bridge = BRIDGE if behind_mm > 0.0 else 0
+    n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     slot, n_blobs[k] = choose_blob(blobs, n_found, area, mm2_per_px, rank)
     if slot < 0:
         return
     blob = blobs[slot]
     mean_depth = blob[5] / blob[0]
-    view_plane = plane
-    if behind_mm > 0.0:
-        distance[k] = mean_depth + behind_mm
-        view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
-    cut_crop(depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, view_plane, distance[k], rotation,
-             heights, origin, n_steps, moments, k)  # fmt: skip
+    cut_crop(depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, rotation, behind_mm, heights,
+             origin, n_steps, moments, distance, k)  # fmt: skip
     n_px[k] = int(blob[0])
 
 
 @njit(cache=True)
 def cut_crop(
-    depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, distance, rotation, heights, origin,
-    n_steps, moments, k,
+    depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, moments, distance, k,
 ):  # fmt: skip
-    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k."""
+    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k; distance[k] moves to behind
+    the animal where heights are measured along the optical axis.
+    """
     crop = heights.shape[1]
     v0, v1 = blob[1] * segment.BLOCK, (blob[2] + 1) * segment.BLOCK
     u0, u1 = blob[3] * segment.BLOCK, (blob[4] + 1) * segment.BLOCK
@@ -92,12 +92,21 @@ def cut_crop(
     origin[k, 1] = int((v0 + v1) / 2 - step * crop / 2)
     n_steps[k] = step
     raw = np.empty((crop, crop), np.float32)
-    segment.cut_heights(depth, limit, labels, slot, plane, distance, origin[k], step, raw)
+    view_plane = plane
+    if behind_mm > 0.0:  # first from far behind, for the blob's mean depth is that of all that hangs together
+        distance[k] = mean_depth + 8.0 * behind_mm
+        view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
+    segment.cut_heights(depth, limit, labels, slot, view_plane, distance[k], origin[k], step, raw)
     segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    if behind_mm > 0.0:
+        distance[k] += segment.level_heights(raw, behind_mm)
+        view_plane[2] = 1.0 / distance[k]
     mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])
-    segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance, moments[k])
+    segment.blob_moments(heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k])
+    if behind_mm > 0.0:
+        moments[k, 8] = segment.back_slope(heights[k], origin[k], step, intrinsics, distance[k], moments[k])
 
 
 @njit(cache=True, parallel=True)
@@ -123,6 +132,6 @@ def extract_windows(
                 if behind == 0.0:
                     inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
                     behind = 1.0 / inverse if inverse > 1e-6 else 0.0
-                limit[v, u] = max(behind - margin, 0.0)
+                limit[v, u] = max(behind - margin[k], 0.0)
         extract_one(depths[k], limit, everywhere, area[k], rank, smooth_mm[k], intrinsics[k], plane[k], rotation[k],
                     behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip

@@ -1,7 +1,6 @@
-"""Numba kernels that find the hand that is held out nearest to the camera, cut it from its arm, and cut its height map.
+"""Numba kernels that cut the hand at an end of a surface from its arm, and its height map from the picture.
 
-Arrays that all of them share: blocks (h, w) float32, the depth in mm of what is nearest in every block of BLOCK x BLOCK
-pixels, 0 = nothing within range; labels (h, w) int32, which surface a block belongs to, -1 none.
+blocks and labels are those of `_ends`.
 """
 
 from __future__ import annotations
@@ -10,225 +9,25 @@ import numpy as np
 from numba import njit, prange
 
 from liex_lab.recordings import _segment as segment
+from liex_lab.recordings._ends import (
+    AROUND_MM,
+    MAX_SURFACES,
+    block_depths,
+    label_surfaces,
+    nearest_ends,
+    point_of_block,
+)
 from liex_lab.recordings._segment import BLOCK
 
-MAX_SURFACES = 24
-_MIN_IN_BLOCK = 5
-_THICK_MM = 25.0  # readings of one block this far behind its nearest belong to something else
-_JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
-MAX_TIPS = 256
-_STICKS_OUT_MM = 90.0  # of a home-sized hand: an end of a surface stands out by this, which an elbow does not
-_WORTH_MM, _MOST_OUT = 60.0, 3.0  # sticking out once more as far is worth being nearer by this, up to so often
-_TIP_MM = 60.0  # and this much of it is where the hand is first taken to be
-_MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
+_TIP_MM = 60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
 _AS_NEAR_MM = 150.0  # a second end is worth a look while it is not farther behind the first
 _LEAST_MM2 = 2500.0  # no hand is smaller
-# of a home-sized hand, mm: how far its points and the beginning of its arm lie from its middle, and its length
-_AROUND_MM, _LENGTH_MM = 190.0, 185.0
-_SHELL = 0.75  # the outer part of that sphere, where only the arm is
+_LENGTH_MM = 185.0  # of a home-sized hand
+_SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
 _SHELL_MM2 = 900.0
 _BIN_MM = 5.0
 _RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
 FIELDS = 8  # of a find: middle x y z, direction of the fingers x y z, where along it the arm is cut, area
-
-
-@njit(cache=True)
-def block_depths(depth, near, far, blocks):
-    """Fill `blocks` from depth (H, W) mm."""
-    for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
-            first, second = np.float32(1e9), np.float32(1e9)
-            for r in range(i * BLOCK, i * BLOCK + BLOCK):
-                for c in range(j * BLOCK, j * BLOCK + BLOCK):
-                    z = depth[r, c]
-                    if near < z < far:
-                        if z < first:
-                            first, second = z, first
-                        elif z < second:
-                            second = z
-            total, n = 0.0, 0
-            if second < 1e8:
-                for r in range(i * BLOCK, i * BLOCK + BLOCK):
-                    for c in range(j * BLOCK, j * BLOCK + BLOCK):
-                        z = depth[r, c]
-                        if near < z < second + _THICK_MM:
-                            total += z
-                            n += 1
-            blocks[i, j] = total / n if n >= _MIN_IN_BLOCK else 0.0
-
-
-@njit(cache=True)
-def label_surfaces(blocks, labels, focal2, least_mm2, areas):
-    """Connected surfaces of at least `least_mm2`: labels, and areas (MAX_SURFACES,) mm^2. Returns how many.
-
-    focal2: fx * fy. Where there are more than fit, the largest are kept.
-    """
-    n_rows, n_columns = blocks.shape
-    for i in range(n_rows):
-        for j in range(n_columns):
-            labels[i, j] = -2 if blocks[i, j] > 0 else -1
-    stack = np.empty((n_rows * n_columns, 2), np.int32)
-    n_surfaces = 0
-    for i in range(n_rows):
-        for j in range(n_columns):
-            if labels[i, j] != -2:
-                continue
-            stack[0, 0], stack[0, 1] = i, j
-            labels[i, j] = MAX_SURFACES
-            at, top, area = 0, 1, 0.0
-            while at < top:
-                r, c = stack[at, 0], stack[at, 1]
-                at += 1
-                here = blocks[r, c]
-                area += BLOCK * BLOCK * here * here / focal2
-                for a in range(max(r - 1, 0), min(r + 2, n_rows)):
-                    for b in range(max(c - 1, 0), min(c + 2, n_columns)):
-                        if labels[a, b] == -2 and abs(blocks[a, b] - here) < _JUMP_MM:
-                            labels[a, b] = MAX_SURFACES
-                            stack[top, 0], stack[top, 1] = a, b
-                            top += 1
-            slot = -1
-            if area >= least_mm2:
-                slot = n_surfaces if n_surfaces < MAX_SURFACES else int(np.argmin(areas))
-                if n_surfaces < MAX_SURFACES:
-                    n_surfaces += 1
-                elif areas[slot] > area:
-                    slot = -1
-                else:
-                    segment.forget(labels, slot)
-            for k in range(top):
-                labels[stack[k, 0], stack[k, 1]] = slot
-            if slot >= 0:
-                areas[slot] = area
-    return n_surfaces
-
-
-@njit(cache=True)
-def walk(blocks, labels, slot, position, order, hops):
-    """All blocks of a surface in the order of their distance, in steps, from where it leaves the picture.
-
-    A surface that does not leave it is walked from its farthest block. order (n, 2) gets the blocks, hops (n,) their
-    distances, position (h, w) where in the order a block is; it comes in as -1. Returns how many blocks there are.
-    """
-    n, deepest, nearest, far_border = 0, np.float32(0.0), np.float32(1e9), np.float32(0.0)
-    far_i, far_j = -1, -1
-    last_i, last_j = labels.shape[0] - 1, labels.shape[1] - 1
-    for i in range(last_i + 1):
-        for j in range(last_j + 1):
-            if labels[i, j] == slot:
-                nearest = min(nearest, blocks[i, j])
-                if blocks[i, j] > deepest:
-                    deepest, far_i, far_j = blocks[i, j], i, j
-                if min(i, j, last_i - i, last_j - j) < _MARGIN:
-                    far_border = max(far_border, blocks[i, j])
-    # a hand may touch the border, too; the arm is farther away
-    arm = 0.5 * (nearest + far_border)
-    for i in range(last_i + 1):
-        for j in range(last_j + 1):
-            on_border = min(i, j, last_i - i, last_j - j) < _MARGIN
-            if on_border and labels[i, j] == slot and blocks[i, j] >= arm:
-                order[n, 0], order[n, 1], hops[n], position[i, j] = i, j, 0, n
-                n += 1
-    if n == 0:
-        order[0, 0], order[0, 1], hops[0], position[far_i, far_j] = far_i, far_j, 0, 0
-        n = 1
-    at = 0
-    while at < n:
-        i, j = order[at, 0], order[at, 1]
-        for a in range(max(i - 1, 0), min(i + 2, labels.shape[0])):
-            for b in range(max(j - 1, 0), min(j + 2, labels.shape[1])):
-                near = abs(blocks[a, b] - blocks[i, j]) < _JUMP_MM
-                if labels[a, b] == slot and position[a, b] < 0 and near:
-                    order[n, 0], order[n, 1], hops[n], position[a, b] = a, b, hops[at] + 1, n
-                    n += 1
-        at += 1
-    return n
-
-
-@njit(cache=True)
-def _root(parent, k):
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
-
-
-@njit(cache=True)
-def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
-    """The ends of a walked surface, where it stops after having stuck out by `least_mm`: rows of tips (MAX_TIPS, 4).
-
-    From the far end of the walk inwards, islands appear and grow together; the lower of two islands that meet has stuck
-    out by the difference (its persistence). A row is depth, less for what sticks out far, block row, block column,
-    depth. Returns how many there are now.
-    """
-    parent = np.arange(n)
-    for k in range(n - 1, -1, -1):
-        i, j = order[k, 0], order[k, 1]
-        for a in range(max(i - 1, 0), min(i + 2, blocks.shape[0])):
-            for b in range(max(j - 1, 0), min(j + 2, blocks.shape[1])):
-                other = position[a, b]
-                if other <= k or other >= n or order[other, 0] != a or order[other, 1] != b:
-                    continue
-                mine, theirs = _root(parent, k), _root(parent, other)
-                if mine == theirs:
-                    continue
-                # an island is known by its outermost block, which comes last in the order
-                low, high = min(mine, theirs), max(mine, theirs)
-                parent[low] = high
-                z = blocks[order[low, 0], order[low, 1]]
-                out_mm = (hops[low] - hops[k]) * BLOCK * z / focal
-                if out_mm >= least_mm:
-                    n_tips = _note(tips, n_tips, z, out_mm / least_mm, order[low])
-    i, j = order[n - 1, 0], order[n - 1, 1]
-    return _note(tips, n_tips, blocks[i, j], hops[n - 1] * BLOCK * blocks[i, j] / focal / least_mm, order[n - 1])
-
-
-@njit(cache=True)
-def _note(tips, n_tips, z, out, block):
-    """Add an end at depth z mm that sticks out `out` times as far as an end must."""
-    if n_tips == MAX_TIPS:
-        return n_tips
-    tips[n_tips, 0] = z - _WORTH_MM * min(out, _MOST_OUT)
-    tips[n_tips, 1], tips[n_tips, 2], tips[n_tips, 3] = block[0], block[1], z
-    return n_tips + 1
-
-
-@njit(cache=True)
-def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
-    """Up to `len(chosen)` ends of surfaces, the nearest first, no two of one hand; rows as in `ends`. How many."""
-    focal = np.sqrt(intrinsics[0] * intrinsics[1])
-    n_blocks = blocks.size
-    position = np.full(blocks.shape, -1, np.int32)
-    order, hops = np.empty((n_blocks, 2), np.int32), np.empty(n_blocks, np.int32)
-    tips, n_tips = np.empty((MAX_TIPS, 4)), 0
-    for slot in range(n_surfaces):
-        n = walk(blocks, labels, slot, position, order, hops)
-        n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
-        if n == 1 or hops[1] > 0:  # it does not leave the picture: where the walk began is an end as well
-            n_tips = _note(tips, n_tips, blocks[order[0, 0], order[0, 1]], _MOST_OUT, order[0])
-    ranked = np.argsort(tips[:n_tips, 0])
-    p, q, n_chosen = np.empty(3), np.empty(3), 0
-    for t in ranked:
-        if n_chosen == len(chosen):
-            break
-        _point(blocks, int(tips[t, 1]), int(tips[t, 2]), intrinsics, p)
-        own = True
-        for c in range(n_chosen):
-            _point(blocks, int(chosen[c, 1]), int(chosen[c, 2]), intrinsics, q)
-            off = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
-            own &= off > _AROUND_MM * size
-        if own:
-            chosen[n_chosen] = tips[t]
-            n_chosen += 1
-    return n_chosen
-
-
-@njit(cache=True)
-def _point(blocks, i, j, intrinsics, out):
-    z = blocks[i, j]
-    out[0] = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
-    out[1] = (i * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[3]) / intrinsics[1] * z
-    out[2] = z
 
 
 @njit(cache=True)
@@ -240,9 +39,9 @@ def locate(blocks, labels, tip, size, intrinsics, found):
     focal2 = intrinsics[0] * intrinsics[1]
     p, middle, fingers = np.empty(3), np.empty(3), np.zeros(3)
     slot = labels[int(tip[1]), int(tip[2])]
-    _point(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
+    point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
     _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
-    around, length = _AROUND_MM * size, _LENGTH_MM * size
+    around, length = AROUND_MM * size, _LENGTH_MM * size
     n_bins = int(2.0 * around / _BIN_MM) + 2
     along = np.empty(n_bins)
     cut, area = -1e9, 0.0
@@ -254,7 +53,7 @@ def locate(blocks, labels, tip, size, intrinsics, found):
             for j in range(blocks.shape[1]):
                 if labels[i, j] != slot:
                     continue
-                _point(blocks, i, j, intrinsics, p)
+                point_of_block(blocks, i, j, intrinsics, p)
                 off = np.sqrt((p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2)
                 if _SHELL * around < off < around:
                     w = BLOCK * BLOCK * p[2] * p[2] / focal2
@@ -269,7 +68,7 @@ def locate(blocks, labels, tip, size, intrinsics, found):
         for i in range(blocks.shape[0]):
             for j in range(blocks.shape[1]):
                 if labels[i, j] == slot:
-                    _point(blocks, i, j, intrinsics, p)
+                    point_of_block(blocks, i, j, intrinsics, p)
                     s, off = 0.0, 0.0
                     for k in range(3):
                         s += (p[k] - middle[k]) * fingers[k]
@@ -287,7 +86,7 @@ def locate(blocks, labels, tip, size, intrinsics, found):
         for i in range(blocks.shape[0]):
             for j in range(blocks.shape[1]):
                 if labels[i, j] == slot:
-                    _point(blocks, i, j, intrinsics, p)
+                    point_of_block(blocks, i, j, intrinsics, p)
                     s, off = 0.0, 0.0
                     for k in range(3):
                         s += (p[k] - middle[k]) * fingers[k]
@@ -318,7 +117,7 @@ def _settle(blocks, labels, slot, radius, intrinsics, middle):
     for i in range(blocks.shape[0]):
         for j in range(blocks.shape[1]):
             if labels[i, j] == slot:
-                _point(blocks, i, j, intrinsics, p)
+                point_of_block(blocks, i, j, intrinsics, p)
                 off = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
                 if off < radius * radius:
                     w = p[2] * p[2]
@@ -480,3 +279,10 @@ def fill_looks(intrinsics, origin, step, distance, crop, along_axis, looks):
         looks[k, :4] = intrinsics[k]
         looks[k, 4:13] = rotation.ravel()
         looks[k, 13], looks[k, 14], looks[k, 15], looks[k, 16] = distance[k], origin[k, 0], origin[k, 1], step[k]
+
+
+@njit(cache=True)
+def view_planes(looks, planes):
+    """`view_plane` of looks (n, 17) into planes (n, 3)."""
+    for k in range(len(looks)):
+        planes[k] = view_plane(looks[k, 4:13].reshape(3, 3), looks[k, 13], looks[k, :4])

@@ -9,6 +9,9 @@ BLOCK = 4  # pixels a side; blobs are connected in blocks
 _ROW_STEP = 2  # every other row is looked at: reading a picture takes longer than anything that is done with it
 _MIN_IN_BLOCK = 3  # of the 8 pixels looked at
 MAX_BLOBS = 32
+_MIN_UNREAD = 9  # of 16 pixels
+N_MOMENTS = 9
+_SLOPE_PASSES, _LEVEL_PASSES = 5, 3
 
 
 @njit(cache=True)
@@ -63,8 +66,9 @@ def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
 
 
 @njit(cache=True)
-def label_blobs(depth, limit, on_floor, labels, blobs):
-    """Connected blobs of pixels nearer than `limit` (H, W), in blocks.
+def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
+    """Connected blobs of pixels nearer than `limit` (H, W), in blocks; up to `bridge` blocks without readings do not
+    part them.
 
     labels (H // BLOCK, W // BLOCK) int32 gets the blob of each block, -1 for none. blobs (MAX_BLOBS, 7) gets pixels,
     first and last block row and column, the sum of depths, and the pixels that cover the floor `on_floor` (H, W).
@@ -85,7 +89,7 @@ def label_blobs(depth, limit, on_floor, labels, blobs):
                 count += hits[j * BLOCK + c]
             labels[i, j] = -2 if count >= _MIN_IN_BLOCK else -1
     n_blobs = 0
-    stack = np.empty((n_rows * n_columns, 2), np.int32)
+    stack = np.empty((n_rows * n_columns, 3), np.int32)
     for i in range(n_rows):
         for j in range(n_columns):
             if labels[i, j] != -2:
@@ -96,7 +100,7 @@ def label_blobs(depth, limit, on_floor, labels, blobs):
             else:
                 slot = n_blobs
                 n_blobs += 1
-            _flood(depth, limit, on_floor, labels, i, j, slot, stack, blobs[slot])
+            _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blobs[slot])
     return n_blobs
 
 
@@ -109,17 +113,28 @@ def forget(labels, slot):
 
 
 @njit(cache=True)
-def _flood(depth, limit, on_floor, labels, i, j, slot, stack, blob):
+def _is_unread(depth, row, column):
+    """Whether most of a block has no reading."""
+    n = 0
+    for v in range(row * BLOCK, row * BLOCK + BLOCK):
+        for u in range(column * BLOCK, column * BLOCK + BLOCK):
+            n += depth[v, u] == 0
+    return n >= _MIN_UNREAD
+
+
+@njit(cache=True)
+def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
     """Give every block connected with (i, j) the label `slot`, and count the blob's pixels into `blob` (7,)."""
     blob[0], blob[1], blob[2], blob[3], blob[4], blob[5], blob[6] = 0, i, i, j, j, 0.0, 0
     top = 1
-    stack[0, 0], stack[0, 1] = i, j
+    stack[0, 0], stack[0, 1], stack[0, 2] = i, j, 0
     labels[i, j] = slot
     while top > 0:
         top -= 1
-        row, column = stack[top, 0], stack[top, 1]
-        blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
-        blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
+        row, column, gone = stack[top, 0], stack[top, 1], stack[top, 2]
+        if gone == 0:
+            blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
+            blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
         for v in range(row * BLOCK, row * BLOCK + BLOCK):
             for u in range(column * BLOCK, column * BLOCK + BLOCK):
                 z = depth[v, u]
@@ -130,9 +145,12 @@ def _flood(depth, limit, on_floor, labels, i, j, slot, stack, blob):
         for di in range(-1, 2):
             for dj in range(-1, 2):
                 a, b = row + di, column + dj
-                if 0 <= a < labels.shape[0] and 0 <= b < labels.shape[1] and labels[a, b] == -2:
+                if not (0 <= a < labels.shape[0] and 0 <= b < labels.shape[1]):
+                    continue
+                on = labels[a, b] == -2
+                if on or (labels[a, b] == -1 and gone < bridge and _is_unread(depth, a, b)):
                     labels[a, b] = slot
-                    stack[top, 0], stack[top, 1] = a, b
+                    stack[top, 0], stack[top, 1], stack[top, 2] = a, b, 0 if on else gone + 1
                     top += 1
 
 
@@ -226,6 +244,30 @@ def keep_largest(raw, runs):
 
 
 @njit(cache=True)
+def level_heights(raw, behind_mm):
+    """Lift all heights of raw (S, S) so that their mean, without what lies farther than behind_mm from it, becomes
+    behind_mm; what is then not above 0 is background. Returns the lift, mm.
+    """
+    mean, reach = 0.0, np.inf
+    for _ in range(_LEVEL_PASSES):
+        total, n = 0.0, 0
+        for r in range(raw.shape[0]):
+            for c in range(raw.shape[1]):
+                if raw[r, c] >= 0.0 and abs(raw[r, c] - mean) <= reach:
+                    total += raw[r, c]
+                    n += 1
+        mean, reach = total / max(n, 1), behind_mm
+    lift = behind_mm - mean
+    for r in range(raw.shape[0]):
+        for c in range(raw.shape[1]):
+            if raw[r, c] >= 0.0:
+                raw[r, c] += lift
+                if raw[r, c] <= 0.0:
+                    raw[r, c] = -1.0
+    return lift
+
+
+@njit(cache=True)
 def smooth_heights(raw, radius, out):
     """Box-filtered heights in 1/16 mm, int16, into out (S, S): background 0, holes filled from what surrounds them.
 
@@ -270,11 +312,11 @@ def smooth_heights(raw, radius, out):
 
 @njit(cache=True)
 def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments):
-    """Mass, area and axes of an animal from its height map, in the arena frame, into moments (8,).
+    """Mass, area and axes of an animal from its height map, in the arena frame, into moments (N_MOMENTS,).
 
     moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of the long axis
-    (mod pi), and the standard deviations mm along and across it. intrinsics (fx, fy, cx, cy); rotation (3, 3) of
-    T_arena_camera, whose translation is (0, 0, distance).
+    (mod pi), the standard deviations mm along and across it, and 0, where `back_slope` may go. intrinsics (fx, fy, cx,
+    cy); rotation (3, 3) of T_arena_camera, whose translation is (0, 0, distance).
     """
     n, area, volume = 0, 0.0, 0.0
     sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -299,7 +341,7 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
             sxx += w * x * x
             sxy += w * x * y
             syy += w * y * y
-    for k in range(8):
+    for k in range(N_MOMENTS):
         moments[k] = 0.0
     if n == 0:
         return
@@ -309,3 +351,47 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     half, root = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
     moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = n, area, volume, mx, my, angle
     moments[6], moments[7] = np.sqrt(max(half + root, 0.0)), np.sqrt(max(half - root, 0.0))
+
+
+@njit(cache=True)
+def back_slope(heights, origin, step, intrinsics, distance, moments):
+    """How steeply the back rises along the long axis, of a height map that was cut along the optical axis.
+
+    A straight line through the heights, in which readings far off it count less with every pass (Geman and McClure's
+    weights), for a light field errs grossly in patches. moments: see `blob_moments`.
+    """
+    size = heights.shape[0]
+    along, height = np.empty(size * size), np.empty(size * size)
+    c, s, n = np.cos(moments[5]), np.sin(moments[5]), 0
+    for r in range(1, size - 1):
+        for k in range(1, size - 1):
+            if heights[r, k] > 0:
+                z = distance - heights[r, k] / 16.0
+                x = (origin[0] + step * k - intrinsics[2]) / intrinsics[0] * z
+                y = -(origin[1] + step * r - intrinsics[3]) / intrinsics[1] * z
+                along[n], height[n] = c * (x - moments[3]) + s * (y - moments[4]), heights[r, k] / 16.0
+                n += 1
+    level, slope, scale = 0.0, 0.0, np.inf
+    for _ in range(_SLOPE_PASSES):
+        sw, sx, sh, sxx, sxh = 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(n):
+            off = (height[i] - level - slope * along[i]) / scale
+            w = 1.0 / (1.0 + off * off) ** 2
+            sw += w
+            sx += w * along[i]
+            sh += w * height[i]
+            sxx += w * along[i] * along[i]
+            sxh += w * along[i] * height[i]
+        spread = sw * sxx - sx * sx
+        if spread <= 1e-9:
+            return slope
+        slope = (sw * sxh - sx * sh) / spread
+        level = (sh - slope * sx) / sw
+        total, weight = 0.0, 0.0
+        for i in range(n):
+            off = abs(height[i] - level - slope * along[i])
+            w = 1.0 if scale == np.inf else 1.0 / (1.0 + (off / scale) ** 2)
+            total += w * off
+            weight += w
+        scale = max(2.0 * total / weight, 1e-3)
+    return slope

@@ -20,7 +20,7 @@ SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
 KIND, NOISE, EROSION, FUR, BIAS, HOLES, DARK, SIDE, SMOOTH, WHITE, LUMPS, EDGE_DROP, GRID, JITTER, FLYING = range(15)
 UNIT, BACKGROUND, OUTLIERS = 15, 16, 17  # mm a step of the picture; error of a learned background; outliers' rarity
 N_PARAMETERS = 18
-_TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
+TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
 
 _TABLE_BITS = 13
 _SHIFT = 64 - _TABLE_BITS
@@ -255,18 +255,18 @@ def light_field(depth, what, p, state, table, out):
     smooth_field(state, table, 1.0 * p[GRID], wrong)
     smooth_field(state, table, 1.5 * p[GRID], move_u)
     smooth_field(state, table, 1.5 * p[GRID], move_v)
-    strength = p[NOISE]
+    strength, jitter, per_mm, per_step = p[NOISE], np.float32(p[JITTER]), 1.0 / TYPICAL_MM, 1.0 / p[UNIT]
     for v in range(height):
         for u in range(width):
-            row = min(max(v + int(round(p[JITTER] * move_v[v, u])), 0), height - 1)
-            column = min(max(u + int(round(p[JITTER] * move_u[v, u])), 0), width - 1)
+            row = min(max(int(v + jitter * move_v[v, u] + np.float32(0.5)), 0), height - 1)
+            column = min(max(int(u + jitter * move_u[v, u] + np.float32(0.5)), 0), width - 1)
             z, here = depth[row, column], depth[v, u]
             if p[SIDE] > 0.0 and here > 0.0 and here < z:  # a near surface grows outwards only
                 z = here
             if z <= 0.0:
                 out[v, u] = 0
                 continue
-            spread = strength * (z / _TYPICAL_MM) ** 2
+            spread = strength * (z * per_mm) * (z * per_mm)
             animal = what[row, column] == ANIMAL
             if blank[v, u] + 0.3 * fine[v, u] < (p[DARK] if animal else p[HOLES]):
                 if p[FLYING] < 0.5:
@@ -276,7 +276,7 @@ def light_field(depth, what, p, state, table, out):
             if abs(wrong[v, u]) > p[OUTLIERS] - 0.25 * (strength - 1.0):
                 z += 12.0 * wrong[v, u] * (0.3 + uniform(state))
             z += spread * (p[SMOOTH] * (0.7 * fine[v, u] + 0.7 * coarse[v, u]) + p[WHITE] * normal(state, table))
-            out[v, u] = int(z / p[UNIT] + 0.5) if z > 0.0 else 0
+            out[v, u] = int(z * per_step + 0.5) if z > 0.0 else 0
 
 
 @njit(cache=True)

@@ -12,6 +12,7 @@ from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.camera import Camera
 from liex_lab.geometry import SE3
 from liex_lab.recordings import _crops as kernels
+from liex_lab.recordings._segment import N_MOMENTS
 from liex_lab.recordings.arena import Floor
 
 Array = NDArray[np.float64]
@@ -26,9 +27,10 @@ class Crops:
     heights (n, CROP, CROP) int16, 1/16 mm above the floor, 0 = not the animal; origin (n, 2) picture pixel (u, v) of
     crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,) readings on the animal, 0 = not found; n_blobs
     (n,) how many things in the frame have about the animal's size;
-    moments (n, 8): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), and the standard
-    deviation mm along and across it, all in the view frame. The view frame is the arena frame, or (camera_view) an
-    upright frame whose z axis is the optical axis backwards; its origin is `distance` (n,) mm in front of the camera.
+    moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), the standard
+    deviation mm along and across it, and (camera_view, else 0) the slope of the back along it, all in the view frame.
+    The view frame is the arena frame, or (camera_view) an upright frame whose z axis is the optical axis backwards; its
+    origin is `distance` (n,) mm in front of the camera.
     """
 
     heights: NDArray[np.int16]
@@ -53,6 +55,12 @@ class Crops:
         """(n,) True where an animal is in view."""
         return self.n_px > 0
 
+    @property
+    def centroid(self) -> Array:
+        """The middle (n, 3) mm of the animal's mass, at its mean height, in the view frame."""
+        moments = self.moments
+        return np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
+
 
 class Foreground(Protocol):
     """What finds the animal in the pictures of one camera: `foreground.Scene`, or `nearest.NearestScene`."""
@@ -76,6 +84,12 @@ class Foreground(Protocol):
 
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17)."""
+
+    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+
+    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
 
     def misfit(self, crops: Crops) -> Array:
         """How unlike the animal each crop (n) is."""
@@ -113,27 +127,33 @@ class Windows:
         return Floor.from_inverse_depth(self.inverse_depth[k], Camera(fx, fy, cx, cy, 1, 1))
 
     def extract(
-        self, size: Array, area_mm2: Array, min_height_mm: float = 7.0, camera_view: bool = False, rank: int = 0
+        self,
+        size: Array,
+        area_mm2: Array,
+        min_height_mm: Array | float = 7.0,
+        camera_view: bool = False,
+        rank: int = 0,
     ) -> tuple[Crops, Array]:
         """The blobs of each window whose areas are nearest to area_mm2 (n,), by rank, and their looks (n, 17); see
-        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home.
+        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home; min_height_mm: one, or (n,).
         """
         n = len(self.depth)
         crops = Crops(
             np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, 8)), np.empty(n), np.zeros(n, np.int64),
+            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.empty(n), np.zeros(n, np.int64),
         )  # fmt: skip
         # a window is the picture of a camera whose centre is shifted
         intrinsics, plane = self.intrinsics.copy(), self.inverse_depth.copy()
         intrinsics[:, 2:] -= self.origin
         plane[:, 2] += plane[:, 0] * self.origin[:, 0] + plane[:, 1] * self.origin[:, 1]
+        margin = np.broadcast_to(np.asarray(min_height_mm, np.float32), (n,)).copy()
         rotation = np.empty((n, 3, 3))
         for k in range(n):
             floor = self.floor(k)
             crops.distance[k] = floor.distance_mm
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
         kernels.extract_windows(
-            self.depth, self.background, np.float32(min_height_mm), area_mm2, rank, self.view.smooth_mm * size,
+            self.depth, self.background, margin, area_mm2, rank, self.view.smooth_mm * size,
             intrinsics, plane, rotation, (self.view.behind_mm if camera_view else 0.0) * size, crops.heights,
             crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
         )  # fmt: skip

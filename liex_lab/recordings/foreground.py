@@ -12,7 +12,7 @@ from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
 from liex_lab.recordings import _crops as kernels
-from liex_lab.recordings._segment import MAX_BLOBS
+from liex_lab.recordings._segment import MAX_BLOBS, N_MOMENTS
 from liex_lab.recordings.arena import Floor, find_floor
 from liex_lab.recordings.background import floor_region, learn_background, sample_frames, stride_for
 from liex_lab.recordings.crops import CROP, Crops, Windows
@@ -23,7 +23,7 @@ __all__ = ["CROP", "Crops", "Scene", "Windows", "floor_region", "learn_backgroun
 
 Array = NDArray[np.float64]
 
-_SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
+SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
 _AREA_SD, _VOLUME_SD = 0.25, 0.2  # of the logarithms, from posture to posture of one animal
 _TOUCH_SHARE = 0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
 
@@ -90,9 +90,11 @@ class Scene:
         background = np.where((background == 0) & on_floor, bare, background)
         # the rims and walls around the floor flicker between near and far: there, nearer than ever is what counts
         behind = np.where(on_floor, background, near)
-        margin = np.maximum(np.float32(min_height_mm), np.float32(_SPREADS) * spread)
+        margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
         limit = np.maximum(behind - margin, 0).astype(np.float32)
-        scene = Scene(recording.camera, floor, background, limit, on_floor, view=view, stride=stride)
+        stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
+        over = on_floor if stands else np.ones_like(on_floor)
+        scene = Scene(recording.camera, floor, background, limit, over, view=view, stride=stride)
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit).astype(np.float32)
@@ -100,7 +102,7 @@ class Scene:
             still_area, still_share = still.usual_area(sample, spine_mm)
             if still_share > share:
                 scene, area, share = still, still_area, still_share
-        else:
+        elif stands:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
         if share == 0.0:
             raise EstimationError(
@@ -152,7 +154,8 @@ class Scene:
         One object of constant size is in (nearly) every frame, the animal; other things come and go or differ.
         """
         areas = np.zeros((len(depths), MAX_BLOBS))
-        kernels.blob_areas(depths, self.limit, self.on_floor, 1.0 / (self.grid.fx * self.grid.fy), areas)
+        bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
+        kernels.blob_areas(depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas)
         low, high = self.view.area[0] * spine_mm[0] ** 2, self.view.area[1] * spine_mm[1] ** 2
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
@@ -192,6 +195,22 @@ class Scene:
         """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame."""
         return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
 
+    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+        if not camera_view:
+            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
+        level = np.zeros((len(crops.step), 3))
+        level[:, 2] = 1.0 / crops.distance
+        return level
+
+    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+        middle = crops.centroid
+        if camera_view:  # the view's frame is not the arena's
+            middle[:, 2] -= crops.distance
+            middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
+        return middle
+
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""
         looks = np.empty((len(crops.step), 17))
@@ -217,7 +236,7 @@ class Scene:
             depths = depths[:, :: self.stride, :: self.stride]
         crops = Crops(
             np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, 8)), np.full(n, self.floor.distance_mm), np.zeros(n, np.int64),
+            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.full(n, self.floor.distance_mm), np.zeros(n, np.int64),
         )  # fmt: skip
         grid = self.grid
         with threads(parallel):

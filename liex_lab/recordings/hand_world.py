@@ -158,7 +158,7 @@ class HandWorld:
         return TrainingWindows(
             depth, np.broadcast_to(np.zeros(1, np.uint16), depth.shape), origin.astype(np.int32), intrinsics[each],
             flat, flat, SE3.identity(n), pose.root, pose.angles, pose.scale, cast.joints, cast.spine_mm,
-            number * m + each, kind[each], np.zeros(n, np.int64),
+            number * m + each, kind[each], np.zeros(n, np.int64), own_bones=True,
         )  # fmt: skip
 
     def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS) -> list[HandSession]:

@@ -11,9 +11,10 @@ from liex_lab.body.skeleton import View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
 from liex_lab.recordings import _nearest as kernels
+from liex_lab.recordings._segment import N_MOMENTS
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.background import sample_frames
-from liex_lab.recordings.crops import CROP, Crops
+from liex_lab.recordings.crops import CROP, Crops, view_of
 from liex_lab.recordings.recording import Recording
 from liex_lab.threads import threads
 
@@ -67,6 +68,19 @@ class NearestScene:
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""
         return looks_of(crops, self._intrinsics(len(crops.step)), camera_view)
+
+    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+        looks = self.looks(crops, camera_view)
+        planes = np.empty((len(looks), 3))
+        kernels.view_planes(looks, planes)
+        return planes
+
+    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+        T_camera_view = view_of(self.looks(crops, camera_view)).inverse()
+        middle = np.einsum("nij,nj->ni", T_camera_view.rotation, crops.centroid) + T_camera_view.translation
+        return self.floor.T_arena_camera @ middle
 
     def extract(
         self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0
@@ -125,7 +139,7 @@ def cut_nearest(
     n = len(depths)
     crops = Crops(
         np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32), np.zeros(n, np.int64),
-        np.zeros((n, 8)), np.full(n, 1000.0), np.zeros(n, np.int64),
+        np.zeros((n, N_MOMENTS)), np.full(n, 1000.0), np.zeros(n, np.int64),
     )  # fmt: skip
     kernels.extract_all(
         depths, *range_mm, rank, size, size * view.behind_mm, size * view.smooth_mm, intrinsics, camera_view,

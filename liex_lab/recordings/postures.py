@@ -134,7 +134,7 @@ def stand(
     elevation = posture.elevation[:, 0].copy()
     rear, pose = stations <= _REAR_PART, Pose.home(skeleton, len(size))
     for _ in range(6):
-        rotation = _root_rotation(heading, elevation, posture.roll)
+        rotation = root_rotation(heading, elevation, posture.roll)
         pose = Pose(SE3(rotation, np.zeros((len(size), 3))), angles, scale)
         frames = pose.frames(skeleton)
         lowest = np.empty((len(size), len(stations)))
@@ -151,7 +151,7 @@ def stand(
     return pose, girth
 
 
-def _root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
+def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
     """Rotations (n, 3, 3) of a base that heads, then rises, then rolls."""
     zero = np.zeros_like(heading)
     turn = so3.exp(np.stack([zero, zero, heading], axis=-1))

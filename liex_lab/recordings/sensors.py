@@ -32,6 +32,15 @@ class Sensor:
         coarse[:, [k.GRID, k.JITTER]] /= self.stride
         return coarse
 
+    def spread_mm(self, parameters: Array, distance_mm: Array) -> Array | float:
+        """Standard deviation (n,) mm of what units of a light-field camera read of one surface; of others 0, for it is
+        small beside everything that they are used for.
+        """
+        if self.kind != k.LIGHT_FIELD_KIND:
+            return 0.0
+        smooth, white, noise = (parameters[:, column] for column in (k.SMOOTH, k.WHITE, k.NOISE))
+        return noise * (distance_mm / k.TYPICAL_MM) ** 2 * np.hypot(0.8 * smooth, white)
+
     def draw(self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0) -> Array:
         """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given fur (n,).
 
@@ -67,13 +76,13 @@ class Sensor:
 def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
     """The habits of n plenoptic cameras into p (n, N_PARAMETERS)."""
     n = len(p)
-    p[:, k.SMOOTH] = rng.uniform(0.3, 1.0, n)  # mm at 250 mm
+    p[:, k.SMOOTH] = rng.uniform(0.4, 1.2, n)  # mm at 250 mm
     p[:, k.WHITE] = rng.uniform(0.1, 0.4, n)
     p[:, k.LUMPS] = rng.uniform(0.05, 0.25, n)
     p[:, k.GRID] = rng.uniform(5.0, 11.0, n)  # the footprint of a few micro lenses, pixels
     p[:, k.JITTER] = rng.uniform(0.5, 2.5, n)
     p[:, k.BACKGROUND], p[:, k.BIAS] = 0.5, 0.0
-    p[:, k.OUTLIERS] = rng.uniform(2.7, 3.6, n)  # standard deviations of a field
+    p[:, k.OUTLIERS] = rng.uniform(2.3, 3.2, n)  # standard deviations of a field
     # quantiles of a field: from a few per cent to a third of the smooth skin bears no texture, less of the rest
     p[:, k.DARK] = rng.uniform(-2.6, -0.45, n)
     p[:, k.HOLES] = rng.uniform(-4.0, -1.2, n)

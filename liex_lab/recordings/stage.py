@@ -113,6 +113,17 @@ class Stage:
             return self.half[0] - np.hypot(local[..., 0], local[..., 1])
         return np.min(self.half - np.abs(local), axis=-1)
 
+    def freedom(self, xy: Array, z: float = 0.0) -> float:
+        """How far (mm) a point of the floor, or z mm above it, is from walls, clutter and the border of the picture."""
+        c = self.camera
+        p = self.T_arena_camera.inverse() @ np.array([xy[0], xy[1], z])
+        uv = c.project(p)
+        border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min() * p[2] / c.fx
+        free = min(float(self.room(xy)), float(border))
+        if len(self.clutter):
+            free = min(free, float(np.linalg.norm(self.clutter - xy, axis=1).min()))
+        return free
+
     def _ideal_depth(self, rng: np.random.Generator, scale: float) -> NDArray[np.float32]:
         """Depth (H, W) mm along every ray: floor within the walls, walls up to their height, beyond them little."""
         T, camera = self.T_arena_camera, self.camera

@@ -74,6 +74,10 @@ class TrueRecording(Recording):
     T_arena_camera: SE3
     floor: Floor
 
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        raise NotImplementedError
+
 
 class SyntheticSession(TrueRecording):
     """A virtual animal in a virtual arena; shape: its body."""

@@ -1,4 +1,4 @@
-"""Things beside the animal: blocks, balls, cables and a hand, as triangle meshes made of rounded parts."""
+"""Things beside the animal: blocks, balls, cables, a hand, pellets, plants, a fish; meshes made of rounded parts."""
 
 from __future__ import annotations
 
@@ -40,10 +40,39 @@ def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
     return turned + np.asarray(centre, float)[..., None, :]
 
 
+def _pellet(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array) -> None:
+    """A lump of food on its way down."""
+    radii[0] = spine_mm * rng.uniform(0.04, 0.13) * rng.uniform(0.7, 1.0, 3)
+    centre[0, 2] = radii[0, 2] + spine_mm * rng.uniform(0.0, 2.0)
+
+
+def _plant(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array) -> None:
+    """A tuft of thin leaves that stand in the water."""
+    for k in range(N_PARTS):
+        tall = spine_mm * rng.uniform(0.3, 0.9)
+        radii[k] = [spine_mm * rng.uniform(0.02, 0.05), spine_mm * rng.uniform(0.03, 0.10), tall]
+        centre[k] = [*rng.normal(0.0, 0.12, 2) * spine_mm, 0.9 * tall]
+        yaw[k] = rng.uniform(-np.pi, np.pi)
+
+
+def _fish(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array) -> None:
+    """Another fish, well smaller than the animal: a body and a tail."""
+    long, heading = spine_mm * rng.uniform(0.30, 0.55), rng.uniform(-np.pi, np.pi)
+    ahead = np.array([np.cos(heading), np.sin(heading)])
+    lift = spine_mm * rng.uniform(0.15, 1.5)
+    for k, (at, length, wide, high) in enumerate([(0.12, 0.40, 0.075, 0.11), (-0.32, 0.22, 0.02, 0.07)]):
+        centre[k] = [*(at * long * ahead), lift]
+        radii[k], yaw[k] = long * np.array([length, wide, high]), heading
+
+
+_IN_WATER = {"pellet": _pellet, "plant": _plant, "fish": _fish}
+
+
 def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
     """Vertices (N_PARTS * V, 3) mm of one thing standing on the floor around the origin, faces as in THING_FACES.
 
-    Blocks and balls are from a third of to somewhat over the animal's size; unused parts shrink to nothing.
+    Blocks and balls are from a third of to somewhat over the animal's size; pellets sink, plants stand and another fish
+    swims in a tank. Unused parts shrink to nothing.
     """
     centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
     yaw, power = np.zeros(N_PARTS), np.full(N_PARTS, 2.0)
@@ -54,6 +83,8 @@ def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
         else:
             radii[0] = radii[0].mean() * rng.uniform(0.9, 1.1, 3)
         centre[0, 2] = radii[0, 2]
+    elif kind in _IN_WATER:
+        _IN_WATER[kind](rng, spine_mm, centre, radii, yaw)
     elif kind == "cable":
         step, thick, heading, bend = rng.uniform(10, 22), rng.uniform(3, 7), rng.uniform(-3, 3), rng.normal(0, 0.25)
         at = np.array([-3.5 * step * np.cos(heading), -3.5 * step * np.sin(heading)])

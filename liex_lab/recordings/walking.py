@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Callable
-from typing import Any
-from urllib.parse import parse_qsl
-
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import Lens
-from liex_lab.errors import RecordingError
-from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.habits import MouseHabits
 from liex_lab.recordings.postures import KINDS, Posture, draw_postures, stand
-from liex_lab.recordings.sensors import BY_NAME, KINECT_V2_SENSOR, Sensor
+from liex_lab.recordings.sensors import KINECT_V2_SENSOR, Sensor
 from liex_lab.recordings.stage import Stage, floor_point
 from liex_lab.recordings.synthetic import SyntheticSession, assemble
 
@@ -36,56 +27,6 @@ _STRETCHES = {
 }
 _BLEND_S = 0.12  # postures flow into one another over about this long
 _STRIDE_HZ_PER_SPINE = 1.6
-_EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
-_MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
-_SPINES_MM = (30.0, 150.0)
-
-
-def open_synthetic(address: str, camera: Lens | None = None) -> SyntheticSession:
-    """The virtual recording of an address, as in synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
-
-    Each setting may be left out: seed 0, 300 frames, a Kinect v2 (or primesense, primesense-qvga), and a size drawn
-    from the seed. camera: taken for the one that the pictures were made with, to see what a wrong one does.
-    """
-    kind, _, query = address.removeprefix("synthetic:").partition("?")
-    if kind != "walk":
-        raise RecordingError(f"{address} is no virtual recording; the only kind is walk, as in {_EXAMPLE}")
-    stated = dict(parse_qsl(query, keep_blank_values=True))
-    for key in stated:
-        if key not in _SETTINGS:
-            near = difflib.get_close_matches(key, _SETTINGS, 1, cutoff=0.0)[0]
-            raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
-    values = {key: _setting(address, key, text) for key, text in stated.items()}
-    seed = values.get("seed", 0)
-    session = walking_session(
-        seed, values.get("frames", 300), sensor=values.get("sensor", KINECT_V2_SENSOR),
-        spine_mm=values.get("spine_mm"), name=f"synthetic-walk-{seed}",
-    )  # fmt: skip
-    if camera is not None:
-        session.camera = fitting(camera, session.width, session.height, "the camera that was stated")
-    return session
-
-
-def _setting(address: str, key: str, text: str) -> Any:
-    """The value of one setting of an address."""
-    read, holds, expected = _SETTINGS[key]
-    try:
-        value = read(text)
-        if holds(value):
-            return value
-    except (KeyError, ValueError):
-        pass
-    raise RecordingError(f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}")
-
-
-# setting: (how to read it, what holds for it, what to say otherwise)
-_SETTINGS: dict[str, tuple[Callable[[str], Any], Callable[[Any], bool], str]] = {
-    "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
-    "frames": (int, lambda n: 1 <= n <= _MOST_FRAMES, f"a whole number from 1 to {_MOST_FRAMES}"),
-    "sensor": (BY_NAME.__getitem__, lambda _: True, f"one of {', '.join(BY_NAME)}"),
-    "spine_mm": (float, lambda mm: math.isfinite(mm) and _SPINES_MM[0] <= mm <= _SPINES_MM[1],
-                 f"a length from {_SPINES_MM[0]:g} to {_SPINES_MM[1]:g} mm"),
-}  # fmt: skip
 
 
 def walking_session(
@@ -165,32 +106,20 @@ def _path(rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array)
     """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back before a wall."""
     n, camera = len(speed), stage.camera
     middle = floor_point(camera, stage.T_arena_camera, np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]))
-    home = stage.centre if _freedom(stage, stage.centre) > _freedom(stage, middle) else middle
-    margin = min(0.85 * spine_mm, 0.7 * _freedom(stage, home))
+    home = stage.centre if stage.freedom(stage.centre) > stage.freedom(middle) else middle
+    margin = min(0.85 * spine_mm, 0.7 * stage.freedom(home))
     position, heading = np.empty((n, 2)), np.empty(n)
     at, way, rate = home + rng.normal(0.0, 0.2 * margin, 2), rng.uniform(-np.pi, np.pi), 0.0
     for i in range(n):
         rate = 0.93 * rate + rng.normal(0.0, 0.25)
         back = np.arctan2(home[1] - at[1], home[0] - at[0])
         away = (back - way + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (_freedom(stage, at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
+        close = np.clip(1.0 - (stage.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
         # it turns back faster the faster it goes, and stays within a mouse's turning rate
         pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
         way += np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
         step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
-        if _freedom(stage, at + step) > margin or _freedom(stage, at + step) > _freedom(stage, at):
+        if stage.freedom(at + step) > margin or stage.freedom(at + step) > stage.freedom(at):
             at = at + step
         position[i], heading[i] = at, way
     return position, heading
-
-
-def _freedom(stage: Stage, xy: Array) -> float:
-    """How far (mm) a point of the floor is from the nearest wall, clutter and border of the picture."""
-    c = stage.camera
-    p = stage.T_arena_camera.inverse() @ np.array([xy[0], xy[1], 0.0])
-    uv = c.project(p)
-    border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min() * p[2] / c.fx
-    free = min(float(stage.room(xy)), float(border))
-    if len(stage.clutter):
-        free = min(free, float(np.linalg.norm(stage.clutter - xy, axis=1).min()))
-    return free

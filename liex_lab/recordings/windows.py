@@ -40,7 +40,9 @@ class TrainingWindows:
     and exact.
     T_arena_camera (n), exact. root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones;
     joints_mm (n, J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
-    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture.
+    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture. spread_mm
+    (n,): standard deviation of the floor's readings, where it matters. own_bones: `joints_mm` are those of each
+    body's own proportions, from which the skeleton's differ.
     """
 
     depth: NDArray[np.uint16]
@@ -59,6 +61,8 @@ class TrainingWindows:
     sensor: NDArray[np.int64]
     kind: NDArray[np.int64]
     unit_mm: float = 1.0
+    spread_mm: Array | float = 0.0
+    own_bones: bool = False
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -240,6 +244,7 @@ def _draw_block(
         inverse_depth_plane(looks.T_arena_camera, looks.intrinsics), looks.T_arena_camera, seen.root, seen.angles,
         seen.scale, seen.joints(skeleton), looks.size * skeleton.length,
         first_session + np.arange(n) // PER_SESSION, looks.sensor, kinds, habits.sensors[0].unit_mm,
+        habits.sensors[0].spread_mm(looks.parameters, looks.T_arena_camera.translation[:, 2]),
     )  # fmt: skip
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError
-from liex_lab.recordings import synthetic, walking, windows
+from liex_lab.recordings import generic, swimming, synthetic, walking, windows
+from liex_lab.recordings.fish import FishHabits
+from liex_lab.recordings.generic import GenericHabits
 from liex_lab.recordings.habits import Habits, MouseHabits
 from liex_lab.recordings.hand_world import HandWorld, find_reference
 from liex_lab.recordings.synthetic import SyntheticSession, TrueRecording
@@ -101,10 +102,37 @@ class MouseWorld(RenderedWorld):
         return walking.walking_session(seed, n_frames, habits=self.habits, **settings)
 
 
+@dataclass(frozen=True)
+class FishWorld(RenderedWorld):
+    """A zebrafish in a tank, seen from above."""
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+        """A fish that swims."""
+        assert isinstance(self.habits, FishHabits)
+        return swimming.swimming_session(seed, n_frames, habits=self.habits, **settings)
+
+
+@dataclass(frozen=True)
+class GenericWorld(RenderedWorld):
+    """Any animal on a floor, or above one."""
+
+    def window_px(self, length_mm: float) -> int:
+        """Pixels a side that hold an animal of this mean length, wherever it is."""
+        assert isinstance(self.habits, GenericHabits)
+        return self.habits.window_px(length_mm)
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+        """An animal that goes about and changes its posture."""
+        assert isinstance(self.habits, GenericHabits)
+        return generic.moving_session(seed, n_frames, habits=self.habits, **settings)
+
+
 def world_of(skeleton: Skeleton) -> World:
-    """The world of an animal."""
+    """The world of an animal; of one that is not known here by its name, the generic one."""
     if skeleton.name == "mouse":
         return MouseWorld(MouseHabits(skeleton))
+    if skeleton.name == "fish":
+        return FishWorld(FishHabits(skeleton))
     if skeleton.name == "hand":
         return HandWorld(skeleton, find_reference())
-    raise LiexError(f"training data can be rendered for the mouse so far, not for the {skeleton.name}")
+    return GenericWorld(GenericHabits(skeleton))

@@ -21,32 +21,37 @@ _MIN_OVERLAP_PX = 20
 
 @dataclass(frozen=True)
 class BodyResidual:
-    """The default body of a skeleton, fattened or thinned by `girth`, held against depth."""
+    """The default body of a skeleton, fattened or thinned by `girth`, held against depth.
+
+    camera_view: how the height maps were cut, see `Scene.extract`.
+    """
 
     surface: Surface
     girth: float = 1.0
+    camera_view: bool = False
 
-    def of(self, pose_arena: Pose, crops: Crops, scene: Foreground, looks: Array | None = None) -> Array:
+    def of(self, pose_arena: Pose, crops: Crops, scene: Foreground) -> Array:
         """Median absolute difference (n,) mm between body and reading over the pixels that both cover; NaN without.
 
-        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth; looks
-        (n, 17): how they were cut, None as `scene.looks` says.
+        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth.
         """
         n = len(pose_arena.scale)
         if n == 0:
             return np.zeros(0)
         rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
         out = np.empty(n)
-        _compare(rendered, crops.heights, scene.looks(crops) if looks is None else looks, out)
+        planes = scene.planes(crops, self.camera_view)
+        _compare(rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, out)
         return out
 
     @staticmethod
     def fit(
-        surface: Surface, pose_arena: Pose, crops: Crops, scene: Foreground, looks: Array | None = None
+        surface: Surface, pose_arena: Pose, crops: Crops, scene: Foreground, camera_view: bool = False
     ) -> BodyResidual:
         """The girth with which the default body explains these frames best."""
-        cost = [np.nanmedian(BodyResidual(surface, float(g)).of(pose_arena, crops, scene, looks)) for g in _GIRTHS]
-        return BodyResidual(surface, float(_GIRTHS[int(np.argmin(cost))]))
+        bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
+        cost = [np.nanmedian(body.of(pose_arena, crops, scene)) for body in bodies]
+        return bodies[int(np.argmin(cost))]
 
 
 def render_crops(
@@ -66,22 +71,18 @@ def render_crops(
 
 
 @njit(cache=True, parallel=True)
-def _compare(rendered, heights, looks, out):
+def _compare(rendered, heights, origin, step, planes, distance, out):
     """Median |rendered - observed| depth of each frame over pixels where both are, into out (n,)."""
     for i in prange(rendered.shape[0]):
-        size = rendered.shape[1]
-        fx, fy, cx, cy, distance, step = looks[i, 0], looks[i, 1], looks[i, 2], looks[i, 3], looks[i, 13], looks[i, 16]
-        # the plane that heights are measured from: 1 / z = a u + b v + c; its normal is the view's z axis reversed
-        a, b = -looks[i, 10] / fx / distance, -looks[i, 11] / fy / distance
-        c0 = -looks[i, 12] / distance - a * cx - b * cy
+        size, plane = rendered.shape[1], planes[i]
         off = np.empty(size * size)
         n = 0
         for r in range(size):
-            v = looks[i, 15] + step * r
+            v = origin[i, 1] + step[i] * r
             for c in range(size):
                 if rendered[i, r, c] > 0 and heights[i, r, c] > 0:
-                    u = looks[i, 14] + step * c
-                    observed = (1.0 - heights[i, r, c] / 16.0 / distance) / (a * u + b * v + c0)
+                    u = origin[i, 0] + step[i] * c
+                    observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (plane[0] * u + plane[1] * v + plane[2])
                     off[n] = abs(rendered[i, r, c] - observed)
                     n += 1
         out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan

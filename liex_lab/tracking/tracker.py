@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.recordings.crops import Foreground, view_of
+from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Track
@@ -51,7 +51,8 @@ class FrameTracker:
             raise EstimationError("no animal was found in the sampled frames; check the depth unit and the plan")
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
         crops, used = estimates.crops, estimates.found
-        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, estimates.looks[used])
+        camera_view = estimator.model.method.camera_view
+        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view)
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
         return FrameTracker(estimator, scene, size, "plan" if spine_mm else "recording", body, limit)
 
@@ -80,13 +81,11 @@ class FrameTracker:
         track.sd_mm[:], track.sd_root[:], track.sd_angles_rad[:] = chosen.sd_mm, chosen.sd_root, chosen.sd_angles
         track.predicted_error_mm[:] = chosen.error_mm
         track.n_foreground_px[:] = estimates.crops.n_px
-        moments = estimates.crops.moments[seen]
-        T_camera_view = view_of(estimates.looks[seen]).inverse()
-        middle = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
-        middle = np.einsum("nij,nj->ni", T_camera_view.rotation, middle) + T_camera_view.translation
-        track.centroid_mm[seen] = self.scene.floor.T_arena_camera @ middle
-        track.centroid_px[seen] = self.scene.camera.project(middle)
-        track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene, estimates.looks[seen])
+        camera_view = self.estimator.model.method.camera_view
+        track.centroid_mm[seen] = self.scene.middles(estimates.crops[seen], camera_view)
+        to_camera = self.scene.floor.T_arena_camera.inverse()
+        track.centroid_px[seen] = self.scene.camera.project(to_camera @ track.centroid_mm[seen])
+        track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene)
         track.flag[seen] = np.where(chosen.error_mm[seen] > self.doubtful_mm, "doubtful", "")
         track.flag[~seen & ~(depths > 0).any(axis=(1, 2))] = "no_depth"
         return track

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.body import Pose, Skeleton
 from liex_lab.body.kinematics import aim
-from liex_lab.body.skeleton import PRESETS
+from liex_lab.body.skeleton import PRESETS, View
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3, so3
 from liex_lab.geometry.se3 import product_of_exponentials
@@ -101,3 +101,37 @@ def test_a_mistake_in_a_skeleton_is_named(change, says):
 def test_an_unknown_animal_names_the_nearest():
     with pytest.raises(LiexError, match="did you mean 'mouse'"):
         Skeleton.load("mose")
+
+
+def test_a_view_follows_from_the_animals_size_unless_the_toml_states_it():
+    mouse, fish = Skeleton.load("mouse"), Skeleton.load("fish")
+    assert mouse.view == View("floor", 120.0, 2.0, (0.12, 1.3), 7.0)
+    assert (mouse.relative_size, fish.view.frame, fish.view.behind_mm) == (1.0, "camera", 21.0)
+    assert fish.relative_size == pytest.approx(30.0 / 52.834, abs=1e-6)
+    table = {**mouse.table, "joints": [dict(joint) for joint in mouse.table["joints"]]}
+    for joint in table["joints"][1:]:
+        joint["offset_mm"] = [3.0 * x for x in joint["offset_mm"]]
+    large = Skeleton.from_table(table, "rat.toml").view
+    assert [large.behind_mm, large.smooth_mm, large.min_height_mm] == pytest.approx([360.0, 6.0, 7.0])
+
+
+@pytest.mark.parametrize(
+    ("view", "says"),
+    [
+        ({"frame": "above"}, "one of floor, camera, got 'above'"),
+        ({"behind": 3}, "unknown key 'behind'"),
+        ({"behind_mm": -1}, "behind_mm is a positive number"),
+        ({"smooth_mm": True}, "smooth_mm is a positive number"),
+        ({"area": [0.3]}, "two rising positive numbers"),
+        ({"area": [0.3, 0.1]}, "two rising positive numbers"),
+    ],
+)
+def test_a_mistake_in_a_view_is_named(view, says):
+    table = {**Skeleton.load("mouse").table, "view": view}
+    with pytest.raises(LiexError, match=says):
+        Skeleton.from_table(table, "mine.toml")
+
+
+def test_a_skeleton_of_one_point_is_refused():
+    with pytest.raises(LiexError, match="a second joint at some distance"):
+        Skeleton.from_table({"name": "dot", "joints": [{"name": "only"}]}, "dot.toml")

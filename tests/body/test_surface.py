@@ -11,6 +11,7 @@ import pytest
 from liex_lab.body import Pose, Skeleton
 from liex_lab.body.shape import FAMILIES, BodyShape, draw_shapes, draw_tail_bends
 from liex_lab.body.surface import Surface
+from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 
@@ -79,10 +80,10 @@ def test_the_mesh_scales_with_the_animal() -> None:
 
 
 def test_a_capsule_surface_holds_its_joints_radii() -> None:
-    fish = Skeleton.load("fish")
-    surface = Surface.of(fish)
-    vertices = surface.vertices(Pose.home(fish))
-    radii = np.array(fish.surface["radii_mm"])
+    snake = Skeleton.load(find_sample("snake.toml"))
+    surface = Surface.of(snake)
+    vertices = surface.vertices(Pose.home(snake))
+    radii = np.array(snake.surface["radii_mm"])
     np.testing.assert_allclose(np.ptp(vertices[:, 2]), 2 * radii.max(), rtol=0.1)
     np.testing.assert_allclose(vertices[:, 0].max(), radii[0], rtol=1e-6)
 

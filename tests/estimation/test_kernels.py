@@ -99,8 +99,9 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
     moments = rng.uniform(10, 100, (2, 8))
     size, scale, image = rng.uniform(0.8, 1.2, n), rng.uniform(0.8, 1.2, n), np.arange(n, dtype=np.int32) % 2
     views, scalars = np.empty((n, 2, VIEW)), np.empty((n, kernels.N_SCALARS))
+    reach = np.full(2, REACH)
     kernels.look_all(
-        np.array([2, 0]), np.stack([window.look] * 2), moments, image, size, REACH, rotations, positions, scale, views,
+        np.array([2, 0]), np.stack([window.look] * 2), moments, image, size, reach, rotations, positions, scale, views,
         scalars,
     )  # fmt: skip
     for s in range(n):

@@ -32,7 +32,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Picture:
-    """One height map (S, S), how it was cut (17,), its moments (8,), and the animal's size over home."""
+    """One height map (S, S), how it was cut (17,), its moments (9,), and the animal's size over home."""
 
     heights: NDArray[np.int16]
     look: Array
@@ -58,7 +58,7 @@ class Picture:
 
     def scalars(self, joint: Array, scale: float) -> NDArray[np.float32]:
         """The eleven numbers that describe the whole animal as a joint (4, 4) sees it."""
-        _, area, volume, x, y, axis, along, across = self.moments
+        _, area, volume, x, y, axis, along, across, _ = self.moments
         size, place, forward = self.size, joint[:3, 3], joint[:3, 0]
         to_middle = np.array([x - place[0], y - place[1], 0.0])
         turned = axis - np.arctan2(forward[1], forward[0])
@@ -93,8 +93,8 @@ def mode(votes: Array, bandwidth: float) -> Array:
 
 
 def start(model: Model, moments: Array, number: int, drawn: Array, size: float) -> Candidate:
-    """Candidate `number` of an animal with moments (8,), from its drawn numbers (4,)."""
-    _, area, volume, x, y, axis, along, across = moments
+    """Candidate `number` of an animal with moments (9,), from its drawn numbers (4,)."""
+    _, area, volume, x, y, axis, along, across, _ = moments
     length = model.skeleton.length
     if model.method.axis_start:
         spread = 0.12 + 0.7 * (across / max(along, 1e-6)) ** 2

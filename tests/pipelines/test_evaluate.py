@@ -45,7 +45,7 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two recordings of 10 small frames stand for every split, toy models for every variant; what was asked for."""
     asked: list[str] = []
 
-    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 40, *_: Any) -> list[SyntheticSession]:
+    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any) -> list[SyntheticSession]:
         asked.append(f"{name} {spine_mm}")
         return [
             SyntheticSession.draw([5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}")

@@ -12,7 +12,7 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
-from liex_lab.recordings import _nearest as kernels
+from liex_lab.recordings import _ends as ends
 from liex_lab.recordings._segment import BLOCK
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.crops import view_of
@@ -127,29 +127,35 @@ def test_ends_agree_with_what_a_reader_would_count(seed: int) -> None:
     rng = np.random.default_rng(seed)
     noise = cv2.GaussianBlur(rng.normal(0.0, 1.0, (15, 20)), (0, 0), 1.2)
     blocks = np.where(noise > 0.02, 800.0 + 20.0 * rng.random((15, 20)), 0.0).astype(np.float32)
-    labels, areas = np.empty(blocks.shape, np.int32), np.empty(kernels.MAX_SURFACES)
+    labels, areas = np.empty(blocks.shape, np.int32), np.empty(ends.MAX_SURFACES)
     focal, least_mm = 500.0, 2.0 * BLOCK * 800.0 / 500.0
-    n = kernels.label_surfaces(blocks, labels, focal * focal, 1.0, areas)
+    n = ends.label_surfaces(blocks, labels, focal * focal, 1.0, areas)
     for slot in range(n):
         position = np.full(blocks.shape, -1, np.int32)
         order, hops = np.empty((blocks.size, 2), np.int32), np.empty(blocks.size, np.int32)
-        size = kernels.walk(blocks, labels, slot, position, order, hops)
+        size = ends.walk(blocks, labels, slot, position, order, hops)
         assert size == (labels == slot).sum()
-        tips = np.zeros((kernels.MAX_TIPS, 4))
-        found = kernels.ends(blocks, order, hops, position, size, focal, least_mm, tips, 0)
+        tips = np.zeros((ends.MAX_TIPS, 4))
+        found = ends.ends(blocks, order, hops, position, size, focal, least_mm, tips, 0)
         expected = ends_by_hand(order[:size], hops[:size], blocks, focal, least_mm)
         assert {tuple(tip[1:3].astype(int)) for tip in tips[:found]} == expected
 
 
+def read_picture(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return picture
+
+
 def test_real_hands_before_real_people_are_found(reference_data: Path) -> None:
     files = sorted((reference_data / "hand_kinect2").glob("*.png"))
-    depths = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.float32)
+    depths = np.stack([read_picture(file) for file in files]).astype(np.float32)
     crops = scene_of(KINECT).extract(depths, 1.0)
     assert crops.found.all()
     assert 11_000 < crops.moments[:, 1].min() < crops.moments[:, 1].max() < 21_000  # mm^2: a hand, no person, no arm
     at = crops.origin + crops.step[:, None] * 48.0
     assert np.linalg.norm(np.diff(at, axis=0), axis=1).max() < 40.0  # and it is the same one all along
-    picture = cv2.imread(str(reference_data / "hand_nyu" / "depth_1_0000001.png"))
+    picture = read_picture(reference_data / "hand_nyu" / "depth_1_0000001.png")
     depth = (picture[..., 1].astype(np.float32) * 256 + picture[..., 0])[None]
     scene = scene_of(NYU_CAMERA)
     crops = scene.extract(depth, 1.1)

@@ -1,0 +1,58 @@
+"""Bodies of any animal: individuals vary, and the other family holds builds that training never reaches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.body.capsules import Capsules
+from liex_lab.body.shape import FAMILIES, BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Surface
+from liex_lab.body.variation import vary_body
+from liex_lab.catalog import find_sample
+from liex_lab.errors import LiexError
+
+FISH, SNAKE = Skeleton.load("fish"), Skeleton.load(find_sample("snake.toml"))
+
+
+def girths(skeleton: Skeleton, family: str, n: int = 800) -> np.ndarray:
+    """Thickness (n, places) of bodies over that of the default."""
+    body = vary_body(np.random.default_rng(1), skeleton, family, n)
+    surface = Surface.of(skeleton)
+    if isinstance(body, Capsules):
+        assert surface.capsules is not None
+        return (body.radii / surface.capsules.radii).reshape(n, -1)
+    assert surface.shape is not None
+    inner = slice(2, -2)
+    return np.sqrt(body.half_width * body.half_height)[:, inner] / np.sqrt(
+        surface.shape.half_width * surface.shape.half_height
+    )[inner]
+
+
+@pytest.mark.parametrize("skeleton", [FISH, SNAKE], ids=["fish", "snake"])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_family_is_drawn_again_from_its_seed_and_its_bodies_can_be_rendered(skeleton, family):
+    body, again = (vary_body(np.random.default_rng(2), skeleton, family, 20) for _ in range(2))
+    for name, values in vars(body).items():
+        np.testing.assert_array_equal(values, getattr(again, name))
+    assert len(body) == 20
+    assert isinstance(body, BodyShape if skeleton is FISH else Capsules)
+    assert (girths(skeleton, family) > 0.2).all()
+    assert (body.fur >= 0).all()
+
+
+@pytest.mark.parametrize("skeleton", [FISH, SNAKE], ids=["fish", "snake"])
+def test_other_bodies_are_slimmer_or_stouter_than_any_of_training(skeleton):
+    train, augmented, other = (np.log(girths(skeleton, family)).mean(axis=1) for family in FAMILIES)
+    assert np.abs(np.median(train)) < 0.05
+    assert train.std() < augmented.std() < other.std()
+    outside = (other < np.quantile(train, 0.01)) | (other > np.quantile(train, 0.99))
+    assert outside.mean() > 0.8
+    beyond = (other < np.quantile(augmented, 0.05)) | (other > np.quantile(augmented, 0.95))
+    assert beyond.mean() > 0.5
+
+
+def test_an_unknown_family_is_refused():
+    with pytest.raises(LiexError, match="no shape family 'eels'"):
+        vary_body(np.random.default_rng(0), FISH, "eels", 1)
