@@ -36,78 +36,99 @@ def locate(blocks, labels, tip, size, intrinsics, found):
 
     What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's length long.
     """
-    focal2 = intrinsics[0] * intrinsics[1]
-    p, middle, fingers = np.empty(3), np.empty(3), np.zeros(3)
+    middle, moved, fingers = np.empty(3), np.empty(3), np.zeros(3)
     slot = labels[int(tip[1]), int(tip[2])]
     point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
     _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
-    around, length = AROUND_MM * size, _LENGTH_MM * size
-    n_bins = int(2.0 * around / _BIN_MM) + 2
-    along = np.empty(n_bins)
-    cut, area = -1e9, 0.0
+    around = AROUND_MM * size
+    cut, area, base = -1e9, 0.0, 0.0
     for step in range(3):
-        shell = 0.0
-        for k in range(3):
-            fingers[k] = 0.0
-        for i in range(blocks.shape[0]):
-            for j in range(blocks.shape[1]):
-                if labels[i, j] != slot:
-                    continue
-                point_of_block(blocks, i, j, intrinsics, p)
-                off = np.sqrt((p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2)
-                if _SHELL * around < off < around:
-                    w = BLOCK * BLOCK * p[2] * p[2] / focal2
-                    shell += w
-                    for k in range(3):
-                        fingers[k] -= w * (p[k] - middle[k]) / off
-        norm = np.sqrt(fingers[0] ** 2 + fingers[1] ** 2 + fingers[2] ** 2)
-        has_arm = shell > _SHELL_MM2 * size * size and norm > 0.3 * shell
-        for k in range(3):
-            fingers[k] = fingers[k] / norm if has_arm else 0.0
-        along[:] = 0.0
-        for i in range(blocks.shape[0]):
-            for j in range(blocks.shape[1]):
-                if labels[i, j] == slot:
-                    point_of_block(blocks, i, j, intrinsics, p)
-                    s, off = 0.0, 0.0
-                    for k in range(3):
-                        s += (p[k] - middle[k]) * fingers[k]
-                        off += (p[k] - middle[k]) ** 2
-                    if off < around * around:
-                        along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * p[2] * p[2] / focal2
-        b, tip = n_bins - 1, 0.0
-        while b > 0 and tip < 100.0 * size * size:
-            tip += along[b]
-            b -= 1
-        cut = b * _BIN_MM - around - length if has_arm else -1e9
+        has_arm = _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers)
+        cut = _wrist(blocks, labels, slot, size, intrinsics, middle, fingers) if has_arm else -1e9
         base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
-        moved = np.zeros(3)
-        total = 0.0
-        for i in range(blocks.shape[0]):
-            for j in range(blocks.shape[1]):
-                if labels[i, j] == slot:
-                    point_of_block(blocks, i, j, intrinsics, p)
-                    s, off = 0.0, 0.0
-                    for k in range(3):
-                        s += (p[k] - middle[k]) * fingers[k]
-                        off += (p[k] - middle[k]) ** 2
-                    if off < around * around and s > cut:
-                        w = p[2] * p[2]
-                        total += w
-                        for k in range(3):
-                            moved[k] += w * p[k]
-                        if step == 2:
-                            labels[i, j] = MAX_SURFACES
-        area = BLOCK * BLOCK * total / focal2
-        for k in range(3):
-            moved[k] /= max(total, 1e-9)
-        if step == 2:
-            found[6] = cut + base
+        area = _beyond(blocks, labels, slot, around, intrinsics, middle, fingers, cut, step == 2, moved)
         for k in range(3):
             middle[k] = moved[k]
     for k in range(3):
         found[k], found[3 + k] = middle[k], fingers[k]
-    found[7] = area
+    found[6], found[7] = cut + base, area
+
+
+@njit(cache=True)
+def _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers):
+    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm leaves the sphere."""
+    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
+    p, shell = np.empty(3), 0.0
+    for k in range(3):
+        fingers[k] = 0.0
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] != slot:
+                continue
+            point_of_block(blocks, i, j, intrinsics, p)
+            off = np.sqrt((p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2)
+            if _SHELL * around < off < around:
+                w = BLOCK * BLOCK * p[2] * p[2] / focal2
+                shell += w
+                for k in range(3):
+                    fingers[k] -= w * (p[k] - middle[k]) / off
+    norm = np.sqrt(fingers[0] ** 2 + fingers[1] ** 2 + fingers[2] ** 2)
+    has_arm = shell > _SHELL_MM2 * size * size and norm > 0.3 * shell
+    for k in range(3):
+        fingers[k] = fingers[k] / norm if has_arm else 0.0
+    return has_arm
+
+
+@njit(cache=True)
+def _wrist(blocks, labels, slot, size, intrinsics, middle, fingers):
+    """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the fingertips."""
+    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
+    p, along = np.empty(3), np.zeros(int(2.0 * around / _BIN_MM) + 2)
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] == slot:
+                point_of_block(blocks, i, j, intrinsics, p)
+                s, off = _along(p, middle, fingers)
+                if off < around * around:
+                    along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * p[2] * p[2] / focal2
+    b, tip = along.size - 1, 0.0
+    while b > 0 and tip < 100.0 * size * size:
+        tip += along[b]
+        b -= 1
+    return b * _BIN_MM - around - _LENGTH_MM * size
+
+
+@njit(cache=True)
+def _beyond(blocks, labels, slot, around, intrinsics, middle, fingers, cut, mark, moved):
+    """The middle `moved` (3,) of what lies in the sphere and beyond the cut, marked in labels if so asked; its area."""
+    p, total = np.empty(3), 0.0
+    for k in range(3):
+        moved[k] = 0.0
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] == slot:
+                point_of_block(blocks, i, j, intrinsics, p)
+                s, off = _along(p, middle, fingers)
+                if off < around * around and s > cut:
+                    w = p[2] * p[2]
+                    total += w
+                    for k in range(3):
+                        moved[k] += w * p[k]
+                    if mark:
+                        labels[i, j] = MAX_SURFACES
+    for k in range(3):
+        moved[k] /= max(total, 1e-9)
+    return BLOCK * BLOCK * total / (intrinsics[0] * intrinsics[1])
+
+
+@njit(cache=True)
+def _along(p, middle, fingers):
+    """How far p (3,) lies from `middle` along `fingers`, and the square of its distance."""
+    s, off = 0.0, 0.0
+    for k in range(3):
+        s += (p[k] - middle[k]) * fingers[k]
+        off += (p[k] - middle[k]) ** 2
+    return s, off
 
 
 @njit(cache=True)
