@@ -51,8 +51,8 @@ _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(seed=31, n_images=16_384, n_calibration=4_096, sizes=_FISH_SIZES),
     ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
-    ("hand", "default"): Recipe(n_images=24_576, n_calibration=4_096, sizes=((0.0, 320),)),
-    ("hand", "paper"): Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 320),)),
+    ("hand", "default"): Recipe(n_images=20_480, n_calibration=4_096, sizes=((0.0, 320),)),
+    ("hand", "paper"): Recipe(n_images=8_192, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 320),)),
 }
 
 

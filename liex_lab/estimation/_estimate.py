@@ -63,17 +63,6 @@ class Tuning(NamedTuple):
     keep: int
 
 
-class Body(NamedTuple):
-    """The body that finished candidates are held against the picture with, see `body.balls.Balls`; none: no balls."""
-
-    unit_mm: float
-    n_own: int
-    joints: Any
-    offsets: Any
-    share: Any
-    radius: Any
-
-
 class _Lanes(NamedTuple):
     """What n candidates, one to a lane, see: see `forests._walk`. frame (n,) and pose (n,) say whose they are."""
 
@@ -175,22 +164,8 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
         fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)
         _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
-            explain_pose(
-                heights[i],
-                looks[i],
-                moments[i, 5],
-                rotations[i, k],
-                positions[i, k],
-                scales[i, k],
-                size,
-                body.unit_mm,
-                body.n_own,
-                body.joints,
-                body.offsets,
-                body.share,
-                body.radius,
-                fit,
-            )
+            explain_pose(heights[i], looks[i], moments[i, 5], rotations[i, k], positions[i, k], scales[i, k], size,
+                         body, fit)  # fmt: skip
             _write_scalars(lanes, s, N_SCALARS, fit)
 
 

@@ -6,6 +6,8 @@ metric, tell good candidates from bad ones.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
@@ -17,18 +19,29 @@ _APART_MM = 8.0
 _STRIDE = 6  # every so many crop pixels a reading is looked at
 
 
+class Body(NamedTuple):
+    """The body that poses are held against the picture with, see `body.balls.Balls`; none: no balls."""
+
+    unit_mm: float
+    n_own: int
+    joints: Any
+    offsets: Any
+    share: Any
+    radius: Any
+
+
 @njit(cache=True)
-def place_balls(rotations, positions, scale, joints, offsets, share, out):
+def place_balls(rotations, positions, scale, body, out):
     """Middles (B, 3) mm of the balls of one pose: rotations (J, 3, 3), positions (J, 3)."""
-    for b in range(len(joints)):
+    for b in range(len(body.joints)):
         for i in range(3):
             ends = np.zeros(2)
             for e in range(2):
-                j = joints[b, e]
+                j = body.joints[b, e]
                 ends[e] = positions[j, i]
                 for k in range(3):
-                    ends[e] += scale * rotations[j, i, k] * offsets[b, e, k]
-            out[b, i] = ends[0] + share[b] * (ends[1] - ends[0])
+                    ends[e] += scale * rotations[j, i, k] * body.offsets[b, e, k]
+            out[b, i] = ends[0] + body.share[b] * (ends[1] - ends[0])
 
 
 @njit(cache=True)
@@ -90,25 +103,19 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
 
 
 @njit(cache=True)
-def explain_pose(
-    heights, look, axis, rotations, positions, scale, size, unit_mm, n_own, joints, offsets, share, radius, out
-):  # fmt: skip
-    """`explain` for one pose; radius (B,) mm at scale 1. axis rad: of the animal's long axis, against which the last
-    number holds the base's x axis.
+def explain_pose(heights, look, axis, rotations, positions, scale, size, body, out):
+    """`explain` for one pose. axis rad: of the animal's long axis, against which the last number holds the base's x
+    axis.
     """
-    balls = np.empty((len(joints), 3))
-    place_balls(rotations, positions, scale, joints, offsets, share, balls)
-    explain(heights, look, balls, radius * scale, n_own, size, unit_mm, out)
+    balls = np.empty((len(body.joints), 3))
+    place_balls(rotations, positions, scale, body, balls)
+    explain(heights, look, balls, body.radius * scale, body.n_own, size, body.unit_mm, out)
     out[7] = _SHARE_UNIT * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0])
 
 
 @njit(cache=True, parallel=True)
-def explain_all(
-    heights, looks, moments, image, rotations, positions, scale, size, unit_mm, n_own, joints, offsets, share, radius,
-    out,
-):  # fmt: skip
+def explain_all(heights, looks, moments, image, rotations, positions, scale, size, body, out):
     """`explain_pose` for a batch of n poses on some of the images (n,); out (n, N_FIT)."""
     for s in prange(len(image)):
         i = image[s]
-        explain_pose(heights[i], looks[i], moments[i, 5], rotations[s], positions[s], scale[s], size[s], unit_mm, n_own,
-                     joints, offsets, share, radius, out[s])  # fmt: skip
+        explain_pose(heights[i], looks[i], moments[i, 5], rotations[s], positions[s], scale[s], size[s], body, out[s])

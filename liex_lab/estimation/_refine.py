@@ -7,6 +7,8 @@ all of it is held near the pose it began with.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
@@ -15,6 +17,32 @@ from liex_lab.estimation._kernels import so3_exp
 
 _STRIDE = 4  # every so many crop pixels a reading pulls
 _ROOT = 7  # twist of the base and log of the scale come before the angles
+_DAMPING = 0.02
+_MOST_GROWTH, _MOST_TURN = 0.1, 0.5  # of log scale, and of an angle (rad), in one step
+
+
+class Tree(NamedTuple):
+    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3); free (F, 2) joint and axis of every angle,
+    limits (F, 2) rad, moves (J, F) which of them turn which joint.
+    """
+
+    parents: Any
+    offsets: Any
+    rest: Any
+    free: Any
+    limits: Any
+    moves: Any
+
+
+class Wishes(NamedTuple):
+    """What weighs how much. robust mm: readings this far off count a quarter; beside: of a ball beside the animal;
+    prior (4,): what a radian of the base, a millimetre of it, a unit of log scale and a radian of a joint away from the
+    start cost, in squared mm.
+    """
+
+    robust: float
+    beside: float
+    prior: Any
 
 
 @njit(cache=True)
@@ -71,21 +99,21 @@ def crop_pixel(look, p):
 
 
 @njit(cache=True)
-def forward(parents, offsets, rest, root_rotation, root_position, angles, scale, rotations, positions):
+def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
     """Joint frames of a pose, as `body.kinematics.forward_kinematics`."""
     turn = np.empty((3, 3))
     for i in range(3):
         positions[0, i] = root_position[i]
         for k in range(3):
             rotations[0, i, k] = root_rotation[i, k]
-    for j in range(1, parents.size):
-        p = parents[j]
+    for j in range(1, tree.parents.size):
+        p = tree.parents[j]
         so3_exp(angles[j, 0], angles[j, 1], angles[j, 2], turn)
-        local = rest[j] @ turn
+        local = tree.rest[j] @ turn
         for i in range(3):
             total = positions[p, i]
             for k in range(3):
-                total += scale * rotations[p, i, k] * offsets[j, k]
+                total += scale * rotations[p, i, k] * tree.offsets[j, k]
             positions[j, i] = total
             for k in range(3):
                 value = 0.0
@@ -118,12 +146,8 @@ def turning_axes(free, angles, rotations, axes):
 
 
 @njit(cache=True)
-def ball_slope(
-    b, ball, ball_joints, ball_offsets, ball_share, moves, free, axes, rotations, positions, scale, slope
-):  # fmt: skip
-    """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles. moves (J, F): which
-    angles turn a joint's frame.
-    """
+def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
+    """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles."""
     slope[:] = 0.0
     x0, y0, z0 = ball[0] - positions[0, 0], ball[1] - positions[0, 1], ball[2] - positions[0, 2]
     for k in range(3):
@@ -132,18 +156,18 @@ def ball_slope(
         slope[0, 3 + k], slope[1, 3 + k], slope[2, 3 + k] = ax, ay, az
     slope[0, 6], slope[1, 6], slope[2, 6] = x0, y0, z0
     for e in range(2):
-        j = ball_joints[b, e]
-        share = ball_share[b] if e == 1 else 1.0 - ball_share[b]
+        j = body.joints[b, e]
+        share = body.share[b] if e == 1 else 1.0 - body.share[b]
         if share == 0.0:
             continue
         end = np.empty(3)
         for i in range(3):
             end[i] = positions[j, i]
             for k in range(3):
-                end[i] += scale * rotations[j, i, k] * ball_offsets[b, e, k]
-        for f in range(len(free)):
-            if moves[j, f]:
-                a = free[f, 0]
+                end[i] += scale * rotations[j, i, k] * body.offsets[b, e, k]
+        for f in range(len(tree.free)):
+            if tree.moves[j, f]:
+                a = tree.free[f, 0]
                 x, y, z = end[0] - positions[a, 0], end[1] - positions[a, 1], end[2] - positions[a, 2]
                 ax, ay, az = axes[f, 0], axes[f, 1], axes[f, 2]
                 slope[0, _ROOT + f] += share * (ay * z - az * y)
@@ -193,12 +217,11 @@ def _solve(curvature, gradient, step):
 
 
 @njit(cache=True)
-def _gather(
-    heights, look, nearest, points, balls, radius, n_own, slopes, robust, beside_weight, gradient, curvature
-):  # fmt: skip
-    """Normal equations of what the picture wants of the balls (B, 3) mm with slopes (n_own, 3, P)."""
-    n_values = gradient.size
-    row, target = np.empty(n_values), np.empty(3)
+def _pull(points, balls, radius, n_own, slopes, robust, gradient, curvature):
+    """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B, 3) passes through
+    it. slopes (n_own, 3, P).
+    """
+    row = np.empty(gradient.size)
     for i in range(len(points)):
         best, which = 1e9, 0
         for b in range(len(balls)):
@@ -210,24 +233,28 @@ def _gather(
             continue
         length = max(best + radius[which], 1e-6)
         weight = 1.0 / (1.0 + (best / robust) ** 2) ** 2
-        for p in range(n_values):
-            row[p] = 0.0
+        row[:] = 0.0
         for a in range(3):
             direction = (points[i, a] - balls[which, a]) / length
-            for p in range(n_values):
+            for p in range(row.size):
                 row[p] -= direction * slopes[which, a, p]
         row[6] -= radius[which]
         _add(row, best, weight, gradient, curvature)
+
+
+@njit(cache=True)
+def _push(heights, look, nearest, balls, radius, slopes, robust, beside, gradient, curvature):
+    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal. slopes (n, 3, P)."""
+    row, target = np.empty(gradient.size), np.empty(3)
     last = heights.shape[0] - 1
-    for b in range(n_own):
+    for b in range(len(slopes)):
         r, c = crop_pixel(look, balls[b])
         r, c = min(max(r, 0), last), min(max(c, 0), last)
         if heights[r, c] > 0:
             out = balls[b, 2] + radius[b] - heights[r, c] / 16.0
             if out > 0.0:
                 weight = 1.0 / (1.0 + (out / robust) ** 2) ** 2
-                for p in range(n_values):
-                    row[p] = slopes[b, 2, p]
+                row[:] = slopes[b, 2]
                 row[6] += radius[b]
                 _add(row, out, weight, gradient, curvature)
             continue
@@ -237,93 +264,89 @@ def _gather(
         point_of(heights, look, a, d, target)
         for axis in range(2):
             off = balls[b, axis] - target[axis]
-            weight = beside_weight / (1.0 + (off / (2.0 * robust)) ** 2)
-            for p in range(n_values):
-                row[p] = slopes[b, axis, p]
+            weight = beside / (1.0 + (off / (2.0 * robust)) ** 2)
+            row[:] = slopes[b, axis]
             _add(row, off, weight, gradient, curvature)
 
 
 @njit(cache=True)
-def refine_one(
-    heights, look, parents, offsets, rest, free, limits, moves, ball_joints, ball_offsets, ball_share, ball_radius,
-    n_own, n_steps, robust, beside_weight, prior, root_rotation, root_position, angles, scale,
-):  # fmt: skip
-    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale.
+def _hold(tree, prior, moved, growth, turned, gradient, curvature):
+    """What the start wants: not to be left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3)."""
+    for k in range(3):
+        gradient[k] += prior[0] * moved[k]
+        gradient[3 + k] += prior[1] * moved[3 + k]
+        curvature[k, k] += prior[0]
+        curvature[3 + k, 3 + k] += prior[1]
+    gradient[6] += prior[2] * growth
+    curvature[6, 6] += prior[2]
+    for f in range(len(tree.free)):
+        j, k = tree.free[f, 0], tree.free[f, 1]
+        gradient[_ROOT + f] += prior[3] * turned[j, k]
+        curvature[_ROOT + f, _ROOT + f] += prior[3]
 
-    free (F, 2): joint and axis of every free angle; limits (F, 2) rad; moves (J, F): which of them turn which joint;
-    robust mm: readings farther off count little; prior (4,): what a radian of the base, a millimetre of it, a unit of
-    log scale and a radian of a joint away from the start cost, in squared mm.
-    """
+
+@njit(cache=True)
+def _go(step, tree, root_rotation, root_position, angles, scale):
+    """Take a step (P,), in place; returns the new scale."""
+    turn = np.empty((3, 3))
+    shift = root_rotation @ step[3:6]
+    so3_exp(step[0], step[1], step[2], turn)
+    root_rotation[:] = root_rotation @ turn
+    root_position += shift
+    for f in range(len(tree.free)):
+        j, k = tree.free[f, 0], tree.free[f, 1]
+        turned = angles[j, k] + min(max(step[_ROOT + f], -_MOST_TURN), _MOST_TURN)
+        angles[j, k] = min(max(turned, tree.limits[f, 0]), tree.limits[f, 1])
+    return scale * np.exp(min(max(step[6], -_MOST_GROWTH), _MOST_GROWTH))
+
+
+@njit(cache=True)
+def _readings(heights, look):
+    """The points (n, 3) mm of the view frame that every `_STRIDE`-th crop pixel shows."""
     side = heights.shape[0]
-    nearest = np.empty((side, side, 2), np.int32)
-    nearest_readings(heights, nearest)
-    points, n_points = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3)), 0
+    points, n = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3)), 0
     for r in range(_STRIDE // 2, side, _STRIDE):
         for c in range(_STRIDE // 2, side, _STRIDE):
             if heights[r, c] > 0:
-                point_of(heights, look, r, c, points[n_points])
-                n_points += 1
-    points = points[:n_points]
-    n_free, n_balls, n_joints = len(free), len(ball_joints), parents.size
-    n_values = _ROOT + n_free
+                point_of(heights, look, r, c, points[n])
+                n += 1
+    return points[:n]
+
+
+@njit(cache=True)
+def refine_one(heights, look, tree, body, wishes, n_steps, root_rotation, root_position, angles, scale):
+    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale."""
+    nearest = np.empty((heights.shape[0], heights.shape[0], 2), np.int32)
+    nearest_readings(heights, nearest)
+    points = _readings(heights, look)
+    n_values, n_joints = _ROOT + len(tree.free), tree.parents.size
     rotations, positions = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3))
-    balls, axes = np.empty((n_balls, 3)), np.empty((n_free, 3))
-    slopes, turn = np.empty((n_own, 3, n_values)), np.empty((3, 3))
+    balls, axes = np.empty((len(body.joints), 3)), np.empty((len(tree.free), 3))
+    slopes, step = np.empty((body.n_own, 3, n_values)), np.empty(n_values)
     first_angles, first_scale = angles.copy(), scale
     moved = np.zeros(6)  # of the base since the start, step by step
-    step = np.empty(n_values)
     for _ in range(n_steps):
-        forward(parents, offsets, rest, root_rotation, root_position, angles, scale, rotations, positions)
-        place_balls(rotations, positions, scale, ball_joints, ball_offsets, ball_share, balls)
-        turning_axes(free, angles, rotations, axes)
-        for b in range(n_own):
-            ball_slope(b, balls[b], ball_joints, ball_offsets, ball_share, moves, free, axes, rotations, positions,
-                       scale, slopes[b])  # fmt: skip
-        gradient, curvature = np.zeros(n_values), np.zeros((n_values, n_values))
-        _gather(heights, look, nearest, points, balls, ball_radius * scale, n_own, slopes, robust, beside_weight,
-                gradient, curvature)  # fmt: skip
-        for k in range(3):
-            gradient[k] += prior[0] * moved[k]
-            gradient[3 + k] += prior[1] * moved[3 + k]
-            curvature[k, k] += prior[0]
-            curvature[3 + k, 3 + k] += prior[1]
-        gradient[6] += prior[2] * np.log(scale / first_scale)
-        curvature[6, 6] += prior[2]
-        for f in range(n_free):
-            j, k = free[f, 0], free[f, 1]
-            gradient[_ROOT + f] += prior[3] * (angles[j, k] - first_angles[j, k])
-            curvature[_ROOT + f, _ROOT + f] += prior[3]
+        forward(tree, root_rotation, root_position, angles, scale, rotations, positions)
+        place_balls(rotations, positions, scale, body, balls)
+        turning_axes(tree.free, angles, rotations, axes)
+        for b in range(body.n_own):
+            ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
+        gradient, curvature, radius = np.zeros(n_values), np.zeros((n_values, n_values)), body.radius * scale
+        _pull(points, balls, radius, body.n_own, slopes, wishes.robust, gradient, curvature)
+        _push(heights, look, nearest, balls, radius, slopes, wishes.robust, wishes.beside, gradient, curvature)
+        _hold(tree, wishes.prior, moved, np.log(scale / first_scale), angles - first_angles, gradient, curvature)
         for i in range(n_values):
-            curvature[i, i] *= 1.02
+            curvature[i, i] *= 1.0 + _DAMPING
         if not _solve(curvature, gradient, step):
             return scale
-        for k in range(3):
-            moved[k] += step[k]
-            moved[3 + k] += step[3 + k]
-        shift = root_rotation @ step[3:6]
-        so3_exp(step[0], step[1], step[2], turn)
-        new = root_rotation @ turn
-        for i in range(3):
-            root_position[i] += shift[i]
-            for k in range(3):
-                root_rotation[i, k] = new[i, k]
-        scale *= np.exp(min(max(step[6], -0.1), 0.1))
-        for f in range(n_free):
-            j, k = free[f, 0], free[f, 1]
-            turned = angles[j, k] + min(max(step[_ROOT + f], -0.5), 0.5)
-            angles[j, k] = min(max(turned, limits[f, 0]), limits[f, 1])
+        moved += step[:6]
+        scale = _go(step, tree, root_rotation, root_position, angles, scale)
     return scale
 
 
 @njit(cache=True, parallel=True)
-def refine_all(
-    heights, looks, parents, offsets, rest, free, limits, moves, ball_joints, ball_offsets, ball_share, ball_radius,
-    n_own, n_steps, robust, beside_weight, prior, root_rotations, root_positions, angles, scales,
-):  # fmt: skip
+def refine_all(heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales):
     """`refine_one` for poses of n frames."""
     for i in prange(len(scales)):
-        scales[i] = refine_one(
-            heights[i], looks[i], parents, offsets, rest, free, limits, moves, ball_joints, ball_offsets, ball_share,
-            ball_radius, n_own, n_steps, robust, beside_weight, prior, root_rotations[i], root_positions[i], angles[i],
-            scales[i],
-        )  # fmt: skip
+        scales[i] = refine_one(heights[i], looks[i], tree, body, wishes, n_steps, root_rotations[i], root_positions[i],
+                               angles[i], scales[i])  # fmt: skip

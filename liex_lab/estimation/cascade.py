@@ -108,10 +108,10 @@ class Cascade:
         samples = self.samples(images, candidates, list(range(self.skeleton.n_joints)))
         if not self.method.explains:
             return samples
-        fit, b = np.empty((len(candidates), explaining.N_FIT), np.float32), self.balls
+        fit = np.empty((len(candidates), explaining.N_FIT), np.float32)
         explaining.explain_all(
             images.heights, images.looks, images.moments, candidates.image, candidates.rotations, candidates.positions,
-            candidates.scale, candidates.size, b.unit_mm, b.n_own, b.joints, b.offsets, b.share, b.radius, fit,
+            candidates.scale, candidates.size, body_of(self.balls), fit,
         )  # fmt: skip
         return replace(samples, scalars=np.concatenate([samples.scalars, fit], axis=1))
 
@@ -154,6 +154,11 @@ class Cascade:
         off = np.linalg.norm(true.translation - estimate.translation, axis=1) / candidates.size
         keep = (np.linalg.norm(turn, axis=1) < method.keep_bent) & (off < method.keep_off_mm)
         return turn * method.joint_lever_mm, keep
+
+
+def body_of(balls: Balls) -> explaining.Body:
+    """A body of balls as the kernels want it."""
+    return explaining.Body(balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius)
 
 
 @dataclass(frozen=True)

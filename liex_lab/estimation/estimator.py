@@ -14,7 +14,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
-from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation._explain import Body
+from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
@@ -84,12 +85,11 @@ class PoseEstimator:
         )  # fmt: skip
 
     @cached_property
-    def _body(self) -> kernels.Body:
+    def _body(self) -> Body:
         """The body that candidates are held against the picture with."""
         if not self.model.method.explains:
-            return kernels.Body(1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
-        b = self.model.cascade.balls
-        return kernels.Body(b.unit_mm, b.n_own, b.joints, b.offsets, b.share, b.radius)
+            return Body(1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+        return body_of(self.model.cascade.balls)
 
     @cached_property
     def _refiner(self) -> Refiner:

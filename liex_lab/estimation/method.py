@@ -117,7 +117,7 @@ _HAND: dict[str, Any] = {
     "regressors": GrowthPlan(10, 16, 12, 60, 0.3, 0.15, 0.4, 0.63),
     "metric": GrowthPlan(60, 9, 40, 100, 0.35, 0.3, 0.4, 0.5),
     "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63), "proposal_reach_mm": 100.0,
-    "explains": True, "refine_steps": 8,
+    "explains": True, "refine_steps": 6,
     "reach_mm": 60.0, "base_lever_mm": 65.0, "joint_lever_mm": 40.0, "scale_lever_mm": 60.0, "keep_turned": 1.3,
     "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0,
     "survivors": 8, "pruner": GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),

@@ -9,13 +9,13 @@ from liex_lab.body import Pose, Skeleton
 from liex_lab.body.balls import Balls
 from liex_lab.body.surface import Surface
 from liex_lab.estimation._explain import place_balls
+from liex_lab.estimation.cascade import body_of
 
 
 def placed(skeleton: Skeleton, pose: Pose) -> np.ndarray:
     balls, frames = Balls.of(skeleton), pose.frames(skeleton)
     out = np.empty((len(balls.radius), 3))
-    place_balls(frames.rotation[0], frames.translation[0], float(pose.scale[0]), balls.joints, balls.offsets,
-                balls.share, out)  # fmt: skip
+    place_balls(frames.rotation[0], frames.translation[0], float(pose.scale[0]), body_of(balls), out)
     return out
 
 

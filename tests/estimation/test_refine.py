@@ -115,18 +115,17 @@ def test_explanations_agree_with_the_slow_twin() -> None:
 def middles(root: SE3, angles: np.ndarray, scale: float) -> np.ndarray:
     """Middles (B, 3) of the balls of one pose, by the kernels' own forward kinematics."""
     rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(HAND.parents, HAND.offsets, HAND.rest, root.rotation, root.translation, angles, scale, rotations,
-                    positions)  # fmt: skip
+    kernels.forward(REFINER.tree, root.rotation, root.translation, angles, scale, rotations, positions)
     out = np.empty((len(BALLS.radius), 3))
-    place_balls(rotations, positions, scale, BALLS.joints, BALLS.offsets, BALLS.share, out)
+    place_balls(rotations, positions, scale, REFINER.body, out)
     return out
 
 
 def test_forward_kinematics_agrees_with_the_bodys_own() -> None:
     _, _, pose = hands()
     rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(HAND.parents, HAND.offsets, HAND.rest, pose.root.rotation[3], pose.root.translation[3],
-                    pose.angles[3], 1.1, rotations, positions)  # fmt: skip
+    kernels.forward(REFINER.tree, pose.root.rotation[3], pose.root.translation[3], pose.angles[3], 1.1, rotations,
+                    positions)  # fmt: skip
     frames = Pose(pose.root, pose.angles, np.full(len(pose.scale), 1.1)).frames(HAND)
     np.testing.assert_allclose(rotations, frames.rotation[3], atol=1e-12)
     np.testing.assert_allclose(positions, frames.translation[3], atol=1e-9)
@@ -137,9 +136,8 @@ def test_slopes_are_those_of_small_steps(k: int) -> None:
     _, _, pose = hands()
     root, angles = SE3(pose.root.rotation[k], pose.root.translation[k]), pose.angles[k]
     rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(HAND.parents, HAND.offsets, HAND.rest, root.rotation, root.translation, angles, 1.0, rotations,
-                    positions)  # fmt: skip
-    balls, free = middles(root, angles, 1.0), REFINER.free
+    kernels.forward(REFINER.tree, root.rotation, root.translation, angles, 1.0, rotations, positions)
+    balls, free = middles(root, angles, 1.0), REFINER.tree.free
     axes = np.empty((len(free), 3))
     kernels.turning_axes(free, angles, rotations, axes)
     step = 1e-6
@@ -152,8 +150,7 @@ def test_slopes_are_those_of_small_steps(k: int) -> None:
     numeric = (np.stack(ahead, axis=-1) - balls[..., None]) / step
     slope = np.empty((3, 7 + len(free)))
     for b in range(BALLS.n_own):
-        kernels.ball_slope(b, balls[b], BALLS.joints, BALLS.offsets, BALLS.share, REFINER.moves, free, axes, rotations,
-                           positions, 1.0, slope)  # fmt: skip
+        kernels.ball_slope(b, balls[b], REFINER.body, REFINER.tree, axes, rotations, positions, 1.0, slope)
         np.testing.assert_allclose(slope, numeric[b], atol=2e-3)
 
 
@@ -180,8 +177,8 @@ def test_small_systems_are_solved() -> None:
 def test_a_chain_is_refined_as_well() -> None:
     mouse = Skeleton.load("mouse")
     refiner = Refiner.of(mouse, Balls.of(mouse))
-    assert refiner.moves.shape == (mouse.n_joints, mouse.dof - 6)
-    assert refiner.moves[-1].all()  # every joint turns the tip
+    assert refiner.tree.moves.shape == (mouse.n_joints, mouse.dof - 6)
+    assert refiner.tree.moves[-1].all()  # every joint turns the tip
     turned = so3.exp(np.zeros((2, 3)))
     pose = Pose(SE3(turned, np.zeros((2, 3))), np.zeros((2, mouse.n_joints, 3)), np.ones(2))
     empty = np.zeros((2, 96, 96), np.int16)

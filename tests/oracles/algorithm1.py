@@ -115,7 +115,7 @@ def seen_start(model: Model, picture: Picture, number: int, size: float) -> Cand
     """Candidate `number` where the method starts from proposals: what one tree says, the axis taken one way."""
     method, forest, (tree, way) = model.method, model.cascade.proposals, divmod(number, 2)
     assert forest is not None
-    _, area, volume, x, y, axis, _, _ = picture.moments
+    _, area, volume, x, y, axis, *_ = picture.moments
     frame = motion.exp([0, 0, axis + np.pi * way, 0, 0, 0])
     frame[:3, 3] = [x, y, volume / max(area, 1)]
     told = np.append(picture.scalars(frame, size), np.float32(1000 - 2000 * way))
