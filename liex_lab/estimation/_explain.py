@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit, prange
 
 N_FIT = 8
-_SHARE_UNIT, _MM_UNIT = 1000.0, 50.0  # thresholds are integers
+BESIDE, OUT_OF, APART = 0, 2, 4  # of the fit: see `explain`
+SHARE_UNIT, MM_UNIT = 1000.0, 50.0  # thresholds are integers
 _MOST_MM = 30.0  # in tenths of the balls' usual radius, as the next two: farther off is simply wrong
 _HIDDEN_MM = 12.0
 _APART_MM = 8.0
@@ -72,9 +73,9 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
         out_of += min(max(-above, 0.0), _MOST_MM)
         hidden += above > _HIDDEN_MM
     seen = max(n - beside, 1.0)
-    out[0] = _SHARE_UNIT * beside / n
-    out[1], out[2] = _MM_UNIT * off / seen, _MM_UNIT * out_of / seen
-    out[3] = _SHARE_UNIT * hidden / n
+    out[0] = SHARE_UNIT * beside / n
+    out[1], out[2] = MM_UNIT * off / seen, MM_UNIT * out_of / seen
+    out[3] = SHARE_UNIT * hidden / n
     n_read, far, apart, within = 0, 0.0, 0.0, 0.0
     for r in range(_STRIDE // 2, last + 1, _STRIDE):
         for c in range(_STRIDE // 2, last + 1, _STRIDE):
@@ -99,7 +100,7 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
             apart += min(max(nearest, 0.0), _MOST_MM)
             within += min(max(-nearest, 0.0), _MOST_MM)
     many = max(n_read, 1)
-    out[4], out[5], out[6] = _MM_UNIT * apart / many, _SHARE_UNIT * far / many, _MM_UNIT * within / many
+    out[4], out[5], out[6] = MM_UNIT * apart / many, SHARE_UNIT * far / many, MM_UNIT * within / many
 
 
 @njit(cache=True)
@@ -110,7 +111,7 @@ def explain_pose(heights, look, axis, rotations, positions, scale, size, body, o
     balls = np.empty((len(body.joints), 3))
     place_balls(rotations, positions, scale, body, balls)
     explain(heights, look, balls, body.radius * scale, body.n_own, size, body.unit_mm, out)
-    out[7] = _SHARE_UNIT * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0])
+    out[7] = SHARE_UNIT * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0])
 
 
 @njit(cache=True, parallel=True)

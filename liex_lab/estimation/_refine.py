@@ -314,11 +314,12 @@ def _readings(heights, look):
 
 
 @njit(cache=True)
-def refine_one(heights, look, tree, body, wishes, n_steps, root_rotation, root_position, angles, scale):
-    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale."""
-    nearest = np.empty((heights.shape[0], heights.shape[0], 2), np.int32)
-    nearest_readings(heights, nearest)
-    points = _readings(heights, look)
+def refine_one(heights, look, nearest, points, tree, body, wishes, n_steps, root_rotation, root_position, angles,
+               scale):  # fmt: skip
+    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale.
+
+    nearest (S, S, 2) as `nearest_readings`, points (n, 3) as `_readings` of the height map.
+    """
     n_values, n_joints = _ROOT + len(tree.free), tree.parents.size
     rotations, positions = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3))
     balls, axes = np.empty((len(body.joints), 3)), np.empty((len(tree.free), 3))
@@ -346,7 +347,23 @@ def refine_one(heights, look, tree, body, wishes, n_steps, root_rotation, root_p
 
 @njit(cache=True, parallel=True)
 def refine_all(heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales):
-    """`refine_one` for poses of n frames."""
+    """`refine_one` for the K poses of each of n frames."""
     for i in prange(len(scales)):
-        scales[i] = refine_one(heights[i], looks[i], tree, body, wishes, n_steps, root_rotations[i], root_positions[i],
-                               angles[i], scales[i])  # fmt: skip
+        nearest = np.empty((heights.shape[1], heights.shape[1], 2), np.int32)
+        nearest_readings(heights[i], nearest)
+        points = _readings(heights[i], looks[i])
+        for k in range(scales.shape[1]):
+            scales[i, k] = refine_one(
+                heights[i],
+                looks[i],
+                nearest,
+                points,
+                tree,
+                body,
+                wishes,
+                n_steps,
+                root_rotations[i, k],
+                root_positions[i, k],
+                angles[i, k],
+                scales[i, k],
+            )

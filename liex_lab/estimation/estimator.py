@@ -20,7 +20,7 @@ from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.refine import Refiner
-from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
@@ -160,14 +160,17 @@ class PoseEstimator:
         self, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, rotations: Array, positions: Array,
         scores: Array, parallel: bool = True,
     ) -> Chosen:  # fmt: skip
-        """One pose for each of n frames out of its candidates, taken into the picture where the method does so."""
+        """One pose for each of n frames out of its candidates; where the method takes poses into the picture, of the
+        mean and the best ones the one that then fits best.
+        """
         method = self.model.method
         picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
         if not method.refine_steps or not len(scores):
             return picked
+        poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
         with threads(parallel):
-            pose = self._refiner.refine(picked.pose, heights, looks, size, method.refine_steps)
-            return replace(picked, pose=pose, fit=self._refiner.fit(pose, heights, looks, moments, size))
+            pose, fit = self._refiner.best(poses, heights, looks, moments, size, method.refine_steps)
+        return replace(picked, pose=pose, fit=fit)
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array

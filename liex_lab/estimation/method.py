@@ -52,7 +52,8 @@ class Method:
     proposals: GrowthPlan | None = None  # trees that say where a start may be, for an animal of any orientation
     proposal_reach_mm: float = 0.0  # offsets of their features reach this far from the animal's centre
     base_rounds: int = 0  # rounds of the base joint where they are not as many as the others'; 0: as many
-    refine_steps: int = 0  # of taking the chosen pose into the picture
+    refine_steps: int = 0  # of taking a pose into the picture
+    refined: int = 0  # candidates that are taken there beside the mean of the best; the one that fits is chosen
     explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
 
     def rounds_of(self, joint: int) -> int:
@@ -85,7 +86,7 @@ class Method:
 
 _UNSET: dict[str, Any] = {
     "home_turn": (0.0, 0.0, 0.0), "proposals": None, "proposal_reach_mm": 0.0, "base_rounds": 0, "refine_steps": 0,
-    "explains": False,
+    "refined": 0, "explains": False,
 }  # fmt: skip
 _FULL_TURN = 10.0  # rad: no filter
 
@@ -117,7 +118,7 @@ _HAND: dict[str, Any] = {
     "regressors": GrowthPlan(10, 16, 12, 60, 0.3, 0.15, 0.4, 0.63),
     "metric": GrowthPlan(60, 9, 40, 100, 0.35, 0.3, 0.4, 0.5),
     "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63), "proposal_reach_mm": 100.0,
-    "explains": True, "refine_steps": 6,
+    "explains": True, "refine_steps": 4, "refined": 4,
     "reach_mm": 60.0, "base_lever_mm": 65.0, "joint_lever_mm": 40.0, "scale_lever_mm": 60.0, "keep_turned": 1.3,
     "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0,
     "survivors": 8, "pruner": GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _ROBUST_MM = 10.0  # in tenths of the balls' usual radius: a reading this far off counts a quarter
 _BESIDE = 0.3  # what a ball beside the animal weighs against a reading
+_BESIDE_MM = 4.0  # in that unit: what it weighs in the choice, if all balls were beside it
 # what it costs to leave the pose that the regressors found, in squares of that unit: a radian of the base, a unit of
 # place, of log scale, and a radian of a joint
 _PRIOR = np.array([1e4, 0.5, 1e4, 60.0])
@@ -46,7 +47,7 @@ class Refiner:
         return Refiner(s, kernels.Tree(s.parents, s.offsets, s.rest, free, limits, moves), body_of(balls))
 
     def refine(self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float, n_steps: int) -> Pose:
-        """Poses (n) in their view frames, each moved into its height map (n, S, S) cut as looks (n, 17) say."""
+        """Poses (n, K) in their view frames, each moved into its height map (n, S, S) cut as looks (n, 17) say."""
         unit = self.body.unit_mm * size
         rotation, position = pose.root.rotation.copy(), pose.root.translation.copy()
         angles, scale = pose.angles.copy(), pose.scale.copy()
@@ -55,11 +56,23 @@ class Refiner:
         return Pose(SE3(rotation, position), angles, scale)
 
     def fit(self, pose: Pose, heights: NDArray[np.int16], looks: Array, moments: Array, size: float) -> Array:
-        """How well poses (n) explain the picture (n, N_FIT); see `_explain.explain`."""
-        frames, n = pose.frames(self.skeleton), len(pose.scale)
-        out = np.empty((n, explaining.N_FIT), np.float32)
+        """How well poses (n, K) explain the picture (n, K, N_FIT); see `_explain.explain`."""
+        frames, (n, k), j = pose.frames(self.skeleton), pose.scale.shape, self.skeleton.n_joints
+        out = np.empty((n * k, explaining.N_FIT), np.float32)
         explaining.explain_all(
-            heights, looks, moments, np.arange(n, dtype=np.int32), frames.rotation, frames.translation, pose.scale,
-            np.full(n, size), self.body, out,
+            heights, looks, moments, np.repeat(np.arange(n, dtype=np.int32), k), frames.rotation.reshape(-1, j, 3, 3),
+            frames.translation.reshape(-1, j, 3), pose.scale.ravel(), np.full(n * k, size), self.body, out,
         )  # fmt: skip
-        return out.astype(float)
+        return out.reshape(n, k, -1).astype(float)
+
+    def best(
+        self, poses: Pose, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, n_steps: int
+    ) -> tuple[Pose, Array]:
+        """The one of poses (n, K) that lies best in the picture once it was taken there (n), and its fit (n, N_FIT)."""
+        moved = self.refine(poses, heights, looks, size, n_steps)
+        fit = self.fit(moved, heights, looks, moments, size)
+        left = (fit[..., explaining.OUT_OF] + fit[..., explaining.APART]) / explaining.MM_UNIT
+        left += _BESIDE_MM * fit[..., explaining.BESIDE] / explaining.SHARE_UNIT
+        rows = np.arange(len(fit)), left.argmin(axis=1)
+        root = SE3(moved.root.rotation[rows], moved.root.translation[rows])
+        return Pose(root, moved.angles[rows], moved.scale[rows]), fit[rows]

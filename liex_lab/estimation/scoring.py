@@ -103,6 +103,21 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
     return Pose(root, angles, scale)
 
 
+def with_best(skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array) -> Pose:
+    """Poses (n, 1 + k): the given ones (n), and the k candidates with the lowest scores (n, K) of each frame."""
+    order = np.argsort(scores, axis=1, kind="stable")[:, :k]
+    n, k, j = *order.shape, skeleton.n_joints
+    turned = np.take_along_axis(rotations, order[..., None, None, None], axis=1).reshape(n * k, 1, j, 3, 3)
+    joints = np.take_along_axis(positions, order[..., None, None], axis=1).reshape(n * k, 1, j, 3)
+    best = mean_pose(skeleton, turned, joints, np.ones((n * k, 1)))
+
+    def beside(first: Array, others: Array) -> Array:
+        return np.concatenate([first[:, None], others.reshape(n, k, *first.shape[1:])], axis=1)
+
+    root = SE3(beside(pose.root.rotation, best.root.rotation), beside(pose.root.translation, best.root.translation))
+    return Pose(root, beside(pose.angles, best.angles), beside(pose.scale, best.scale))
+
+
 def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float) -> Array:
     """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good scores (n, k)."""
     along = positions[:, :, -1] - positions[:, :, 0]

@@ -55,6 +55,21 @@ def shaken(pose: Pose, seed: int, strength: float = 1.0) -> Pose:
     return Pose(pose.root @ SE3.exp(twist), angles, pose.scale)
 
 
+def alone(pose: Pose) -> Pose:
+    """Poses (n) as (n, 1)."""
+    root = SE3(pose.root.rotation[:, None], pose.root.translation[:, None])
+    return Pose(root, pose.angles[:, None], pose.scale[:, None])
+
+
+def refined(pose: Pose, heights: np.ndarray, looks: np.ndarray, size: float, n_steps: int) -> Pose:
+    after = REFINER.refine(alone(pose), heights, looks, size, n_steps)
+    return Pose(SE3(after.root.rotation[:, 0], after.root.translation[:, 0]), after.angles[:, 0], after.scale[:, 0])
+
+
+def fit_of(pose: Pose, heights: np.ndarray, looks: np.ndarray, moments: np.ndarray, size: float) -> np.ndarray:
+    return REFINER.fit(alone(pose), heights, looks, moments, size)[:, 0]
+
+
 def off(a: Pose, b: Pose) -> np.ndarray:
     return np.linalg.norm(a.joints(HAND) - b.joints(HAND), axis=-1).mean(axis=1)
 
@@ -62,19 +77,19 @@ def off(a: Pose, b: Pose) -> np.ndarray:
 def test_poses_go_where_the_readings_are() -> None:
     crops, looks, true = hands()
     before = shaken(true, 1)
-    after = REFINER.refine(before, crops.heights, looks, 1.0, 8)
+    after = refined(before, crops.heights, looks, 1.0, 8)
     assert np.median(off(after, true)) < 0.6 * np.median(off(before, true))
     assert (off(after, true) < off(before, true)).mean() > 0.85
 
 
 def test_a_true_pose_stays_about_where_it_is() -> None:
     crops, looks, true = hands()
-    assert np.median(off(REFINER.refine(true, crops.heights, looks, 1.0, 8), true)) < 4.0
+    assert np.median(off(refined(true, crops.heights, looks, 1.0, 8), true)) < 4.0
 
 
 def test_joints_stay_within_their_limits_and_hinges_on_their_axes() -> None:
     crops, looks, true = hands()
-    after = REFINER.refine(shaken(true, 2, 3.0), crops.heights, looks, 1.0, 8)
+    after = refined(shaken(true, 2, 3.0), crops.heights, looks, 1.0, 8)
     low, high = HAND.limits[..., 0], HAND.limits[..., 1]
     assert ((after.angles >= low - 1e-12) & (after.angles <= high + 1e-12))[:, 1:].all()
     np.testing.assert_allclose(np.linalg.det(after.root.rotation), 1.0)
@@ -84,20 +99,34 @@ def test_joints_stay_within_their_limits_and_hinges_on_their_axes() -> None:
 def test_the_pose_that_came_in_is_left_as_it_was() -> None:
     crops, looks, true = hands()
     kept = true.angles.copy(), true.root.translation.copy()
-    REFINER.refine(true, crops.heights, looks, 1.0, 2)
+    refined(true, crops.heights, looks, 1.0, 2)
     np.testing.assert_array_equal(true.angles, kept[0])
     np.testing.assert_array_equal(true.root.translation, kept[1])
 
 
 def test_a_picture_of_nothing_moves_nothing_far() -> None:
     crops, looks, true = hands()
-    after = REFINER.refine(true, np.zeros_like(crops.heights), looks, 1.0, 8)
+    after = refined(true, np.zeros_like(crops.heights), looks, 1.0, 8)
     np.testing.assert_allclose(after.joints(HAND), true.joints(HAND), atol=1e-6)
+
+
+def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> None:
+    crops, looks, true = hands()
+    poses = [alone(shaken(true, 5, 6.0)), alone(true), alone(shaken(true, 6, 6.0))]
+    both = Pose(
+        SE3(*(np.concatenate([getattr(p.root, name) for p in poses], axis=1) for name in ("rotation", "translation"))),
+        np.concatenate([p.angles for p in poses], axis=1), np.concatenate([p.scale for p in poses], axis=1),
+    )  # fmt: skip
+    best, fit = REFINER.best(both, crops.heights, looks, crops.moments, 1.0, 2)
+    near = refined(true, crops.heights, looks, 1.0, 2)
+    taken = off(best, near) < 1e-9
+    assert taken.mean() > 0.9
+    np.testing.assert_allclose(fit[taken], fit_of(near, crops.heights, looks, crops.moments, 1.0)[taken])
 
 
 def test_the_true_pose_explains_the_picture_best() -> None:
     crops, looks, true = hands()
-    fit, wrong = (REFINER.fit(pose, crops.heights, looks, crops.moments, 1.0) for pose in (true, shaken(true, 3, 2.0)))
+    fit, wrong = (fit_of(pose, crops.heights, looks, crops.moments, 1.0) for pose in (true, shaken(true, 3, 2.0)))
     worse = wrong[:, [0, 1, 4, 5]] > fit[:, [0, 1, 4, 5]]
     assert (worse.mean(axis=0) > 0.9).all()
 
@@ -105,7 +134,7 @@ def test_the_true_pose_explains_the_picture_best() -> None:
 def test_explanations_agree_with_the_slow_twin() -> None:
     crops, looks, true = hands()
     pose = shaken(true, 4)
-    fit, frames = REFINER.fit(pose, crops.heights, looks, crops.moments, 1.07), pose.frames(HAND)
+    fit, frames = fit_of(pose, crops.heights, looks, crops.moments, 1.07), pose.frames(HAND)
     for k in range(4):
         slow = explained(crops.heights[k], looks[k], crops.moments[k, 5], BALLS, frames.rotation[k],
                          frames.translation[k], float(pose.scale[k]), 1.07)  # fmt: skip
@@ -183,4 +212,4 @@ def test_a_chain_is_refined_as_well() -> None:
     pose = Pose(SE3(turned, np.zeros((2, 3))), np.zeros((2, mouse.n_joints, 3)), np.ones(2))
     empty = np.zeros((2, 96, 96), np.int16)
     looks = np.tile([300.0, 300.0, 0.0, 0.0, *np.diag([1.0, -1.0, -1.0]).ravel(), 600.0, 0.0, 0.0, 1.0], (2, 1))
-    assert np.isfinite(refiner.refine(pose, empty, looks, 1.0, 3).joints(mouse)).all()
+    assert np.isfinite(refiner.refine(alone(pose), empty, looks, 1.0, 3).joints(mouse)).all()

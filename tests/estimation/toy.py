@@ -110,7 +110,7 @@ def tiny(variant: str) -> Method:
     if variant == "seen":
         proposals = GrowthPlan(4, 12, 4, 60, 0.3, 0.15, 0.3, 0.63)
         return replace(tiny("default"), proposals=proposals, proposal_reach_mm=40.0, base_rounds=3, explains=True,
-                       refine_steps=3)  # fmt: skip
+                       refine_steps=3, refined=2)  # fmt: skip
     method = METHODS[variant]
     return replace(
         method, rounds=2, n_candidates=8, training_candidates=4,
