@@ -16,6 +16,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
 from liex_lab.estimation._explain import Body
 from liex_lab.estimation.cascade import ImageSet, body_of
+from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
@@ -150,27 +151,27 @@ class PoseEstimator:
                 values[better] for values in (other_looks, found[0], found[1], found[3])
             )
         usable = crops.found
-        picked = self.pick(crops.heights[usable], looks[usable], crops.moments[usable], size, rotations[usable],
-                           positions[usable], scores[usable], parallel)  # fmt: skip
+        images = ImageSet(crops.heights[usable], looks[usable], crops.moments[usable])
+        picked = self.pick(images, size, rotations[usable], positions[usable], scores[usable], parallel)
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops)
 
     def pick(
-        self, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, rotations: Array, positions: Array,
-        scores: Array, parallel: bool = True,
-    ) -> Chosen:  # fmt: skip
-        """One pose for each of n frames out of its candidates; where the method takes poses into the picture, of the
-        mean and the best ones the one that then fits best.
+        self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
+    ) -> Chosen:
+        """One pose for each of n height maps out of its candidates, after the last correction.
+
+        Where the method takes poses into the picture, it is of the mean and the best ones the one that then fits best.
         """
         method = self.model.method
         picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
-        if not method.refine_steps or not len(scores):
-            return picked
-        poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
         with threads(parallel):
-            pose, fit = self._refiner.best(poses, heights, looks, moments, size, method.refine_steps)
-        return replace(picked, pose=pose, fit=fit)
+            if method.refine_steps and len(scores):
+                poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
+                pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
+                picked = replace(picked, pose=pose, fit=fit)
+            return corrected(picked, self.model, images, size)
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array

@@ -21,7 +21,8 @@ from liex_lab.estimation.method import Method
 from liex_lab.forests.forest import Forest
 
 SCHEMA = 2
-_FORESTS = ("metric", "expectation", "pruner", "proposals")  # that follow the regressors, as far as a model has them
+# that follow the regressors, as far as a model has them
+_FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
 _DAMAGE = (
     OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
     lzma.LZMAError,
@@ -54,7 +55,7 @@ class Model:
     """Everything an estimator needs.
 
     expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
-    is the small metric that sees the base joint only.
+    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more.
     """
 
     cascade: Cascade
@@ -64,6 +65,7 @@ class Model:
     calibration: Calibration = field(default_factory=Calibration)
     card: dict[str, Any] = field(default_factory=dict)
     pruner: Forest | None = None
+    corrector: Forest | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -136,8 +138,11 @@ class Model:
         named = dict(zip(extra, forests[n_regressors:], strict=True))
         stops = np.cumsum(rounds).tolist()
         each = [forests[stop - n : stop] for n, stop in zip(rounds, stops, strict=True)]
-        cascade = Cascade(skeleton, method, each, named.get("proposals"))
-        return Model(cascade, named["metric"], named.get("expectation"), table, calibration, card, named.get("pruner"))
+        metric, *others = (named.get(name) for name in _FORESTS)
+        assert metric is not None
+        expectation, pruner, corrector, proposals = others
+        cascade = Cascade(skeleton, method, each, proposals)
+        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector)
 
     def digest(self) -> str:
         """SHA-256 of the model file."""

@@ -12,7 +12,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _explain as explaining
 from liex_lab.estimation import _refine as kernels
-from liex_lab.estimation.cascade import body_of
+from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.geometry import SE3
 
 Array = NDArray[np.float64]
@@ -65,12 +65,10 @@ class Refiner:
         )  # fmt: skip
         return out.reshape(n, k, -1).astype(float)
 
-    def best(
-        self, poses: Pose, heights: NDArray[np.int16], looks: Array, moments: Array, size: float, n_steps: int
-    ) -> tuple[Pose, Array]:
+    def best(self, poses: Pose, images: ImageSet, size: float, n_steps: int) -> tuple[Pose, Array]:
         """The one of poses (n, K) that lies best in the picture once it was taken there (n), and its fit (n, N_FIT)."""
-        moved = self.refine(poses, heights, looks, size, n_steps)
-        fit = self.fit(moved, heights, looks, moments, size)
+        moved = self.refine(poses, images.heights, images.looks, size, n_steps)
+        fit = self.fit(moved, images.heights, images.looks, images.moments, size)
         left = (fit[..., explaining.OUT_OF] + fit[..., explaining.APART]) / explaining.MM_UNIT
         left += _BESIDE_MM * fit[..., explaining.BESIDE] / explaining.SHARE_UNIT
         rows = np.arange(len(fit)), left.argmin(axis=1)

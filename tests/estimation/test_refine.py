@@ -15,6 +15,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.camera import Camera
 from liex_lab.estimation import _refine as kernels
 from liex_lab.estimation._explain import place_balls
+from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.refine import Refiner
 from liex_lab.geometry import SE3, so3
 from liex_lab.recordings.arena import Floor
@@ -117,7 +118,7 @@ def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> No
         SE3(*(np.concatenate([getattr(p.root, name) for p in poses], axis=1) for name in ("rotation", "translation"))),
         np.concatenate([p.angles for p in poses], axis=1), np.concatenate([p.scale for p in poses], axis=1),
     )  # fmt: skip
-    best, fit = REFINER.best(both, crops.heights, looks, crops.moments, 1.0, 2)
+    best, fit = REFINER.best(both, ImageSet(crops.heights, looks, crops.moments), 1.0, 2)
     near = refined(true, crops.heights, looks, 1.0, 2)
     taken = off(best, near) < 1e-9
     assert taken.mean() > 0.9
