@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,9 @@ from liex_lab.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.crops import Foreground
 
+Array = NDArray[Any]
 N_FRAMES = 128
 N_REPEATS = 5
 _CANDIDATES = (5, 10, 20, 40)
@@ -31,7 +32,7 @@ class _Footage:
 
     name: str
     frames: NDArray[np.float32]
-    scene: Scene
+    scene: Foreground
     size: float
 
     @property
@@ -70,6 +71,8 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         one, two = (_frames_per_s(default, footage, parallel) for parallel in (False, True))
         progress(2, 5, "timing the others")
         ratios = {name: two / _frames_per_s(rival, footage, True) for name, rival in rivals.items()}
+        paper = cast("PoseEstimator", rivals["paper"])
+        ratios["paper_one_by_one"] = two * best_seconds(partial(_one_by_one, paper, footage)) / N_FRAMES
         progress(3, 5, "timing the stages")
         stages = _stages(default, footage)
         progress(4, 5, "timing what makes a frame dearer")
@@ -86,26 +89,24 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         "cost_ms": costs,
         "machine": f"{platform.processor() or platform.machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
         "protocol": f"{N_FRAMES} rendered {footage.pixels} frames in memory, foreground to final pose, best of "
-        f"{N_REPEATS}; ratios on {cores} cores in the same run; stages and costs in ms a frame on one core: `joints` "
-        "is the whole with that many joints' regressors, `candidates` unpruned, `pixels` the foreground alone",
+        f"{N_REPEATS}; ratios on {cores} cores in the same run, `paper` on our engine, `paper_one_by_one` compiled but "
+        "as published: every candidate walks down every tree by itself, and leaves are averaged; stages and costs in "
+        "ms a frame on one core: `joints` is the whole with that many joints' regressors, `candidates` unpruned, "
+        "`pixels` the foreground alone",
     }
 
 
 def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
     """Frames of a rendered recording, as many as are timed, and the scene learned from it."""
-    from liex_lab.pipelines.build import plan_of
+    from liex_lab.pipelines.build import build_scene, plan_of
 
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.recordings.foreground import Scene
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
     recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
     plan = plan_of(animal)
-    scene, sample = Scene.learn(
-        recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm), 96, plan.foreground.min_height_mm,
-        estimator.skeleton.view,
-    )  # fmt: skip
+    scene, sample = build_scene(recording, plan, estimator.skeleton, 96)
     frames = recording.depths(0, min(len(recording), N_FRAMES))  # whole ones, which those of the sample need not be
     frames = frames[np.arange(N_FRAMES) % len(frames)]
     return _Footage(recording.name, frames, scene, estimator.find_size(sample, scene))
@@ -131,6 +132,34 @@ def _frames_per_s(subject: PoseEstimator | Baseline, footage: _Footage, parallel
     return len(footage.frames) / best_seconds(job)
 
 
+def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
+    """Algorithm 1 as it is written, from frames to the scores of all candidates: no two of them share a step."""
+    from liex_lab.estimation.cascade import Candidates, ImageSet
+    from liex_lab.estimation.initial import draw_starts, start_poses
+    from liex_lab.estimation.training import base_at_front
+    from liex_lab.forests.forest import predict
+
+    method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
+    crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
+    images = ImageSet(crops.heights, footage.scene.looks(crops, method.camera_view), crops.moments)
+    n, k = len(crops.heights), method.n_candidates
+    rotation, position, scale = start_poses(
+        crops.moments, draw_starts(np.random.default_rng(0), 1, k), np.ones((n, k)), skeleton.length,
+        base_at_front(skeleton), method.axis_start, method.camera_view,
+    )  # fmt: skip
+    image = np.repeat(np.arange(n, dtype=np.int32), k)
+    poses = Candidates.start(
+        skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), np.ones(n * k)
+    )
+    for joint, rounds in zip(skeleton.solved, cascade.forests, strict=True):
+        if joint:
+            cascade.place(poses, joint)
+        for forest in rounds:
+            cascade.apply(poses, joint, predict(forest, cascade.samples(images, poses, [joint])))
+    cascade.place_ends(poses)
+    return predict(paper.model.metric, cascade.samples(images, poses, list(range(skeleton.n_joints))))
+
+
 def _ms(job: Callable[[], Any]) -> float:
     """Milliseconds a frame."""
     return 1000.0 * best_seconds(job) / N_FRAMES
@@ -138,17 +167,17 @@ def _ms(job: Callable[[], Any]) -> float:
 
 def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
     """Milliseconds a frame on one core of what a frame goes through."""
-    from liex_lab.estimation.scoring import choose
+    from liex_lab.estimation.cascade import ImageSet
 
     frames, scene, size = footage.frames, footage.scene, footage.size
     crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
     looks = scene.looks(crops, default.model.method.camera_view)
     rotations, positions, _, scores = default.candidates(crops, looks, size)
+    images = ImageSet(crops.heights, looks, crops.moments)
     return {
         "foreground": _ms(lambda: scene.extract(frames, size, False, default.model.method.camera_view)),
         "candidates": _ms(lambda: default.candidates(crops, looks, size, False)),
-        "choice": _ms(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
-                                     rotations, positions, scores)),
+        "choice": _ms(lambda: default.pick(images, size, rotations, positions, scores, False)),
     }  # fmt: skip
 
 
@@ -176,15 +205,8 @@ def _cut(footage: _Footage) -> None:
 
 def _sizes(footage: _Footage) -> list[_Footage]:
     """The same frames with every second pixel and with all of them."""
-    from liex_lab.recordings.arena import Floor
-
-    out, scene = [], footage.scene
+    out = []
     for step in _SHRINK:
-        camera, cut = scene.camera.every(step), (slice(None, None, step), slice(None, None, step))
-        floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, camera)
-        smaller = replace(
-            scene, camera=camera, floor=floor, background=np.ascontiguousarray(scene.background[cut]),
-            limit=np.ascontiguousarray(scene.limit[cut]), on_floor=np.ascontiguousarray(scene.on_floor[cut]),
-        )  # fmt: skip
-        out.append(replace(footage, frames=np.ascontiguousarray(footage.frames[(slice(None), *cut)]), scene=smaller))
+        frames = np.ascontiguousarray(footage.frames[:, ::step, ::step])
+        out.append(replace(footage, frames=frames, scene=footage.scene.every(step)))
     return out

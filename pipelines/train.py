@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from liex_lab.estimation.method import Method
     from liex_lab.estimation.model import Model
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.foreground import Crops
     from liex_lab.recordings.windows import TrainingWindows
 
 Array = NDArray[np.float64]
@@ -39,20 +39,32 @@ class Recipe:
     n_correction: int = 12_288  # further images, for the last correction
     n_calibration: int = 24_576  # and further ones, for the predicted error
     degraded_share: float = 0.5
-    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
+    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (45.0, 144), (100.0, 232))
 
 
 _CALIBRATION, _CORRECTION = 1, 2  # numbers of their own random numbers, so that each can be made again by itself
+# of the images that an animal's predicted error is calibrated on show bodies that vary as individuals do; intervals for
+# bodies that vary far more, as the others do, are wider than most animals need
+_ORDINARY_SHARE = {"mouse": 0.5}
 _AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
-RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
+RECIPES = {
+    "default": Recipe(),
+    "paper": Recipe(n_images=10_240, n_correction=0, degraded_share=0.0, sizes=((0.0, 144),)),
+}
 _AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
 _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # of an animal and a variant, where it is not the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES),
-    ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
+    ("fish", "paper"): Recipe(
+        seed=31, n_images=6_144, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)
+    ),
+    ("hand", "default"): Recipe(n_images=20_480, n_correction=0, n_calibration=4_096, sizes=((0.0, 320),)),
+    ("hand", "paper"): Recipe(
+        n_images=8_192, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 320),)
+    ),
 }
 
 
@@ -110,6 +122,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     from liex_lab.estimation.calibration import calibrate, with_corrector
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
+    from liex_lab.recordings.worlds import world_of
 
     rng = np.random.default_rng(recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
@@ -125,7 +138,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
-        "images": "rendered from a seed; no recording of an animal was used",
+        "images": world_of(skeleton).sources,
     }  # fmt: skip
     model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
     if method.corrector is not None and recipe.n_correction:
@@ -135,15 +148,16 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
         first = recipe.n_images + recipe.n_correction
-        unseen = rendered_set(skeleton, method, recipe, first, recipe.n_calibration, silent)
+        unseen = calibration_set(skeleton, method, recipe, first)
         model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
     return model
 
 
 def rendered_set(
-    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress
-) -> TrainingSet:
-    """N training images from number `first` on, cut out by the product's own foreground."""
+    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress,
+    family: str = "augmented",
+) -> TrainingSet:  # fmt: skip
+    """N training images from number `first` on, of bodies of a family, cut out by the product's own foreground."""
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.recordings.windows import BLOCK
     from liex_lab.recordings.worlds import world_of
@@ -155,49 +169,67 @@ def rendered_set(
         progress(number - begin, blocks, "rendering training images")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
         (windows,) = world.training_blocks(
-            recipe.seed, 1, first=number, family="augmented", degraded_share=recipe.degraded_share,
+            recipe.seed, 1, first=number, family=family, degraded_share=recipe.degraded_share,
             spine_mm=spine_mm or None, window_px=window_px,
         )  # fmt: skip
         parts.append(cut_out(skeleton, method, windows))
     return TrainingSet.join(parts)
 
 
+def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
+    """Training images from number `first` on as a model is calibrated on them: some of ordinary bodies, see
+    `_ORDINARY_SHARE`, the rest as varied as those that it was trained on.
+    """
+    from liex_lab.estimation.training import TrainingSet
+
+    ordinary = round(_ORDINARY_SHARE.get(skeleton.name, 0.0) * recipe.n_calibration)
+    varied = rendered_set(skeleton, method, recipe, first, recipe.n_calibration - ordinary, silent)
+    if not ordinary:
+        return varied
+    first += recipe.n_calibration - ordinary
+    return TrainingSet.join([varied, rendered_set(skeleton, method, recipe, first, ordinary, silent, "train")])
+
+
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
     """Training images of what the foreground found in the windows, with the truth in their view frames."""
+    from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.foreground import SPREADS, Windows
+    from liex_lab.recordings.nearest import NearestWindows
 
-    size = windows.spine_mm / skeleton.length
-    depth, background = (
-        picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
-        for picture in (windows.depth, windows.background)
-    )
-    cut = Windows(depth, background, windows.intrinsics, windows.origin.astype(float), windows.floor, skeleton.view)
+    size, origin = windows.spine_mm / skeleton.length, windows.origin.astype(float)
     shown = size if method.session_size else np.ones(len(size))
-    parts = [cut_rank(skeleton, method, windows, cut, shown, rank) for rank in (0, 1)]
-    return TrainingSet.join(parts)
+    if skeleton.view.foreground == FOREGROUNDS[1]:
+        held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
+        cuts = [held.extract(shown, method.camera_view, rank) for rank in (0, 1)]
+    else:
+        depth, background = (
+            picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+            for picture in (windows.depth, windows.background)
+        )
+        cut = Windows(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+        area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
+        # a scene learned from a recording knows how much its readings spread
+        least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+        cuts = [cut.extract(shown, area, least, method.camera_view, rank) for rank in (0, 1)]
+    return TrainingSet.join([with_truth(skeleton, method, windows, crops, looks) for crops, looks in cuts])
 
 
-def cut_rank(
-    skeleton: Skeleton, method: Method, windows: TrainingWindows, cut: Windows, shown: Array, rank: int
-) -> TrainingSet:
-    """Training images of the blobs that come first (rank 0) or second in likeness to the animal's area."""
+def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
+    """Training images of blobs that were cut from the windows, with the truth in their view frames."""
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.geometry import SE3
-    from liex_lab.recordings.foreground import SPREADS
+    from liex_lab.recordings.crops import view_of
 
-    size = windows.spine_mm / skeleton.length
-    area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
-    # a scene learned from a recording knows how much its readings spread
-    least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-    crops, looks = cut.extract(shown, area, least, method.camera_view, rank)
-    rotation = looks[:, 4:13].reshape(-1, 3, 3)
-    T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
+    T_view_camera = view_of(looks)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
-    middle = frames.translation.mean(axis=1)
+    joints = frames.translation
+    if windows.own_bones:
+        joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
+    middle = joints.mean(axis=1)
     off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
     if method.camera_view:  # what is beside it in depth is another thing as well
         off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
@@ -205,8 +237,8 @@ def cut_rank(
     good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
     return TrainingSet(
         ImageSet(crops.heights[good], looks[good], crops.moments[good]),
-        Truth(frames.rotation[good], frames.translation[good], pose.scale[good]),
-        size[good],
+        Truth(frames.rotation[good], joints[good], pose.scale[good]),
+        (windows.spine_mm / skeleton.length)[good],
         animal[good],
     )
 

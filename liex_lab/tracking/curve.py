@@ -191,8 +191,9 @@ def short_gaps(
 
 def _flips(seen: Observations, track: Track) -> list[Flip]:
     """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
-    ends = seen.joints([0, track.skeleton.n_joints - 1])[:, 0]
-    along = track.joints_mm[:, -1] - track.joints_mm[:, 0]
+    tip = track.skeleton.tip
+    ends = seen.joints([0, tip])[:, 0]
+    along = track.joints_mm[:, tip] - track.joints_mm[:, 0]
     exchanged = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)
