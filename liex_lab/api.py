@@ -57,6 +57,25 @@ def flip_session(
     )
 
 
+def follow_live(
+    source: str, plan: Plan, *, replay: bool = False, to: str = "viewer", patience_s: float = 3.0,
+    progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured latencies."""
+    from liex_lab.pipelines.live import follow_live as job
+    from liex_lab.pipelines.live import open_live
+    from liex_lab.sessions.live import LiveView
+
+    arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
+    numbers, _ = job(
+        arriving, plan, progress=progress,
+        viewer=lambda tracker, arriving: LiveView(
+            arriving.name, arriving.camera, tracker.subject.T_arena_camera, tracker.subject.skeleton, to
+        ),
+    )  # fmt: skip
+    return numbers
+
+
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     """The bundled sample recording as a session; an earlier session of the demo is replaced."""
     from liex_lab.catalog import find_sample

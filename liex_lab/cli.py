@@ -294,6 +294,27 @@ def evaluate_reference(
 
 
 @app.command()
+def live(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")],
+    plan: PlanName = "mouse",
+    settings: Settings = None,
+    replay: Annotated[bool, typer.Option("--replay", help="Send a whole recording at its own pace.")] = False,
+    to: Annotated[str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")] = "viewer",
+    patience_s: Annotated[float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")] = 3.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.api import follow_live
+
+    with progress_bar() as progress:
+        result = follow_live(source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@app.command()
 def flip(
     session: SessionPath,
     start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],

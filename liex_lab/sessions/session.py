@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 FILES = (
     "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
     "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "columns.json", "session.rrd",
-    "session.mcap",
+    "session.mcap", "observations.npz",
 )  # fmt: skip
-_OPTIONAL = {"kinematics.parquet", "summary.csv"}
+_OPTIONAL = {"kinematics.parquet", "summary.csv", "observations.npz"}
 
 
 class Session:

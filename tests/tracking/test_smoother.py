@@ -36,9 +36,9 @@ def by_least_squares(times, y, r, q):
         step = np.hstack([-np.array([[1.0, dt], [0.0, 1.0]]), np.eye(2)])
         rows = slice(2 * t - 2, 2 * t + 2)
         precision[rows, rows] += step.T @ np.linalg.inv(noise) @ step
-    for t in np.flatnonzero(np.isfinite(r)):
-        precision[2 * t, 2 * t] += 1.0 / r[t]
-        right[2 * t] += y[t] / r[t]
+    for k in np.flatnonzero(np.isfinite(r)):
+        precision[2 * k, 2 * k] += 1.0 / r[k]
+        right[2 * k] += y[k] / r[k]
     covariance = np.linalg.inv(precision)
     mean = covariance @ right
     return mean[::2], mean[1::2], np.array([covariance[2 * t : 2 * t + 2, 2 * t : 2 * t + 2] for t in range(n)])
