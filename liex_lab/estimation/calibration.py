@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
-from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, choose, clue_samples
+from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
+from liex_lab.estimation.settle import Settler
 from liex_lab.estimation.training import TrainingSet, quantised
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
@@ -18,7 +21,8 @@ from liex_lab.recordings.foreground import Crops
 Array = NDArray[np.float64]
 
 _CAP_MM = 25.0  # at the reference length; a lost pose must not decide what an ordinary score means
-_SIZE_SD = 0.05  # how far off (log) the size of a session is, once it has been estimated over many frames
+# how far off (log) the size of a session is once it has been estimated over many frames, where poses settle, and before
+_SIZE_SD, _SETTLED_SIZE_SD, _GUESS_SD = 0.05, 0.02, 0.08
 _DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
 _GROUP = 50  # images share a size guess, as the frames of a recording do
 _EXPECTATION = GrowthPlan(
@@ -41,14 +45,26 @@ class Trial:
     clues: Samples
 
 
-def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
-    """Let a model choose. Images are taken in order of size, and each group of them shares one guess of it."""
+@dataclass(frozen=True)
+class _Picks:
+    """What a model chose for some images: rows (n,) of the set, the size that was assumed, how they were cut."""
+
+    rows: NDArray[np.int64]
+    size: float
+    looks: Array
+    moments: Array
+    chosen: Chosen
+
+
+def _picks(model: Model, data: TrainingSet, size_sd: float, rng: np.random.Generator) -> Iterator[_Picks]:
+    """Let a model choose. Images are taken in order of size, and each group of them shares one guess of it, off by
+    size_sd (log).
+    """
     animals = np.flatnonzero(data.animal)
     order = animals[np.argsort(data.size[animals], kind="stable")]
-    estimator, skeleton = PoseEstimator(model), model.skeleton
-    scores_of, spreads, joint_errors, clues = [], [], [], []
+    estimator = PoseEstimator(model)
     for rows in np.array_split(order, max(1, len(order) // _GROUP)):
-        size = float(np.median(data.size[rows]) * np.exp(_SIZE_SD * rng.standard_normal()))
+        size = float(np.median(data.size[rows]) * np.exp(size_sd * rng.standard_normal()))
         size = size if model.method.session_size else 1.0
         looks, moments = data.images.looks[rows], data.images.moments[rows]
         crops = Crops(
@@ -56,14 +72,33 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
             np.full(len(rows), 1), moments, looks[:, 13], np.ones(len(rows), np.int64),
         )  # fmt: skip
         rotations, positions, _, scores = estimator.candidates(crops, looks, size)
-        picked = choose(skeleton, model.method, model.calibration, size, rotations, positions, scores)
-        off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[rows], axis=-1)
-        scores_of.append(picked.score)
-        spreads.append(picked.spread)
-        joint_errors.append(off / size)
-        clues.append(clue_samples(picked, skeleton, moments, looks, size).scalars)
-    scalars = np.concatenate(clues)
-    blank = clue_samples(picked, skeleton, moments, looks, size)
+        picked = estimator.pick(crops.heights, looks, size, rotations, positions, scores)
+        yield _Picks(rows, size, looks, moments, picked)
+
+
+def fit_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> Settler:
+    """How the poses that a model chooses settle, from images with known truth."""
+    picks = list(_picks(model, data, _GUESS_SD, rng))
+    rows = np.concatenate([p.rows for p in picks])
+    sizes = np.concatenate([np.full(len(p.rows), p.size) for p in picks])
+    pose = Pose.join([p.chosen.pose for p in picks])
+    return Settler.fit(
+        model.skeleton, pose, data.images.heights[rows], data.images.looks[rows], sizes, data.truth.positions[rows],
+        data.size[rows],
+    )  # fmt: skip
+
+
+def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
+    """What a model's choices are worth, see `_picks`."""
+    skeleton = model.skeleton
+    scores_of, spreads, joint_errors, clues = [], [], [], []
+    for p in _picks(model, data, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD, rng):
+        off = np.linalg.norm(p.chosen.pose.joints(skeleton) - data.truth.positions[p.rows], axis=-1)
+        scores_of.append(p.chosen.score)
+        spreads.append(p.chosen.spread)
+        joint_errors.append(off / p.size)
+        clues.append(clue_samples(p.chosen, skeleton, p.moments, p.looks, p.size))
+    scalars, blank = np.concatenate([samples.scalars for samples in clues]), clues[-1]
     n = len(scalars)
     samples = Samples(
         blank.heights, np.zeros(n, np.int32), np.ones(n, np.float32),
@@ -87,6 +122,8 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     The forest predicts the true error of the chosen pose. The ratios of true to predicted error that bound 90 % of the
     images, and the limit of what is doubtful, come from predictions for images that their forest has not seen.
     """
+    if model.method.settle:
+        model = replace(model, settler=fit_settler(model, data, rng).table)
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
     capped = np.minimum(error, _CAP_MM * model.skeleton.relative_size)

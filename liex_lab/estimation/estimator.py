@@ -17,6 +17,7 @@ from liex_lab.estimation import _estimate as kernels
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.settle import Settler
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
@@ -130,8 +131,8 @@ class PoseEstimator:
                 values[better] for values in (other_looks, found[0], found[1], found[3])
             )
         usable = crops.found
-        picked = choose(self.skeleton, method, self.model.calibration, size,
-                        rotations[usable], positions[usable], scores[usable])  # fmt: skip
+        picked = self.pick(crops.heights[usable], looks[usable], size, rotations[usable], positions[usable],
+                           scores[usable], parallel)  # fmt: skip
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         T_camera_view = SE3(
@@ -139,6 +140,18 @@ class PoseEstimator:
             np.stack([np.zeros(len(looks)), np.zeros(len(looks)), crops.distance], axis=-1),
         ).inverse()
         return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+
+    def pick(
+        self, heights: NDArray[np.int16], looks: Array, size: float, rotations: Array, positions: Array, scores: Array,
+        parallel: bool = True,
+    ) -> Chosen:  # fmt: skip
+        """One pose for each of n frames out of its candidates, settled where the model does so."""
+        picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
+        if self.model.settler is None or not len(scores):
+            return picked
+        with threads(parallel):
+            pose, grown = Settler(self.skeleton, self.model.settler).settle(picked.pose, heights, looks, size)
+        return replace(picked, pose=pose, told_scale=size * np.exp(grown))
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
@@ -164,7 +177,7 @@ class PoseEstimator:
             return 1.0
         for _ in range(_SIZE_PASSES):
             estimates = self.estimate(sample, scene, guess)
-            scale, score = estimates.chosen.pose.scale, estimates.chosen.score
+            scale, score = estimates.chosen.told_scale, estimates.chosen.score
             seen = np.flatnonzero(estimates.found)
             if not len(seen):
                 raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
@@ -210,4 +223,5 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
     return Chosen(
         pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
         rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+        rows(picked.told_scale),
     )  # fmt: skip

@@ -54,7 +54,7 @@ class Model:
     """Everything an estimator needs.
 
     expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
-    is the small metric that sees the base joint only.
+    is the small metric that sees the base joint only; settler: the table of `settle.Settler`, where the method settles.
     """
 
     cascade: Cascade
@@ -64,6 +64,7 @@ class Model:
     calibration: Calibration = field(default_factory=Calibration)
     card: dict[str, Any] = field(default_factory=dict)
     pruner: Forest | None = None
+    settler: NDArray[np.float64] | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -91,6 +92,8 @@ class Model:
         forests += [getattr(self, name) for name in extra]
         for k, forest in enumerate(forests):
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
+        if self.settler is not None:
+            arrays["settler"] = self.settler
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
             for name, values in arrays.items():
@@ -112,6 +115,7 @@ class Model:
                     raise ModelError(f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab")
                 names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
                 forests = [_join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names]
+                settler = archive["settler"] if "settler" in archive.files else None
             method = Method.from_dict(head["method"])
             values = head["calibration"]
             for name in ("quantiles", "joint_share"):
@@ -130,7 +134,8 @@ class Model:
             raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
         cascade = Cascade(skeleton, method, [forests[k * n : (k + 1) * n] for k in range(len(skeleton.solved))])
         named = dict(zip(extra, forests[n_regressors:], strict=True))
-        return Model(cascade, named["metric"], named.get("expectation"), table, calibration, card, named.get("pruner"))
+        return Model(cascade, named["metric"], named.get("expectation"), table, calibration, card, named.get("pruner"),
+                     settler)  # fmt: skip
 
     def digest(self) -> str:
         """SHA-256 of the model file."""
