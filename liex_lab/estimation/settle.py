@@ -19,6 +19,8 @@ from liex_lab.estimation import _settle as kernels
 Array = NDArray[np.float64]
 
 _MOST_SHARE = 0.08  # of the length: readings farther from the back than this are not the back
+SURE_SHARE = 1 / 3  # of the frames tell the size: those that see most of the animal's far end
+N_OTHERS = 15  # clues that are not of one joint
 _RIDGE = 1e-2  # of the features' variance
 _LEAST_SPREAD = 1e-6
 _TAIL = 0.01  # of what a clue was seen to be: beyond it is taken for the last that was seen
@@ -27,8 +29,8 @@ _SLID_SHARE, _SIZE_LOG = 0.1, 0.25  # of the length, and in logarithms: poses fa
 
 @dataclass(frozen=True)
 class Settler:
-    """table (F, J + 4): the least and the most of each of the `clues`, and the weights that lead from them to the rise of
-    each joint and the slide along the chain, both over the animal's length, and the logarithm of its true over its
+    """table (F, J + 4): the least and most of each of the `clues`, and the weights that lead from them to the rise of
+    each joint, the slide along the chain (both over the animal's length) and the logarithm of the true over the
     assumed size.
     """
 
@@ -57,16 +59,11 @@ class Settler:
         x, y = features[good], labels[good]
         bounds = np.quantile(x, [_TAIL, 1.0 - _TAIL], axis=0)
         x = np.clip(x, *bounds)
-        middle, spread = x.mean(axis=0), x.std(axis=0)
-        per = np.where(spread > _LEAST_SPREAD, 1.0 / np.maximum(spread, _LEAST_SPREAD), 0.0)  # a constant tells nothing
-        scaled = (x - middle) * per
-        ridge = _RIDGE * len(x) * np.eye(x.shape[1])
-        weights = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ (y - y.mean(axis=0))) * per[:, None]
-        weights[0] = y.mean(axis=0) - middle @ weights
-        return Settler(skeleton, np.column_stack([*bounds, weights]))
+        # from all of them: those that see its far end best were mostly taken for smaller than they are
+        return Settler(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
-    def settle(self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float) -> tuple[Pose, Array]:
-        """Poses (n) put right, and what each says about the animal's size: (n,) the logarithm of true over assumed."""
+    def settle(self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float) -> Settled:
+        """Poses (n) put right, and what each of them says about the animal's size."""
         skeleton, n = self.skeleton, len(pose.scale)
         joints = pose.joints(skeleton)
         seen = clues(skeleton, pose, joints, heights, looks, np.full(n, size))
@@ -74,7 +71,35 @@ class Settler:
         length = skeleton.length * size
         moved = joints + length * told[:, -2, None, None] * tangents(joints)
         moved[..., 2] += length * told[:, :-2]
-        return Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]), told[:, -1]
+        return Settled(Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]), told[:, -1], far_end_seen(seen))
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Poses (n) under their backs; grown (n,): the logarithm of the animal's true over its assumed size as each tells;
+    clear (n,): how much of the animal's far end it sees, without which no one knows its size.
+    """
+
+    pose: Pose
+    grown: Array
+    clear: Array
+
+
+def _linear(x: Array, y: Array) -> Array:
+    """Ridge regression: weights (F, K) from clues (n, F), of which the first is constant, to labels (n, K)."""
+    middle, spread = x.mean(axis=0), x.std(axis=0)
+    per = np.where(spread > _LEAST_SPREAD, 1.0 / np.maximum(spread, _LEAST_SPREAD), 0.0)  # a constant tells nothing
+    scaled = (x - middle) * per
+    ridge = _RIDGE * len(x) * np.eye(x.shape[1])
+    weights = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ (y - y.mean(axis=0))) * per[:, None]
+    weights[0] = y.mean(axis=0) - middle @ weights
+    return np.asarray(weights)
+
+
+def far_end_seen(seen: Array) -> Array:
+    """How much (n,) is seen of the last quarter of a chain, out of `clues` (n, F)."""
+    j = (seen.shape[1] - N_OTHERS) // 2
+    return np.asarray(seen[:, 1 + j + 3 * j // 4 : 1 + 2 * j].mean(axis=1))
 
 
 def tangents(joints: Array) -> Array:

@@ -99,19 +99,21 @@ def test_wrong_poses_settle_and_tell_the_size(settler):
     heights = maps(true)
     for i in range(len(size)):
         one = off[np.array([i])]
-        settled, grown = settler.settle(one, heights[i : i + 1], looks, float(size[i]))
-        for pose, errors in ((one, before), (settled, after)):
+        settled = settler.settle(one, heights[i : i + 1], looks, float(size[i]))
+        for pose, errors in ((one, before), (settled.pose, after)):
             errors.append(np.abs(pose.joints(FISH)[0, :, 2] - true.joints(FISH)[i, :, 2]).mean())
-        told.append(np.log(size[i] / true.scale[i]) + grown[0])
+        told.append(np.log(size[i] / true.scale[i]) + settled.grown[0])
+        assert settled.clear[0] > 0.5
     assert np.mean(after) < 0.35 * np.mean(before)
     assert np.mean(np.abs(told)) < 0.5 * np.mean(np.abs(np.log(size / true.scale)))
 
 
 def test_a_pose_that_sees_nothing_stays_near_where_it_is(settler):
     off, size = wrong(fish(1, 7), 8)
-    settled, grown = settler.settle(off, np.zeros((1, SIDE, SIDE), np.int16), look()[None], float(size[0]))
-    assert np.linalg.norm(settled.joints(FISH) - off.joints(FISH), axis=-1).max() < 6.0
-    assert abs(grown[0]) < 0.5
+    settled = settler.settle(off, np.zeros((1, SIDE, SIDE), np.int16), look()[None], float(size[0]))
+    assert np.linalg.norm(settled.pose.joints(FISH) - off.joints(FISH), axis=-1).max() < 6.0
+    assert abs(settled.grown[0]) < 0.5
+    assert settled.clear[0] == 0.0
 
 
 def test_tangents_follow_the_chain_in_the_pictures_plane():
