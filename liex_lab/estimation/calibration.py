@@ -1,4 +1,6 @@
-"""What the learned metric's score means in millimetres, found on images that no tree has seen."""
+"""What is learned of a model's own choices, on images that no tree has seen: their last correction, and how far off
+they are in millimetres.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
+from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.correction import moves_to, pose_samples
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
@@ -30,6 +34,7 @@ _EXPECTATION = GrowthPlan(
     bag_share=0.5,
 )  # fmt: skip
 _SHRINKAGE = 0.12
+_CORRECTED_MM, _CORRECTION_SHRINKAGE = 12.0, 0.1  # at the reference length: what is farther off is another pose
 _FOLDS = 4
 
 
@@ -46,18 +51,19 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class _Picks:
-    """What a model chose for some images: rows (n,) of the set, the size that was assumed, how they were cut."""
+class _Group:
+    """Images that share a guess of the size, as the frames of a recording do: their rows in the set, the guess over
+    home size, and the model's choices for them.
+    """
 
     rows: NDArray[np.int64]
+    images: ImageSet
     size: float
-    looks: Array
-    moments: Array
     chosen: Chosen
 
 
-def _picks(model: Model, data: TrainingSet, size_sd: float, rng: np.random.Generator) -> Iterator[_Picks]:
-    """Let a model choose. Images are taken in order of size, and each group of them shares one guess of it, off by
+def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd: float = _SIZE_SD) -> Iterator[_Group]:
+    """Let a model choose. Images of animals are taken in order of size, and each group of them shares one guess, off by
     size_sd (log).
     """
     animals = np.flatnonzero(data.animal)
@@ -66,45 +72,74 @@ def _picks(model: Model, data: TrainingSet, size_sd: float, rng: np.random.Gener
     for rows in np.array_split(order, max(1, len(order) // _GROUP)):
         size = float(np.median(data.size[rows]) * np.exp(size_sd * rng.standard_normal()))
         size = size if model.method.session_size else 1.0
-        looks, moments = data.images.looks[rows], data.images.moments[rows]
+        looks = data.images.looks[rows]
+        images = ImageSet(data.images.heights[rows], looks, data.images.moments[rows])
         crops = Crops(
-            data.images.heights[rows], looks[:, 14:16].astype(np.int32), looks[:, 16].astype(np.int32),
-            np.full(len(rows), 1), moments, looks[:, 13], np.ones(len(rows), np.int64),
+            images.heights, looks[:, 14:16].astype(np.int32), looks[:, 16].astype(np.int32), np.full(len(rows), 1),
+            images.moments, looks[:, 13], np.ones(len(rows), np.int64),
         )  # fmt: skip
         rotations, positions, _, scores = estimator.candidates(crops, looks, size)
-        picked = estimator.pick(crops.heights, looks, size, rotations, positions, scores)
-        yield _Picks(rows, size, looks, moments, picked)
-
-
-def fit_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> Settler:
-    """How the poses that a model chooses settle, from images with known truth."""
-    picks = list(_picks(model, data, _GUESS_SD, rng))
-    rows = np.concatenate([p.rows for p in picks])
-    sizes = np.concatenate([np.full(len(p.rows), p.size) for p in picks])
-    pose = Pose.join([p.chosen.pose for p in picks])
-    return Settler.fit(
-        model.skeleton, pose, data.images.heights[rows], data.images.looks[rows], sizes, data.truth.positions[rows],
-        data.size[rows],
-    )  # fmt: skip
+        yield _Group(rows, images, size, estimator.pick(images, size, rotations, positions, scores))
 
 
 def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
-    """What a model's choices are worth, see `_picks`."""
+    """The choices of a model for the animals among the images, and how far off they are."""
     skeleton = model.skeleton
     scores_of, spreads, joint_errors, clues = [], [], [], []
-    for p in _picks(model, data, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD, rng):
-        off = np.linalg.norm(p.chosen.pose.joints(skeleton) - data.truth.positions[p.rows], axis=-1)
-        scores_of.append(p.chosen.score)
-        spreads.append(p.chosen.spread)
-        joint_errors.append(off / p.size)
-        clues.append(clue_samples(p.chosen, skeleton, p.moments, p.looks, p.size))
-    scalars, blank = np.concatenate([samples.scalars for samples in clues]), clues[-1]
+    for group in _choices(model, data, rng, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD):
+        picked, images = group.chosen, group.images
+        off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1)
+        scores_of.append(picked.score)
+        spreads.append(picked.spread)
+        joint_errors.append(off / group.size)
+        blank = clue_samples(picked, skeleton, images.moments, images.looks, group.size)
+        clues.append(blank.scalars)
+    scalars = np.concatenate(clues)
     n = len(scalars)
     samples = Samples(
         blank.heights, np.zeros(n, np.int32), np.ones(n, np.float32),
         np.zeros((n, 1, blank.views.shape[2]), np.float32), scalars,
     )  # fmt: skip
     return Trial(np.concatenate(scores_of), np.concatenate(spreads), np.concatenate(joint_errors), samples)
+
+
+def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
+    """The model with the last correction of its choices, learned from images that no tree has seen.
+
+    What is off by more than an ordinary error, as a pose that points the other way, teaches nothing. Skeletons that
+    branch have no such correction: their poses do not follow from the places of their joints.
+    """
+    plan, worst = model.method.corrector, _CORRECTED_MM * model.skeleton.relative_size
+    if plan is None or not model.skeleton.is_chain:
+        return model
+    parts, moves = [], []
+    for group in _choices(model, data, rng):
+        true = data.truth.positions[group.rows]
+        off = np.linalg.norm(group.chosen.pose.joints(model.skeleton) - true, axis=-1).mean(axis=1)
+        near = np.flatnonzero(off < worst * group.size)
+        samples = pose_samples(group.chosen.pose, model, group.images, group.size)
+        samples = Samples(
+            data.images.heights, group.rows.astype(np.int32), samples.inverse_size, samples.views, samples.scalars
+        )
+        parts.append(samples[near])
+        moves.append(moves_to(group.chosen.pose, model, true, group.size)[near])
+    labels = np.concatenate(moves).astype(np.float32)
+    return replace(
+        model, corrector=quantised(boost_forest(Samples.join(parts), labels, plan, _CORRECTION_SHRINKAGE, rng))
+    )
+
+
+def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
+    """The model with how its choices settle, where the method has them settle, from images that no tree has seen."""
+    if not model.method.settle:
+        return model
+    groups = list(_choices(model, data, rng, _GUESS_SD))
+    rows = np.concatenate([group.rows for group in groups])
+    sizes = np.concatenate([np.full(len(group.rows), group.size) for group in groups])
+    pose = Pose.join([group.chosen.pose for group in groups])
+    images = ImageSet(data.images.heights[rows], data.images.looks[rows], data.images.moments[rows])
+    settler = Settler.fit(model.skeleton, pose, images, sizes, data.truth.positions[rows], data.size[rows])
+    return replace(model, settler=settler.table)
 
 
 def _rows(samples: Samples, index: NDArray[np.int64]) -> Samples:
@@ -122,8 +157,6 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     The forest predicts the true error of the chosen pose. The ratios of true to predicted error that bound 90 % of the
     images, and the limit of what is doubtful, come from predictions for images that their forest has not seen.
     """
-    if model.method.settle:
-        model = replace(model, settler=fit_settler(model, data, rng).table)
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
     capped = np.minimum(error, _CAP_MM * model.skeleton.relative_size)

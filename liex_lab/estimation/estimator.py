@@ -14,6 +14,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
+from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
@@ -131,8 +133,8 @@ class PoseEstimator:
                 values[better] for values in (other_looks, found[0], found[1], found[3])
             )
         usable = crops.found
-        picked = self.pick(crops.heights[usable], looks[usable], size, rotations[usable], positions[usable],
-                           scores[usable], parallel)  # fmt: skip
+        images = ImageSet(crops.heights[usable], looks[usable], crops.moments[usable])
+        picked = self.pick(images, size, rotations[usable], positions[usable], scores[usable], parallel)
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         T_camera_view = SE3(
@@ -142,15 +144,15 @@ class PoseEstimator:
         return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
 
     def pick(
-        self, heights: NDArray[np.int16], looks: Array, size: float, rotations: Array, positions: Array, scores: Array,
-        parallel: bool = True,
-    ) -> Chosen:  # fmt: skip
-        """One pose for each of n frames out of its candidates, settled where the model does so."""
+        self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
+    ) -> Chosen:
+        """One pose for each of n height maps out of its candidates, after the last correction, and settled."""
         picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
-        if self.model.settler is None or not len(scores):
-            return picked
         with threads(parallel):
-            settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, heights, looks, size)
+            picked = corrected(picked, self.model, images, size)
+            if self.model.settler is None or not len(scores):
+                return picked
+            settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, images, size)
         return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
 
     def _is_animal(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _settle as kernels
+from liex_lab.estimation.cascade import ImageSet
 
 Array = NDArray[np.float64]
 
@@ -44,12 +45,11 @@ class Settler:
 
     @staticmethod
     def fit(
-        skeleton: Skeleton, pose: Pose, heights: NDArray[np.int16], looks: Array, size: Array, true_joints: Array,
-        true_size: Array,
-    ) -> Settler:  # fmt: skip
+        skeleton: Skeleton, pose: Pose, images: ImageSet, size: Array, true_joints: Array, true_size: Array
+    ) -> Settler:
         """From chosen poses (n) with their assumed sizes (n,) and the truth, all in the view frame."""
         joints = pose.joints(skeleton)
-        features = clues(skeleton, pose, joints, heights, looks, size)
+        features = clues(skeleton, pose, joints, images, size)
         length = skeleton.length * size
         off = (true_joints - joints) / length[:, None, None]
         slide = np.sum(off * tangents(joints), axis=-1).mean(axis=1)
@@ -62,11 +62,11 @@ class Settler:
         # from all of them: those that see its far end best were mostly taken for smaller than they are
         return Settler(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
-    def settle(self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float) -> Settled:
+    def settle(self, pose: Pose, images: ImageSet, size: float) -> Settled:
         """Poses (n) put right, and what each of them says about the animal's size."""
         skeleton, n = self.skeleton, len(pose.scale)
         joints = pose.joints(skeleton)
-        seen = clues(skeleton, pose, joints, heights, looks, np.full(n, size))
+        seen = clues(skeleton, pose, joints, images, np.full(n, size))
         told = np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]
         length = skeleton.length * size
         moved = joints + length * told[:, -2, None, None] * tangents(joints)
@@ -109,9 +109,7 @@ def tangents(joints: Array) -> Array:
     return np.asarray(way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
 
 
-def clues(
-    skeleton: Skeleton, pose: Pose, joints: Array, heights: NDArray[np.int16], looks: Array, size: Array
-) -> Array:
+def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size: Array) -> Array:
     """What is seen along the mid-lines of poses (n) with joints (n, J, 3) mm, (n, F), lengths over the animal's own.
 
     A constant, the height of the back over each joint and how much of it is seen, how far the animal reaches past the
@@ -119,17 +117,16 @@ def clues(
     """
     n, j = joints.shape[:2]
     length = skeleton.length * size
+    usual = float(np.median(length)) if n else 0.0
     seen = np.empty((n, 2 * j + 2))
-    most = _MOST_SHARE * float(np.median(length)) if n else 0.0
-    kernels.look_along(
-        heights, looks, np.arange(j), np.ascontiguousarray(joints), float(np.median(length)) if n else 0.0, most, seen
-    )
+    chain, places = np.arange(j), np.ascontiguousarray(joints)
+    kernels.look_along(images.heights, images.looks, chain, places, usual, _MOST_SHARE * usual, seen)
     share = np.minimum(seen[:, j : 2 * j] * 2.0, 1.0)
     back = np.clip(seen[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (share > 0)
     ends = seen[:, 2 * j :] / length[:, None]
     rise, roll = pose.root.rotation[:, 2, 0], pose.root.rotation[:, 2, 1]
     bent = np.abs(pose.angles[..., 2]).sum(axis=1)
-    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / length
+    mm_per_px = images.looks[:, 16] * images.looks[:, 13] / images.looks[:, 0] / length
     return np.column_stack(
         [np.ones(n), back, share, ends, ends**2, rise, np.abs(rise), rise**2, np.abs(roll), roll**2, bent, mm_per_px,
          ends * mm_per_px[:, None], np.log(pose.scale / size)]

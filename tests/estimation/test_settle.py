@@ -10,6 +10,7 @@ import pytest
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _settle as kernels
+from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.settle import Settler, tangents
 from liex_lab.geometry import SE3, so3
@@ -65,12 +66,15 @@ def wrong(pose: Pose, seed: int) -> tuple[Pose, np.ndarray]:
     return off, size
 
 
+def images_of(heights: np.ndarray) -> ImageSet:
+    return ImageSet(heights, np.tile(look(), (len(heights), 1)), np.zeros((len(heights), 9)))
+
+
 @pytest.fixture(scope="module")
 def settler() -> Settler:
     true = fish(400, 1)
     off, size = wrong(true, 2)
-    looks = np.tile(look(), (len(size), 1))
-    return Settler.fit(FISH, off, maps(true), looks, size, true.joints(FISH), true.scale)
+    return Settler.fit(FISH, off, images_of(maps(true)), size, true.joints(FISH), true.scale)
 
 
 def test_the_height_of_the_back_over_a_joint_leaves_gross_errors_out():
@@ -95,11 +99,11 @@ def test_where_the_animal_ends_past_its_chain(short_mm):
 def test_wrong_poses_settle_and_tell_the_size(settler):
     true = fish(60, 5)
     off, size = wrong(true, 6)
-    looks, before, after, told = look()[None], [], [], []
+    before, after, told = [], [], []
     heights = maps(true)
     for i in range(len(size)):
         one = off[np.array([i])]
-        settled = settler.settle(one, heights[i : i + 1], looks, float(size[i]))
+        settled = settler.settle(one, images_of(heights[i : i + 1]), float(size[i]))
         for pose, errors in ((one, before), (settled.pose, after)):
             errors.append(np.abs(pose.joints(FISH)[0, :, 2] - true.joints(FISH)[i, :, 2]).mean())
         told.append(np.log(size[i] / true.scale[i]) + settled.grown[0])
@@ -110,7 +114,7 @@ def test_wrong_poses_settle_and_tell_the_size(settler):
 
 def test_a_pose_that_sees_nothing_stays_near_where_it_is(settler):
     off, size = wrong(fish(1, 7), 8)
-    settled = settler.settle(off, np.zeros((1, SIDE, SIDE), np.int16), look()[None], float(size[0]))
+    settled = settler.settle(off, images_of(np.zeros((1, SIDE, SIDE), np.int16)), float(size[0]))
     assert np.linalg.norm(settled.pose.joints(FISH) - off.joints(FISH), axis=-1).max() < 6.0
     assert abs(settled.grown[0]) < 0.5
     assert settled.clear[0] == 0.0
