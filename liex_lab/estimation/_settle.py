@@ -75,19 +75,17 @@ def end_past(heights, look, end, before, reach):
 
 
 @njit(cache=True, parallel=True)
-def look_along(heights, looks, chain, positions, length, most, out):
-    """Fill `out` (n, 2 C + 2) for poses (n, J, 3) mm: `back_over` of the joints `chain` (C,), heights first, and
-    `end_past` of the chain's first and last. length mm of the animal; most: see `back_over`.
+def look_along(heights, looks, positions, length, most_share, out):
+    """Fill `out` (n, 2 J + 2) for chains (n, J, 3) mm of animals `length` (n,) mm long: `back_over` of the joints, first
+    heights, and `end_past` of the first and the last of them. most_share of the length: see `back_over`.
     """
-    m = chain.size
+    m = positions.shape[1]
     for i in prange(positions.shape[0]):
         here = np.empty(2)
         for k in range(m):
-            back_over(heights[i], looks[i], positions[i, chain[k]], most, here)
+            back_over(heights[i], looks[i], positions[i, k], most_share * length[i], here)
             out[i, k], out[i, m + k] = here[0], here[1]
-        reach = _END_SHARE * length
         for end in range(2):
             k, before = (m - 1, m - 2) if end else (0, 1)
-            out[i, 2 * m + end] = end_past(
-                heights[i], looks[i], positions[i, chain[k]], positions[i, chain[before]], reach
-            )
+            reach = _END_SHARE * length[i]
+            out[i, 2 * m + end] = end_past(heights[i], looks[i], positions[i, k], positions[i, before], reach)

@@ -117,10 +117,8 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     """
     n, j = joints.shape[:2]
     length = skeleton.length * size
-    usual = float(np.median(length)) if n else 0.0
     seen = np.empty((n, 2 * j + 2))
-    chain, places = np.arange(j), np.ascontiguousarray(joints)
-    kernels.look_along(images.heights, images.looks, chain, places, usual, _MOST_SHARE * usual, seen)
+    kernels.look_along(images.heights, images.looks, np.ascontiguousarray(joints), length, _MOST_SHARE, seen)
     share = np.minimum(seen[:, j : 2 * j] * 2.0, 1.0)
     back = np.clip(seen[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (share > 0)
     ends = seen[:, 2 * j :] / length[:, None]
