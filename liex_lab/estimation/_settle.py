@@ -76,7 +76,7 @@ def end_past(heights, look, end, before, reach):
 
 @njit(cache=True, parallel=True)
 def look_along(heights, looks, positions, length, most_share, out):
-    """Fill `out` (n, 2 J + 2) for chains (n, J, 3) mm of animals `length` (n,) mm long: `back_over` of the joints, first
+    """Fill `out` (n, 2 J + 2) for chains (n, J, 3) mm of animals `length` (n,) mm long: `back_over` of joints, first
     heights, and `end_past` of the first and the last of them. most_share of the length: see `back_over`.
     """
     m = positions.shape[1]
