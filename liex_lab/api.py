@@ -65,6 +65,25 @@ def flip_session(
     )
 
 
+def follow_live(
+    source: str, plan: Plan, *, replay: bool = False, to: str = "viewer", patience_s: float = 3.0,
+    progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured latencies."""
+    from liex_lab.pipelines.live import follow_live as job
+    from liex_lab.pipelines.live import open_live
+    from liex_lab.sessions.live import LiveView
+
+    arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
+    numbers, _ = job(
+        arriving, plan, progress=progress,
+        viewer=lambda tracker, arriving: LiveView(
+            arriving.name, arriving.camera, tracker.subject.T_arena_camera, tracker.subject.skeleton, to
+        ),
+    )  # fmt: skip
+    return numbers
+
+
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     """The bundled sample recording as a session; an earlier session of the demo is replaced."""
     from liex_lab.catalog import find_sample
@@ -112,6 +131,25 @@ def run_scale(
     from liex_lab.pipelines.scale import evaluate_scale
 
     return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
+
+
+def evaluate_tracking(
+    animal: str = "mouse",
+    sequence: str = "hard",
+    *,
+    model: str | Path | None = None,
+    n_frames: int | None = None,
+    figure: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error over time."""
+    from functools import partial
+
+    from liex_lab.dashboards.tracking_figure import draw_tracking
+    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+
+    draw = None if figure is None else partial(draw_tracking, path=figure)
+    return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
 
 
 def run_tables(

@@ -181,9 +181,7 @@ def evaluate_pose(
     from liex_lab.pipelines.evaluate import evaluate_pose as measure
 
     with progress_bar() as progress:
-        result = measure(
-            animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress
-        )
+        result = measure(animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
     _tell_numbers(result, json_file)
 
 
@@ -255,13 +253,14 @@ def evaluate_tracking(
     sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
     model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
     n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
-    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+    from liex_lab.api import evaluate_tracking as measure
 
     with progress_bar() as progress:
-        result = measure(animal, sequence, model=model, n_frames=n_frames, progress=progress)
+        result = measure(animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress)
     _tell_numbers(result, json_file)
 
 
@@ -281,6 +280,25 @@ def evaluate_statistics(
     _tell_numbers(result, json_file)
 
 
+@evaluate.command("nyu")
+def evaluate_nyu(
+    reference: Annotated[
+        Path, typer.Option("--reference", metavar="DIR", help="Labels, published answers and frames of the NYU data.")
+    ],
+    model: Annotated[str | None, typer.Option("--model", help="A hand model of your own, .npz.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and ours."""
+    from liex_lab.pipelines.nyu import evaluate_nyu as measure
+    from liex_lab.pipelines.nyu import in_short
+
+    with progress_bar() as progress:
+        result = measure(reference, model=model, progress=progress)
+    _tell_numbers(in_short(result), None)
+    if json_file is not None:
+        _keep_numbers(result, json_file)
+
+
 @evaluate.command("reference")
 def evaluate_reference(
     session: SessionPath,
@@ -293,6 +311,27 @@ def evaluate_reference(
     from liex_lab.pipelines.evaluate import evaluate_reference as measure
 
     _tell_numbers(measure(session, reference), json_file)
+
+
+@app.command()
+def live(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")],
+    plan: PlanName = "mouse",
+    settings: Settings = None,
+    replay: Annotated[bool, typer.Option("--replay", help="Send a whole recording at its own pace.")] = False,
+    to: Annotated[str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")] = "viewer",
+    patience_s: Annotated[float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")] = 3.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.api import follow_live
+
+    with progress_bar() as progress:
+        result = follow_live(source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress)
+    _tell_numbers(result, json_file)
 
 
 @app.command()
@@ -432,13 +471,17 @@ def _tell_session(session: Path) -> None:
 def _tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(_json(result) + "\n", encoding="utf-8")
+        _keep_numbers(result, json_file)
     table = Table(show_header=False)
     for name, value in result.items():
         shown = f"{value:.4g}" if isinstance(value, float) else _json(value) if isinstance(value, dict) else str(value)
         table.add_row(name, Text(shown))
     Console().print(table)
+
+
+def _keep_numbers(result: dict[str, Any], json_file: Path) -> None:
+    json_file.parent.mkdir(parents=True, exist_ok=True)
+    json_file.write_text(_json(result) + "\n", encoding="utf-8")
 
 
 def _json(result: Any) -> str:

@@ -30,12 +30,16 @@ _Z90 = 1.645
 
 @dataclass(frozen=True)
 class Followed:
-    """What was made of n frames: joints and true joints (n, J, 3) mm in one frame, sd_mm (n, J) along an axis."""
+    """What was made of n frames: joints and true joints (n, J, 3) mm in one frame, sd_mm (n, J) along an axis.
+
+    tip: the joint that the base's heading points at.
+    """
 
     joints: Array
     truth: Array
     sd_mm: Array
     frames_per_s: float
+    tip: int = -1
 
     @property
     def error_mm(self) -> Array:
@@ -45,7 +49,7 @@ class Followed:
     @property
     def longest_flip(self) -> int:
         """Most frames in a row whose base-to-tip direction is more than 90 degrees off."""
-        along, true = (j[:, -1] - j[:, 0] for j in (self.joints, self.truth))
+        along, true = (j[:, self.tip] - j[:, 0] for j in (self.joints, self.truth))
         longest = run = 0
         for off in np.einsum("nd,nd->n", along, true) < 0:
             run = run + 1 if off else 0

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.build import plan_of
+from liex_lab.pipelines.build import build_scene, plan_of
 from liex_lab.pipelines.evaluate import estimator_of
 from numpy.typing import NDArray
 
@@ -47,13 +47,13 @@ def evaluate_tracking(
     rows: Sequence[str] = ROWS,
     seeds: Sequence[int] = (),
     n_frames: int | None = None,
-    draw: Callable[[Measured, dict[str, Any]], object] | None = None,
+    draw: Callable[[TestSequence, dict[str, Followed]], object] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The figures of a fixed sequence; `liex evaluate tracking`.
 
     rows: only some of `ROWS`; seeds: other sequences of the same kind, whose frames are taken together; draw: is given
-    what was measured and the figures, to make a picture of them.
+    the first sequence and what the rows made of it, for a picture.
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.sequences import tracking_sequence
@@ -74,7 +74,7 @@ def evaluate_tracking(
         "online_lag_frames": ONLINE_LAG, "protocol": TRACKING_PROTOCOL,
     }  # fmt: skip
     if draw is not None:
-        draw(measured[0], result)
+        draw(measured[0].sequence, measured[0].rows)
     return result
 
 
@@ -82,14 +82,10 @@ def follow_sequence(
     recording: TestSequence, estimator: PoseEstimator, plan: Plan, rows: Sequence[str], progress: Progress = silent
 ) -> Measured:
     """Every row's way through a sequence; scene, size and animal are found by the product, nothing is handed over."""
-    from liex_lab.recordings.foreground import Scene
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.tracker import FrameTracker
 
-    sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
-    scene, sample = Scene.learn(
-        recording, sizes, plan.foreground.n_background_frames, plan.foreground.min_height_mm, estimator.skeleton.view
-    )
+    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
     tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
     parts: list[Observations] = []
     seconds = dict.fromkeys(("single", "observe", "algorithm3"), 0.0)
@@ -104,11 +100,12 @@ def follow_sequence(
         seconds["observe"] += time.perf_counter() - between
     seen = Observations.join(parts)
     found: dict[str, Followed] = {}
+    tip = estimator.skeleton.tip
     n = len(recording)
     T = recording.T_arena_camera @ scene.floor.T_arena_camera.inverse()
 
     def put(name: str, track: Track, spent: float) -> None:
-        found[name] = Followed(T @ track.joints_mm, recording.joints_arena, track.sd_mm, n / spent)
+        found[name] = Followed(T @ track.joints_mm, recording.joints_arena, track.sd_mm, n / spent, tip)
 
     began = time.perf_counter()
     single = tracker.follow_again(seen)
@@ -126,7 +123,7 @@ def follow_sequence(
         began = time.perf_counter()
         joints, sd = _algorithm3(tracker, recording, plan.seed)
         found["algorithm3"] = Followed(recording.T_arena_camera @ joints, recording.joints_arena, sd,
-                                       n / (time.perf_counter() - began))  # fmt: skip
+                                       n / (time.perf_counter() - began), tip)  # fmt: skip
     return Measured(recording, {name: found[name] for name in ROWS if name in found})
 
 

@@ -14,15 +14,19 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
-from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation._explain import Body
+from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
-from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.proposals import N_WAYS, propose
+from liex_lab.estimation.refine import Refiner
+from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
+from liex_lab.estimation.settle import SURE_SHARE, Settler
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
-from liex_lab.recordings.foreground import Crops, Scene
+from liex_lab.recordings.crops import Crops, Foreground, view_of
 from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
@@ -71,13 +75,13 @@ class _Sight:
         nothing.scores[:] = np.inf
         return nothing
 
-    def opposite(self, usable: NDArray[np.bool_]) -> _Sight:
+    def opposite(self, usable: NDArray[np.bool_], tip: int) -> _Sight:
         """The same with only the candidates that point away from where the one with the lowest score does, in frames
-        `usable`; the best of them takes the others' places, so that their number stays.
+        `usable`, from base to `tip`; the best of them takes the others' places, so that their number stays.
         """
         rows = np.arange(len(self.scores))
         best = np.where(usable[:, None], self.scores, 0.0).argmin(axis=1)
-        along = self.positions[:, :, -1] - self.positions[:, :, 0]
+        along = self.positions[:, :, tip] - self.positions[:, :, 0]
         away = np.einsum("nkd,nd->nk", along, along[rows, best]) < 0
         scores = np.where(away & usable[:, None], self.scores, np.inf)
         taken = np.where(away, np.arange(scores.shape[1]), scores.argmin(axis=1)[:, None])
@@ -123,14 +127,27 @@ class PoseEstimator:
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.Tuning(
-            method.rounds, method.reaches(self.skeleton.n_joints),
+            method.rounds_of(0), method.rounds, method.reaches(self.skeleton.n_joints),
             np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
             min(keep or n_starts, n_starts),
         )  # fmt: skip
 
     @cached_property
+    def _body(self) -> Body:
+        """The body that candidates are held against the picture with."""
+        if not self.model.method.explains:
+            return Body(1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+        return body_of(self.model.cascade.balls)
+
+    @cached_property
+    def _refiner(self) -> Refiner:
+        return Refiner.of(self.skeleton, self.model.cascade.balls)
+
+    @cached_property
     def _starts(self) -> Array:
         k = self.n_candidates or self.model.method.n_candidates
+        if self.model.cascade.proposals is not None:
+            k = N_WAYS * self.model.cascade.proposals.n_trees
         return draw_starts(np.random.default_rng(_START_SEED), 1, k)
 
     def candidates(
@@ -144,8 +161,11 @@ class PoseEstimator:
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
             crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
-            method.camera_view,
+            method.camera_view, method.home_turn,
         )  # fmt: skip
+        if self.model.cascade.proposals is not None:
+            images = ImageSet(crops.heights, looks, crops.moments)
+            base_rotation, base_position = propose(self.model.cascade.proposals, images, sizes[:, 0], method)
         tuning = self._tuning(k)
         starts = np.ascontiguousarray(base_rotation[:, :, None]), base_position[:, :, None].copy(), scales
         rotations = np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3))
@@ -154,17 +174,17 @@ class PoseEstimator:
         with threads(parallel):
             kernels.estimate_all(
                 crops.heights, looks, crops.moments, np.flatnonzero(crops.found), size, self._chain, *self._packed,
-                tuning, starts, poses,
+                tuning, self._body, starts, poses,
             )  # fmt: skip
         return poses
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Estimates:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
         size = size if self.model.method.session_size else 1.0
         return self._estimates(self._look(depths, scene, size, parallel)[0], scene, size, parallel)
 
     def hypotheses(
-        self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> tuple[Estimates, ...]:
         """What else the frames (n, H, W) mm may show, each like `estimate`'s answer, which comes first: the best pose
         that points the other way, and the same two of the second thing of about the animal's size. Rows without such
@@ -174,10 +194,12 @@ class PoseEstimator:
         found: list[Estimates] = []
         for sight in self._look(depths, scene, size, parallel):
             best = self._estimates(sight, scene, size, parallel)
-            found += [best, self._estimates(sight.opposite(best.found), scene, size, parallel)]
+            found += [best, self._estimates(sight.opposite(best.found, self.skeleton.tip), scene, size, parallel)]
         return tuple(found)
 
-    def _look(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool) -> tuple[_Sight, _Sight]:
+    def _look(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
+    ) -> tuple[_Sight, _Sight]:
         """What was taken for the animal, with its candidates, and the next best thing; see `estimate`."""
         first = self._sight(depths, scene, size, parallel, 0)
         second = first.nothing()
@@ -193,7 +215,7 @@ class PoseEstimator:
             second.put(rows, kept)
         return first, second
 
-    def _sight(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool, rank: int) -> _Sight:
+    def _sight(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool, rank: int) -> _Sight:
         """The thing of that rank in each frame, and its candidates."""
         camera_view = self.model.method.camera_view
         crops = scene.extract(depths, size, parallel, camera_view, rank=rank)
@@ -201,31 +223,39 @@ class PoseEstimator:
         rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
         return _Sight(crops, looks, rotations, positions, scores)
 
-    def _estimates(self, sight: _Sight, scene: Scene, size: float, parallel: bool) -> Estimates:
+    def _estimates(self, sight: _Sight, scene: Foreground, size: float, parallel: bool) -> Estimates:
         """The chosen poses of what was seen, in the camera frame."""
-        method, crops = self.model.method, sight.crops
+        crops = sight.crops
         usable = crops.found & np.isfinite(sight.scores).any(axis=1)
         seen = sight[np.flatnonzero(usable)]
         images = ImageSet(seen.crops.heights, seen.looks, seen.crops.moments)
         picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
         picked = with_expected_error(picked, self.model, images.moments, images.looks, size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        T_camera_view = SE3(
-            np.broadcast_to(scene.view_rotation(method.camera_view), (len(usable), 3, 3)),
-            np.stack([np.zeros(len(usable)), np.zeros(len(usable)), crops.distance], axis=-1),
-        ).inverse()
-        return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+        return Estimates(replace(whole, pose=whole.pose.moved(view_of(sight.looks).inverse())), usable, crops)
 
     def pick(
         self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
     ) -> Chosen:
-        """One pose for each of n height maps out of its candidates, after the last correction."""
-        picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
+        """One pose for each of n height maps out of its candidates, after the last correction, and settled.
+
+        Where the method takes poses into the picture, it is of the mean and the best ones the one that then fits best.
+        """
+        method = self.model.method
+        picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
         with threads(parallel):
-            return corrected(picked, self.model, images, size)
+            if method.refine_steps and len(scores):
+                poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
+                pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
+                picked = replace(picked, pose=pose, fit=fit, told_scale=pose.scale)
+            picked = corrected(picked, self.model, images, size)
+            if self.model.settler is None or not len(scores):
+                return picked
+            settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, images, size)
+        return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
 
     def _is_animal(
-        self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array
     ) -> NDArray[np.bool_]:
         """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
 
@@ -237,7 +267,7 @@ class PoseEstimator:
             return likeness[1] < likeness[0]
         return second + likeness[1] < first + likeness[0]
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm of the recording.
 
         The area seen from above gives the first guess; the model then measures the spine in every frame, the median of
@@ -250,11 +280,12 @@ class PoseEstimator:
         uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
             estimates = uncorrected.estimate(sample, scene, guess)
-            scale, score = estimates.chosen.pose.scale, estimates.chosen.score
+            scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
             seen = np.flatnonzero(estimates.found)
             if not len(seen):
                 raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
-            trusted = seen[np.argsort(score[seen])[: max(8, len(seen) * 2 // 3)]]
+            n_trusted = len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+            trusted = seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]
             guess = float(np.median(scale[trusted]))
         return guess
 
@@ -296,4 +327,6 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
     return Chosen(
         pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
         rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+        rows(picked.fit, picked.fit.shape[1]),
+        rows(picked.told_scale), rows(picked.told_trust),
     )  # fmt: skip

@@ -21,7 +21,8 @@ from liex_lab.estimation.method import Method
 from liex_lab.forests.forest import Forest
 
 SCHEMA = 2
-_FORESTS = ("metric", "expectation", "pruner", "corrector")  # that follow the regressors, as far as a model has them
+# that follow the regressors, as far as a model has them
+_FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
 _DAMAGE = (
     OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
     lzma.LZMAError,
@@ -54,7 +55,8 @@ class Model:
     """Everything an estimator needs.
 
     expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
-    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more.
+    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more; settler:
+    the table of `settle.Settler`, where the method settles.
     """
 
     cascade: Cascade
@@ -65,6 +67,7 @@ class Model:
     card: dict[str, Any] = field(default_factory=dict)
     pruner: Forest | None = None
     corrector: Forest | None = None
+    settler: NDArray[np.float64] | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -75,6 +78,11 @@ class Model:
     def method(self) -> Method:
         """The variant of the method."""
         return self.cascade.method
+
+    @property
+    def proposals(self) -> Forest | None:
+        """What says where starts may be."""
+        return self.cascade.proposals
 
     def to_bytes(self) -> bytes:
         """The model file's content; equal models give equal bytes."""
@@ -92,6 +100,8 @@ class Model:
         forests += [getattr(self, name) for name in extra]
         for k, forest in enumerate(forests):
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
+        if self.settler is not None:
+            arrays["settler"] = self.settler
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
             for name, values in arrays.items():
@@ -113,6 +123,7 @@ class Model:
                     raise ModelError(f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab")
                 names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
                 forests = [_join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names]
+                settler = archive["settler"] if "settler" in archive.files else None
             method = Method.from_dict(head["method"])
             values = head["calibration"]
             for name in ("quantiles", "joint_share"):
@@ -124,17 +135,19 @@ class Model:
         except _DAMAGE as error:
             raise ModelError(f"{path} is not a whole model file ({error}); train it again or copy it anew") from None
         skeleton = Skeleton.from_table(table, str(path))
-        n = method.rounds
-        n_regressors = n * len(skeleton.solved)
+        rounds = [method.rounds_of(joint) for joint in skeleton.solved]
+        n_regressors = sum(rounds)
         extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
             raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
-        cascade = Cascade(skeleton, method, [forests[k * n : (k + 1) * n] for k in range(len(skeleton.solved))])
         named = dict(zip(extra, forests[n_regressors:], strict=True))
+        stops = np.cumsum(rounds).tolist()
+        each = [forests[stop - n : stop] for n, stop in zip(rounds, stops, strict=True)]
         metric, *others = (named.get(name) for name in _FORESTS)
         assert metric is not None
-        expectation, pruner, corrector = others
-        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector)
+        expectation, pruner, corrector, proposals = others
+        cascade = Cascade(skeleton, method, each, proposals)
+        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector, settler)
 
     def digest(self) -> str:
         """SHA-256 of the model file."""

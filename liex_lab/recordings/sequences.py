@@ -68,7 +68,8 @@ def tracking_sequence(
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
-    assert isinstance(world, RenderedWorld)
+    if not isinstance(world, RenderedWorld):
+        raise RecordingError(f"there are no test sequences of a {world.skeleton.name}; mouse and fish have them")
     kind, habits = SEQUENCES[name], world.habits
     n, own_seed = n_frames or kind.n_frames, [kind.seed if seed is None else seed]
     rng, step_ns = np.random.default_rng([*own_seed, 1]), habits.frame_ns

@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 FILES = (
     "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
     "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "transitions.parquet",
-    "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap",
+    "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap", "observations.npz",
 )  # fmt: skip
-_OPTIONAL = {"kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet"}
+_OPTIONAL = {
+    "kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet", "observations.npz",
+}  # fmt: skip
 
 
 class Session:

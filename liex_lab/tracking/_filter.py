@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from liex_lab.tracking._joints import exp_so3
+
 _START_RATE = 1e2  # variance of the velocity before anything is known, of its usual variance
 
 
@@ -86,21 +88,6 @@ def run_vectors(times, y, known, start, forward, back, ahead, out, rate):
             d1 = rate[t + 1, k] - rate[t, k]
             out[t, k] += back[t, 0, 0] * d0 + back[t, 0, 1] * d1
             rate[t, k] += back[t, 1, 0] * d0 + back[t, 1, 1] * d1
-
-
-@njit(cache=True)
-def exp_so3(w, out):
-    """Rotation (3, 3) of a rotation vector (3,) rad."""
-    th2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    if th2 < 1e-8:
-        a, b = 1.0 - th2 / 6.0, 0.5 - th2 / 24.0
-    else:
-        th = np.sqrt(th2)
-        a, b = np.sin(th) / th, 2.0 * np.sin(th / 2.0) ** 2 / th2
-    x, y, z = w[0], w[1], w[2]
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    out[1, 0], out[1, 1], out[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
-    out[2, 0], out[2, 1], out[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.geometry import SE3
 from liex_lab.tracking.chain import NONE, Chain
-from liex_lab.tracking.observations import Observations, reversed_pose
+from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import MOTION, Curve, Motion, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
 
@@ -102,12 +102,11 @@ def _admitted(
 ) -> NDArray[np.int64]:
     """(n,) of frames that were passed by, the hypothesis that lies on the curve all the same; NONE elsewhere."""
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
-    every = range(skeleton.n_joints)
     for h in range(seen.score.shape[1]):
         rows = np.flatnonzero((path == NONE) & seen.known[:, h] & np.isfinite(curve.error_mm))
         if not len(rows):
             continue
-        joints = seen.pose(np.full(len(seen), h))[rows].joints(skeleton)[:, every]
+        joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
         off = np.linalg.norm(joints - curve.joints[rows], axis=-1).mean(axis=1) / seen.error_mm[rows, h]
         better = off < best[rows]
         found[rows[better]], best[rows[better]] = h, off[better]
@@ -166,7 +165,7 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     path = np.where(seen.known[:, 0], 0, NONE)
     pose, error = seen.pose(path), seen.along(seen.error_mm, path)
     length = subject.length_mm
-    curve = Curve(pose, pose.joints(subject.skeleton), error, MOTION.middle_error * error,
+    curve = Curve(pose, joints_of(subject.skeleton, pose), error, MOTION.middle_error * error,
                   MOTION.turn_error * error / length, path >= 0)  # fmt: skip
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
 
@@ -192,8 +191,9 @@ def short_gaps(
 
 def _flips(seen: Observations, track: Track) -> list[Flip]:
     """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
-    ends = seen.joints([0, track.skeleton.n_joints - 1])[:, 0]
-    along = track.joints_mm[:, -1] - track.joints_mm[:, 0]
+    tip = track.skeleton.tip
+    ends = seen.joints([0, tip])[:, 0]
+    along = track.joints_mm[:, tip] - track.joints_mm[:, 0]
     exchanged = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
+from liex_lab.tracking._joints import place_joints
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -106,8 +107,18 @@ class Observations:
                 rows = np.flatnonzero(part.known[:, h])
                 if len(rows):
                     pose = part.pose(np.full(len(part), h))[rows]
-                    out[start + rows, h] = pose.joints(self.skeleton)[:, list(joints)]
+                    out[start + rows, h] = joints_of(self.skeleton, pose)[:, list(joints)]
         return out
+
+
+def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
+    """Joint positions (n, J, 3) mm of poses (n); as `Pose.joints`, quicker."""
+    out = np.empty((len(pose.scale), skeleton.n_joints, 3))
+    place_joints(
+        skeleton.parents, skeleton.offsets, skeleton.rest, skeleton.axes.any(axis=1), pose.root.rotation,
+        pose.root.translation, pose.angles, np.asarray(pose.scale, float), out,
+    )  # fmt: skip
+    return out
 
 
 _BLOCK = 4096

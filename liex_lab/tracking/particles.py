@@ -16,7 +16,7 @@ from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.forests.forest import predict
 from liex_lab.geometry import SE3, brownian_path, brownian_steps, so3
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground, view_of
 from liex_lab.recordings.frame import DepthFrame
 
 Array = NDArray[np.float64]
@@ -56,8 +56,9 @@ class ParticleFilter:
     """
 
     def __init__(
-        self, estimator: PoseEstimator, scene: Scene, size: float, rng: np.random.Generator, how: Wander | None = None
-    ) -> None:
+        self, estimator: PoseEstimator, scene: Foreground, size: float, rng: np.random.Generator,
+        how: Wander | None = None,
+    ) -> None:  # fmt: skip
         self._estimator, self._scene, self._size, self._rng = estimator, scene, size, rng
         self._how = how or Wander()
         self._particles: _Particles | None = None
@@ -80,7 +81,8 @@ class ParticleFilter:
         if not crops.found[0]:
             return None
         looks = self._scene.looks(crops, method.camera_view)
-        T_view_camera = SE3(self._scene.view_rotation(method.camera_view), np.array([0.0, 0.0, crops.distance[0]]))
+        view = view_of(looks)
+        T_view_camera = SE3(view.rotation[0], view.translation[0])
         images = ImageSet(crops.heights, looks, crops.moments)
         rotations, positions, score = self._measure(images, T_view_camera @ self._particles.base)
         w = np.exp(-(score**2 - (score**2).min()) / (2.0 * (self._how.sigma_mm * self._unit) ** 2))

@@ -12,6 +12,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.tracking import _filter as kernels
+from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
 
@@ -91,7 +92,7 @@ def smooth(
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     if not known.any():
         return Curve.unknown(len(seconds), skeleton.n_joints)
-    joints = pose.joints(skeleton)
+    joints = joints_of(skeleton, pose)
     weight, used = np.ones(len(seconds)), known.copy()
     curve = _run(skeleton, seconds, pose, joints, error_mm, length_mm, motion, weight, used)
     for _ in range(_PASSES):
@@ -121,12 +122,12 @@ def _run(
     angles, _ = turn.vectors(pose.angles.reshape(n, -1), used)
     scale = np.exp(size.vectors(np.log(pose.scale)[:, None], used)[0][:, 0])
     made = Pose(SE3(rotation, np.zeros((n, 3))), angles.reshape(pose.angles.shape), scale)
-    made.root.translation[:] = centre - made.joints(skeleton).mean(axis=1)
+    made.root.translation[:] = centre - joints_of(skeleton, made).mean(axis=1)
     lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
     relative = 0.5 * middle.variance / motion.middle_error**2
     relative += 0.5 * turn.variance * (length_mm / motion.turn_error) ** 2
     return Curve(
-        made, made.joints(skeleton), np.sqrt(lasting**2 + relative),
+        made, joints_of(skeleton, made), np.sqrt(lasting**2 + relative),
         np.sqrt(middle.variance + (motion.middle_error * lasting) ** 2),
         np.sqrt(turn.variance + (motion.turn_error * lasting / length_mm) ** 2), used,
     )  # fmt: skip

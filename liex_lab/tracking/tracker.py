@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.tracking.curve import Subject, single_frames, track_whole
 from liex_lab.tracking.observations import Observations
@@ -32,7 +32,7 @@ class FrameTracker:
     """
 
     estimator: PoseEstimator
-    scene: Scene
+    scene: Foreground
     size: float
     size_origin: str
     body: BodyResidual
@@ -42,7 +42,7 @@ class FrameTracker:
     @staticmethod
     def prepare(
         estimator: PoseEstimator,
-        scene: Scene,
+        scene: Foreground,
         sample: NDArray[np.float32],
         spine_mm: float | None = None,
         doubtful_mm: float | None = None,
@@ -109,7 +109,7 @@ class FrameTracker:
         seen.n_px[found, h] = crops.n_px[found]
         if not len(found):
             return
-        centre = self._centres(estimates, found)
+        centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
         seen.centroid_mm[found, h] = centre
         in_camera = self.scene.floor.T_arena_camera.inverse() @ centre
         seen.centroid_px[found, h] = self.scene.camera.project(in_camera)
@@ -117,12 +117,3 @@ class FrameTracker:
             seen.residual_mm[found, h] = seen.residual_mm[found, h - 1]
         else:
             seen.residual_mm[found, h] = self.body.of(pose[found], crops[found], self.scene)
-
-    def _centres(self, estimates: Estimates, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """The animal's centre (m, 3) mm as seen from above and its mean height, in the arena frame."""
-        moments, camera_view = estimates.crops.moments[rows], self.estimator.model.method.camera_view
-        centre = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
-        if camera_view:  # the view's frame is not the arena's
-            centre[:, 2] -= estimates.crops.distance[rows]
-            centre = self.scene.floor.T_arena_camera @ (centre @ self.scene.view_rotation(camera_view))
-        return centre

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import SE3
 from liex_lab.tracking.curve import short_gaps, single_frames, spans, track_whole
-from liex_lab.tracking.observations import Observations, reversed_pose
+from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.track import Flip
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
@@ -161,6 +164,16 @@ def test_gaps_are_measured_in_seconds_between_measurements():
     assert np.flatnonzero(short_gaps(seconds, measured, 0.31)).tolist() == [2, 3]
     assert np.flatnonzero(short_gaps(seconds, measured, 0.2, ahead=True)).tolist() == [7]
     assert not short_gaps(seconds, np.zeros(8, bool), 1.0).any()
+
+
+def test_quick_joints_are_the_joints(measured):
+    skeleton = Skeleton.load("hand")
+    rng = np.random.default_rng(1)
+    angles = rng.normal(0.0, 0.6, (9, skeleton.n_joints, 3)) * skeleton.axes
+    angles[:, 0] = 0.0
+    root = SE3.exp(rng.normal(0.0, 1.0, (9, 6)))
+    for body, pose in ((skeleton, Pose(root, angles, np.full(9, 1.3))), (MOUSE, measured)):
+        np.testing.assert_allclose(joints_of(body, pose), pose.joints(body), atol=1e-9)
 
 
 def test_spans_are_the_stretches_of_true():

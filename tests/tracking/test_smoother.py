@@ -7,6 +7,7 @@ import pytest
 
 from liex_lab.geometry import so3
 from liex_lab.tracking import _filter as kernels
+from liex_lab.tracking._joints import exp_so3
 
 TIMES = np.cumsum([0.0, 0.03, 0.03, 0.1, 0.03, 0.03, 0.2, 0.03, 0.03])
 Q = 40.0
@@ -35,9 +36,9 @@ def by_least_squares(times, y, r, q):
         step = np.hstack([-np.array([[1.0, dt], [0.0, 1.0]]), np.eye(2)])
         rows = slice(2 * t - 2, 2 * t + 2)
         precision[rows, rows] += step.T @ np.linalg.inv(noise) @ step
-    for t in np.flatnonzero(np.isfinite(r)):
-        precision[2 * t, 2 * t] += 1.0 / r[t]
-        right[2 * t] += y[t] / r[t]
+    for k in np.flatnonzero(np.isfinite(r)):
+        precision[2 * k, 2 * k] += 1.0 / r[k]
+        right[2 * k] += y[k] / r[k]
     covariance = np.linalg.inv(precision)
     mean = covariance @ right
     return mean[::2], mean[1::2], np.array([covariance[2 * t : 2 * t + 2, 2 * t : 2 * t + 2] for t in range(n)])
@@ -73,7 +74,7 @@ def test_rotations_about_one_axis_are_smoothed_as_their_angles_are():
 def test_the_scalar_exponential_and_logarithm_are_those_of_the_geometry(angle):
     w = angle * np.array([2.0, -1.0, 2.0]) / 3.0
     rotation, back = np.zeros((3, 3)), np.zeros(3)
-    kernels.exp_so3(w, rotation)
+    exp_so3(w, rotation)
     np.testing.assert_allclose(rotation, so3.exp(w), atol=1e-14)
     kernels.log_so3(rotation, back)
     np.testing.assert_allclose(so3.exp(back), rotation, atol=1e-12)
