@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
+from liex_lab.cli_results import compare, export
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -32,6 +33,8 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
+app.command()(compare)
+app.command()(export)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
@@ -241,6 +244,22 @@ def evaluate_tables(
         written = run_tables(out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress)
     for path in written:
         typer.echo(path)
+
+
+@evaluate.command("statistics")
+def evaluate_statistics(
+    n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
+    effect: Annotated[
+        float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
+    ] = 1.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How often the comparison of groups is wrong on studies without an effect, and how often it finds one."""
+    from liex_lab.pipelines.evaluate_statistics import evaluate_statistics as measure
+
+    with progress_bar() as progress:
+        result = measure(n_studies, effect, progress=progress)
+    _tell_numbers(result, json_file)
 
 
 @evaluate.command("nyu")

@@ -30,6 +30,7 @@ IMAGE = "arena/camera/image"
 OVERLAY = "arena/camera/image/overlay"
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
+FLOOR = "arena/floor"
 ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
 _BLOCK = 8192  # frames of small things sent in one go
 RAW_UP_TO = 300  # frames; beyond it depth is stored as RVL, which is half the size
@@ -38,6 +39,7 @@ MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 # Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
 PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xDDCC77)
 _FLAG_COLOURS = {"doubtful": 0xCCBB44, "not_found": 0xEE6677, "no_depth": 0xBBBBBB}
+_WALL, _WORST = 0x9AA0A6, 12
 _BONE, _JOINT = [255, 255, 255, 255], [255, 80, 60, 255]
 
 
@@ -84,6 +86,8 @@ class ReplayWriter:
         for name, label, colour in (
             ("speed_mm_s", "speed (mm/s)", 0x4477AA),
             ("nose_height_mm", "nose height (mm)", 0x228833),
+            ("bend_rad", "bend (rad)", 0xAA3377),
+            ("tail_beat_hz", "tail beat (Hz)", 0x66CCEE),
         ):
             if name in kinematics:
                 scalars.append((f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float)))
@@ -91,6 +95,7 @@ class ReplayWriter:
             self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True)
             self._stream.send_columns(entity, _timeline(index, elapsed), [*rr.Scalars.columns(scalars=values)])
         self._log_lanes(rows, bouts, words)
+        self._log_worst(rows, index, elapsed)
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(
@@ -116,6 +121,23 @@ class ReplayWriter:
             image_plane_distance=0.05,
         )
         self._stream.log(IMAGE, lens, static=True)
+        for name, outline, colour in self._outlines():
+            ring = np.column_stack([outline, np.zeros(len(outline))])[[*range(len(outline)), 0]]
+            look: dict[str, Any] = {"colors": _rgba([colour]), "labels": [name] if name else None}
+            where = f"zones/{rr.escape_entity_path_part(name)}" if name else "walls"
+            on_floor = rr.LineStrips3D([ring / MM_PER_UNIT], radii=0.001, **look)
+            self._stream.log(f"{FLOOR}/{where}", on_floor, static=True)
+            seen = camera.project(T_arena_camera.inverse() @ ring) + 0.5
+            if np.isfinite(seen).all():
+                in_picture = rr.LineStrips2D([seen], radii=rr.Radius.ui_points(1.0), **look)
+                self._stream.log(f"{OVERLAY}/{where}", in_picture, static=True)
+
+    def _outlines(self) -> list[tuple[str, Array, int]]:
+        """The walls, whose name is empty, and the zones on the floor: name, corners (n, 2) mm, colour."""
+        walls = self._origin.arena.outline_mm()
+        zones = zip(self._origin.zones, cycle(PALETTE), strict=False)
+        drawn = [(zone.name, zone.outline_mm(), colour) for zone, colour in zones]
+        return ([("", walls, _WALL)] if len(walls) else []) + drawn
 
     def _log_depth_kind(self, first: NDArray[np.uint16]) -> None:
         """What holds for every depth image: unit, colours, layout."""
@@ -176,6 +198,17 @@ class ReplayWriter:
         xyzw = np.roll(so3.quaternion(track.root_rotation[seen]), -1, axis=-1)
         columns = rr.Transform3D.columns(translation=track.root_mm[seen] / 1000.0, quaternion=xyzw)
         self._stream.send_columns(ROOT, _timeline(index[seen], elapsed[seen]), [*columns])
+
+    def _log_worst(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+        """The frames with the largest predicted error, as notes to jump to."""
+        error = np.nan_to_num(rows.track.predicted_error_mm)
+        worst = np.sort(np.argsort(-error, kind="stable")[:_WORST])
+        worst = worst[error[worst] > 0]
+        if len(worst) == 0:
+            return
+        notes = [f"frame {index[k]}: joint error to be expected {error[k]:.1f} mm" for k in worst]
+        columns = rr.TextLog.columns(text=notes, level=["INFO"] * len(notes))
+        self._stream.send_columns("log/worst", _timeline(index[worst], elapsed[worst]), [*columns])
 
     def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """The lane of the actions, and the lane of frames to distrust."""
