@@ -6,7 +6,7 @@ import numpy as np
 
 from liex_lab.sessions import Session
 
-_LOST_SHARE, _DOUBTFUL_SHARE, _ERROR_SHARE, _NOISE_SHARE = 0.02, 0.05, 0.1, 0.5
+_LOST_SHARE, _DOUBTFUL_SHARE, _ERROR_SHARE, _NOISE_SHARE = 0.02, 0.05, 0.1, 1.0
 
 
 def warnings(session: Session) -> list[str]:
@@ -55,8 +55,8 @@ def _of_measures(session: Session) -> list[str]:
     noise, pause = row.get("speed_noise_mm_s", np.nan), rules.get("pause_below_mm_s", np.nan)
     if noise > _NOISE_SHARE * pause:
         found.append(
-            f"Errors of the pose alone look like a speed of {noise:.0f} mm/s, and a pause is one below {pause:g} mm/s: "
-            "pauses, distance and mean speed at rest are not to be trusted."
+            f"Errors of the pose alone may look like a speed of up to {noise:.0f} mm/s, and a pause is one below "
+            f"{pause:g} mm/s: pauses, and distance and speed at rest, are not to be trusted."
         )
     described = session.columns
     fps = session.metadata["frames"]["fps_median"] or 0.0

@@ -84,7 +84,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
         return good
     row = session.summary.iloc[0]
     shown = [(f"{row['distance_m']:.2f}", "m", "distance"), (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed")]
-    if "rear_count" in row:
+    if "rear_count" in row and "tail_beat_hz" not in row:
         shown.append((f"{int(row['rear_count'])}", "", f"rears, {row['rear_s']:.1f} s in all"))
     elif np.isfinite(row.get("tail_beat_hz", np.nan)):
         shown.append((f"{row['tail_beat_hz']:.1f}", "Hz", "tail beat, median"))

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
+from liex_lab.cli_results import compare, export
 from liex_lab.cli_study import cohort, scale, verify
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
@@ -36,6 +37,8 @@ app.add_typer(evaluate, name="evaluate")
 app.command()(cohort)
 app.command()(verify)
 evaluate.command("scale")(scale)
+app.command()(compare)
+app.command()(export)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
@@ -365,53 +368,6 @@ def show(
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
     command = [sys.executable, "-m", "rerun", str(replay), "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
-
-
-@app.command()
-def compare(
-    places: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Sessions, or folders with sessions in.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for the tables.")],
-    measures: Annotated[
-        list[str] | None, typer.Option("--measure", help="A column of summary.csv; repeatable; the usual ones.")
-    ] = None,
-    reference: Annotated[str | None, typer.Option("--reference", help="Compare with this group only.")] = None,
-    animals: Annotated[
-        Path | None, typer.Option("--animals", metavar="CSV", help="subject_id with group, cage, sex or batch.")
-    ] = None,
-    engine: Annotated[str, typer.Option("--engine", help="auto, permutation or mixed.")] = "auto",
-) -> None:
-    """Compare groups of animals: the test that the design allows, effect sizes, and n at every level."""
-    from liex_lab.pipelines.compare import compare_sessions
-
-    with progress_bar() as progress:
-        found = compare_sessions(
-            places, out, measures or (), reference=reference, animals=animals, engine=engine, progress=progress
-        )
-    table = Table("measure", "contrast", "difference [95 %]", "g", "p", "p, FDR", "n", "test")
-    for row in found["stats"].to_dict("records"):
-        interval = f"{row['estimate']:.4g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
-        numbers = (f"{row[name]:.2g}" for name in ("effect_size", "p", "p_fdr"))
-        n = f"{row['n_units_first']} + {row['n_units_second']} {row['unit']}s"
-        said = row["test"] or row["refused"]
-        table.add_row(*map(Text, (row["measure"], row["contrast"], interval, *numbers, n, said)))
-    Console().print(table)
-    typer.echo(f"tables: {found['folder']}")
-
-
-@app.command()
-def export(
-    session: SessionPath,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap or csv.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="The folder for it; the session's own if not named.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under this name.")] = False,
-) -> None:
-    """Write a session for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, or every table as CSV."""
-    from liex_lab.exchange import export as job
-    from liex_lab.sessions import Session
-
-    typer.echo(f"export: {job(Session.open(session), to, out, overwrite=overwrite)}")
 
 
 @app.command()

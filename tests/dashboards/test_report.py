@@ -118,7 +118,7 @@ def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatc
 
 def test_noise_that_hides_a_pause_is_warned_of(tmp_path):
     assert not any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE)))
-    track = replace(MOUSE, sd_mm=3.0)
+    track = replace(MOUSE, sd_mm=4.0)
     assert any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track)))
 
 
