@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tarfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
@@ -14,14 +15,17 @@ from liex_lab.dashboards import figures
 from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 from liex_lab.dashboards.report import methods, render, write_report
 
+from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.around import around_onsets
 from liex_lab.body import Skeleton
+from liex_lab.exchange import export
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
 from liex_lab.sessions import Session, tables
 from liex_lab.sessions.rrd import PALETTE
 from liex_lab.water import Water
+from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(4.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
@@ -172,6 +176,17 @@ def test_walls_zones_and_what_was_undone_are_shown(tmp_path):
     for said in ("round, radius 250 mm; zones: nest", "kannala_brandt 0.125", "450 mm below the lens", "<title>nest"):
         assert said in page, said
     assert "ideal camera in air" in " ".join(methods(session))
+
+
+@pytest.mark.parametrize("archive", sorted((REPOSITORY / "tests" / "golden").glob("*.tar.gz")), ids=lambda a: a.stem)
+def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp_path, archive):
+    with tarfile.open(archive) as packed:
+        packed.extractall(tmp_path, filter="data")
+    (found,) = tmp_path.rglob("session.json")
+    assert "How good it is" in render(Session.open(found.parent))
+    assert len(measure_session(Session.open(found.parent)).summary) == 1
+    for target in ("csv", "boris", "dlc", "movement", "sleap"):
+        assert export(Session.open(found.parent), target, tmp_path).exists()
 
 
 def test_a_session_without_behaviour_has_a_report_too(tmp_path):
