@@ -14,8 +14,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.rvl import rvl_message
+from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rows import Rows, frame_count, stop_times, stretches
 
@@ -55,10 +57,15 @@ class ReplayWriter:
         self._first_ns: int | None = None
         self._stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
         self._stream.set_log_time_enabled(False)
+        self._path, self._n_sent, self._checked, self._n_found = path, 0, 0, 0
         self._stream.save(path)
         if blueprint is not None:
             self._stream.send_blueprint(blueprint)
         self._log_scene()
+
+    def go_on(self, first_ns: int) -> None:
+        """The file continues another one, whose first frame was at `first_ns`."""
+        self._first_ns = first_ns
 
     def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
         """Depth (H, W) uint16 mm of consecutive frames."""
@@ -76,6 +83,7 @@ class ReplayWriter:
                 images = np.stack(depth[part])
                 columns = rr.DepthImage.columns(buffer=images.view(np.uint8).reshape(len(images), -1))
             self._stream.send_columns(DEPTH, _timeline(index[part], elapsed[part]), [*columns])
+            self._n_sent += 1
         self._stream.flush()
 
     def finish(
@@ -105,7 +113,22 @@ class ReplayWriter:
             "session", rr.AnyValues(session_id=self._origin.name, animal=self._origin.skeleton.name,
                                     input_sha256=self._origin.input_sha256)
         )  # fmt: skip
+        self.flushed()
         self.abandon()
+
+    def flushed(self) -> int:
+        """Hand everything to the system; returns the file's bytes. Raises SessionError where something is missing.
+
+        Rerun does not tell when the disk is full, so the messages on disk are counted.
+        """
+        self._stream.flush()
+        size = self._path.stat().st_size
+        with self._path.open("rb") as file:
+            for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
+                self._checked, self._n_found = at + length, self._n_found + 1
+        if self._n_found < self._n_sent:
+            raise SessionError("the replay was not written whole; make room on the disk and run it again")
+        return size
 
     def abandon(self) -> None:
         """Close the file, whole or not."""
@@ -173,7 +196,7 @@ class ReplayWriter:
         self._stream.log(UNCERTAINTY, look, static=True)
         for start in range(0, track.n_frames, _BLOCK):
             part = slice(start, start + _BLOCK)
-            when, seen = _timeline(index[part], elapsed[part]), track.observed[part]
+            when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
             self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
@@ -204,7 +227,7 @@ class ReplayWriter:
     def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frame of the body's base; while the animal is lost it stays where it was seen last."""
         track = rows.track
-        seen = track.observed
+        seen = track.posed
         if not seen.any():
             return
         self._stream.log(ROOT, rr.TransformAxes3D(0.02), static=True)

@@ -76,7 +76,7 @@ class WalkingMouse:
             sd_angles_rad=np.full(angles.shape, 0.05), scale=scale,
             predicted_error_mm=2.0 + 0.5 * np.sin(self.times_s), residual_mm=np.full(n, 1.5),
             n_foreground_px=np.full(n, 900, np.int64), centroid_mm=joints.mean(axis=1), centroid_px=uv.mean(axis=1),
-            flag=np.full(n, "", "<U12"),
+            p_flip=np.zeros(n), bridged=np.zeros(n, bool), flag=np.full(n, "", "<U12"),
         )  # fmt: skip
         return forget(track, self.lost)
 
