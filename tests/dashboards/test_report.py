@@ -122,7 +122,7 @@ def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatc
 
 def test_noise_that_hides_a_pause_is_warned_of(tmp_path):
     assert not any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE)))
-    track = replace(MOUSE, sd_mm=4.0)
+    track = replace(MOUSE, sd_mm=8.0)
     assert any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track)))
 
 
@@ -135,14 +135,14 @@ def test_the_matrix_and_the_zones_are_on_the_page(tmp_path):
 
 
 def test_a_measure_around_an_onset_is_what_the_frames_say():
-    """A speed that steps from 10 to 90 mm/s at each of four onsets."""
-    time = np.arange(0, 40, 1 / 30)
+    """A speed that steps from 10 to 90 mm/s at each of five onsets."""
+    time = np.arange(0, 50, 1 / 30)
     speed = np.where((time % 10) >= 5.0, 90.0, 10.0)
     moved = pd.DataFrame({"time_s": time, "speed_mm_s": speed})
-    bouts = pd.DataFrame({"action": ["run"] * 4 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 1.0]})
+    bouts = pd.DataFrame({"action": ["run"] * 5 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 45.0, 1.0]})
     found = around_onsets(moved, bouts, "run", "speed_mm_s")
     assert found is not None
-    assert found.n == 4
+    assert found.n == 5
     np.testing.assert_allclose(found.median[found.time_s < -0.05], 10.0)
     np.testing.assert_allclose(found.median[found.time_s > 0.05], 90.0)
     assert around_onsets(moved, bouts, "walk", "speed_mm_s") is None
