@@ -55,7 +55,7 @@ def acted_tracks(
     scenarios: list[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[LabelledTrack]:
     """The tracks of all scenarios, kept from earlier or measured now. Those of one individual share its size."""
-    key = hashlib.sha256(repr(scenarios).encode() + estimator.model.digest.encode() + _generator()).hexdigest()[:16]
+    key = hashlib.sha256(repr(scenarios).encode() + estimator.model.digest().encode() + _generator()).hexdigest()[:16]
     path = cache_folder() / "acted" / f"{scenarios[0].animal}-{key}.npz"
     if path.is_file():
         return _load(path, estimator)

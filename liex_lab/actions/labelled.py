@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +34,9 @@ class LabelledTrack:
 
     def __getitem__(self, rows: slice | NDArray[np.int64]) -> LabelledTrack:
         """Some of its frames."""
-        from dataclasses import fields
-
         assert self.wall_mm is not None
-        columns = [getattr(self.track, f.name)[rows] for f in fields(Track) if f.name != "skeleton"]
         truth = None if self.truth is None else self.truth[rows]
-        track = Track(self.track.skeleton, *columns)
-        return LabelledTrack(track, self.words[rows], self.animal, self.wall_mm[rows], truth)
+        return LabelledTrack(some_rows(self.track, rows), self.words[rows], self.animal, self.wall_mm[rows], truth)
 
     def at_rate(self, rate_hz: float) -> LabelledTrack:
         """What a slower camera would have seen: the frames nearest to its times."""
@@ -49,3 +45,9 @@ class LabelledTrack:
         after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
         rows = np.where(wanted - times[after - 1] < times[after] - wanted, after - 1, after)
         return self[np.unique(rows)]
+
+
+def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:
+    """Some frames of a track."""
+    columns = [getattr(track, f.name)[rows] for f in fields(Track) if f.name != "skeleton"]
+    return Track(track.skeleton, *columns)
