@@ -19,10 +19,10 @@ from liex_lab.progress import Progress, silent
 
 Array = NDArray[np.float64]
 
-_HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 14, 256, 2
+_HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 10, 512, 2
 _WEIGHT_DECAY = 2e-3
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
-_SHARPNESS = 0.15
+_SHARPNESS = 0.1
 _LEAST_BOUTS = 3  # of a word that is to be learned
 
 
