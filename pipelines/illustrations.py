@@ -74,7 +74,7 @@ def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
     from liex_lab.estimation.training import TrainingSet
 
     recipe = recipe_of("default", skeleton)
-    first = recipe.n_images + recipe.n_calibration
+    first = recipe.n_images + recipe.n_correction + recipe.n_calibration
     recipe = replace(recipe, sizes=recipe_of("paper", skeleton).sizes)
     data = rendered_set(skeleton, model.method, recipe, first, n, silent)
     rows = np.flatnonzero(data.animal)[:n]

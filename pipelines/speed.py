@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.recordings.foreground import Scene
 
+Array = NDArray[Any]
 N_FRAMES = 128
 N_REPEATS = 5
 _CANDIDATES = (5, 10, 20, 40)
@@ -70,6 +71,8 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         one, two = (_frames_per_s(default, footage, parallel) for parallel in (False, True))
         progress(2, 5, "timing the others")
         ratios = {name: two / _frames_per_s(rival, footage, True) for name, rival in rivals.items()}
+        paper = cast("PoseEstimator", rivals["paper"])
+        ratios["paper_one_by_one"] = two * best_seconds(partial(_one_by_one, paper, footage)) / N_FRAMES
         progress(3, 5, "timing the stages")
         stages = _stages(default, footage)
         progress(4, 5, "timing what makes a frame dearer")
@@ -86,8 +89,10 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         "cost_ms": costs,
         "machine": f"{platform.processor() or platform.machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
         "protocol": f"{N_FRAMES} rendered {footage.pixels} frames in memory, foreground to final pose, best of "
-        f"{N_REPEATS}; ratios on {cores} cores in the same run; stages and costs in ms a frame on one core: `joints` "
-        "is the whole with that many joints' regressors, `candidates` unpruned, `pixels` the foreground alone",
+        f"{N_REPEATS}; ratios on {cores} cores in the same run, `paper` on our engine, `paper_one_by_one` compiled but "
+        "as published: every candidate walks down every tree by itself, and leaves are averaged; stages and costs in "
+        "ms a frame on one core: `joints` is the whole with that many joints' regressors, `candidates` unpruned, "
+        "`pixels` the foreground alone",
     }
 
 
@@ -131,6 +136,34 @@ def _frames_per_s(subject: PoseEstimator | Baseline, footage: _Footage, parallel
     return len(footage.frames) / best_seconds(job)
 
 
+def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
+    """Algorithm 1 as it is written, from frames to the scores of all candidates: no two of them share a step."""
+    from liex_lab.estimation.cascade import Candidates, ImageSet
+    from liex_lab.estimation.initial import draw_starts, start_poses
+    from liex_lab.estimation.training import base_at_front
+    from liex_lab.forests.forest import predict
+
+    method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
+    crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
+    images = ImageSet(crops.heights, footage.scene.looks(crops, method.camera_view), crops.moments)
+    n, k = len(crops.heights), method.n_candidates
+    rotation, position, scale = start_poses(
+        crops.moments, draw_starts(np.random.default_rng(0), 1, k), np.ones((n, k)), skeleton.length,
+        base_at_front(skeleton), method.axis_start, method.camera_view,
+    )  # fmt: skip
+    image = np.repeat(np.arange(n, dtype=np.int32), k)
+    poses = Candidates.start(
+        skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), np.ones(n * k)
+    )
+    for joint, rounds in zip(skeleton.solved, cascade.forests, strict=True):
+        if joint:
+            cascade.place(poses, joint)
+        for forest in rounds:
+            cascade.apply(poses, joint, predict(forest, cascade.samples(images, poses, [joint])))
+    cascade.place_ends(poses)
+    return predict(paper.model.metric, cascade.samples(images, poses, list(range(skeleton.n_joints))))
+
+
 def _ms(job: Callable[[], Any]) -> float:
     """Milliseconds a frame."""
     return 1000.0 * best_seconds(job) / N_FRAMES
@@ -138,17 +171,17 @@ def _ms(job: Callable[[], Any]) -> float:
 
 def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
     """Milliseconds a frame on one core of what a frame goes through."""
-    from liex_lab.estimation.scoring import choose
+    from liex_lab.estimation.cascade import ImageSet
 
     frames, scene, size = footage.frames, footage.scene, footage.size
     crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
     looks = scene.looks(crops, default.model.method.camera_view)
     rotations, positions, _, scores = default.candidates(crops, looks, size)
+    images = ImageSet(crops.heights, looks, crops.moments)
     return {
         "foreground": _ms(lambda: scene.extract(frames, size, False, default.model.method.camera_view)),
         "candidates": _ms(lambda: default.candidates(crops, looks, size, False)),
-        "choice": _ms(lambda: choose(default.skeleton, default.model.method, default.model.calibration, size,
-                                     rotations, positions, scores)),
+        "choice": _ms(lambda: default.pick(images, size, rotations, positions, scores, False)),
     }  # fmt: skip
 
 

@@ -36,21 +36,28 @@ class Recipe:
 
     seed: int = 20
     n_images: int = 49_152
-    n_calibration: int = 24_576
+    n_correction: int = 12_288  # further images, for the last correction
+    n_calibration: int = 24_576  # and further ones, for the predicted error
     degraded_share: float = 0.5
     sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
 
 
-_CALIBRATION = 1  # number of the calibration's own random numbers, so that it can be made again by itself
+_CALIBRATION, _CORRECTION = 1, 2  # numbers of their own random numbers, so that each can be made again by itself
 _AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
-RECIPES = {"default": Recipe(), "paper": Recipe(n_images=10_240, degraded_share=0.0, sizes=((0.0, 144),))}
+RECIPES = {
+    "default": Recipe(),
+    "paper": Recipe(n_images=10_240, n_correction=0, degraded_share=0.0, sizes=((0.0, 144),)),
+}
+_AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
 _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # of an animal and a variant, where it is not the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
-    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_calibration=4_096, sizes=_FISH_SIZES),
-    ("fish", "paper"): Recipe(seed=31, n_images=6_144, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)),
+    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES),
+    ("fish", "paper"): Recipe(
+        seed=31, n_images=6_144, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)
+    ),
 }
 
 
@@ -62,7 +69,7 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
     if not isinstance(world, GenericWorld):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
     sizes = tuple((factor * skeleton.length, world.window_px(factor * skeleton.length)) for factor in _OWN_SIZES)
-    images = {name: getattr(_OWN["fish", variant], name) for name in ("n_images", "n_calibration", "degraded_share")}
+    images = {name: getattr(_OWN["fish", variant], name) for name in _AMOUNTS}
     return Recipe(**images, sizes=sizes if variant == "default" else sizes[:1])
 
 
@@ -77,8 +84,8 @@ def train_model(
 ) -> Path:
     """Train an animal's model and write it, and its card, to `out` (.npz); returns the path.
 
-    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of that to calibrate on,
-    instead of what the recipe says.
+    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of that to correct and
+    to calibrate on, instead of what the recipe says.
     """
     import numba
 
@@ -90,7 +97,7 @@ def train_model(
     skeleton = Skeleton.load(animal)
     recipe = recipe_of(variant, skeleton)
     if n_images is not None:
-        recipe = replace(recipe, n_images=n_images, n_calibration=n_images // 4)
+        recipe = replace(recipe, n_images=n_images, n_correction=n_images // 4, n_calibration=n_images // 4)
     model = make_model(skeleton, method_of(variant, skeleton), recipe, progress)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,8 +111,8 @@ def train_model(
 
 
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
-    """Algorithm 2, the learned metric, and its calibration on images that no tree has seen."""
-    from liex_lab.estimation.calibration import calibrate
+    """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and the calibration."""
+    from liex_lab.estimation.calibration import calibrate, with_corrector
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
 
@@ -126,9 +133,14 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         "images": "rendered from a seed; no recording of an animal was used",
     }  # fmt: skip
     model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
+    if method.corrector is not None and recipe.n_correction:
+        progress(steps - 1, steps, "learning the last correction")
+        unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_correction, silent)
+        model = with_corrector(model, unseen, np.random.default_rng([recipe.seed, _CORRECTION]))
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
-        unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_calibration, silent)
+        first = recipe.n_images + recipe.n_correction
+        unseen = rendered_set(skeleton, method, recipe, first, recipe.n_calibration, silent)
         model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
     return model
 

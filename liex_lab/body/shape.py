@@ -38,7 +38,7 @@ class BodyShape:
     def default(skeleton: Skeleton) -> BodyShape:
         """The animal that the skeleton's [surface] table describes."""
         table = skeleton.surface
-        if (skeleton.parents[1:] != np.arange(skeleton.n_joints - 1)).any():
+        if not skeleton.is_chain:
             raise LiexError(
                 f"the [surface] of '{skeleton.name}' has stations, but its joints are not one chain, each the parent "
                 "of the next; give radii_mm instead"

@@ -111,7 +111,7 @@ class Skeleton:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise LiexError(f"the skeleton {path} is not a TOML file: {error}") from None
-        return Skeleton.from_table(table, str(path))
+        return Skeleton.from_table(_with_mesh(table, path), str(path))
 
     @staticmethod
     def from_table(table: dict[str, Any], origin: str) -> Skeleton:
@@ -155,6 +155,11 @@ class Skeleton:
         return len(self.names)
 
     @property
+    def is_chain(self) -> bool:
+        """Whether each joint carries the next and only that, as along a spine."""
+        return bool(np.array_equal(self.parents, np.arange(-1, self.n_joints - 1)))
+
+    @property
     def dof(self) -> int:
         """Degrees of freedom: six for the base and one for each free axis of the other joints."""
         return _ROOT_DOF + int(self.axes[1:].sum())
@@ -186,6 +191,23 @@ class Skeleton:
     def solved(self) -> list[int]:
         """The joints that move and so need a regressor, base first."""
         return [0] + [j for j in range(1, self.n_joints) if self.axes[j].any()]
+
+
+def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The table of the TOML at `path`; where its [surface] names the file of a mesh, with the mesh in its place."""
+    surface = table.get("surface")
+    if not isinstance(surface, dict) or "mesh" not in surface:
+        return table
+    from liex_lab.body.mesh import read_mesh
+
+    name, unit_mm = surface["mesh"], surface.get("mesh_unit_mm", 1.0)
+    if not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0):
+        raise LiexError(
+            f"{path}: [surface] mesh is the name of a file and mesh_unit_mm the mm that one of its units is long, got "
+            f"{name!r} and {unit_mm!r}"
+        )
+    others = {key: value for key, value in surface.items() if key not in ("mesh", "mesh_unit_mm")}
+    return table | {"surface": others | read_mesh(path.parent / name, float(unit_mm), str(path))}
 
 
 def _length(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -> float:

@@ -1,7 +1,8 @@
 """The surface around a skeleton, as a triangle mesh, and its picture in a depth camera.
 
 A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a tube along one chain
-of joints (the mouse), `radii_mm` a capsule around every bone and `capsules` further ones (anything else).
+of joints (the mouse), `radii_mm` a capsule around every bone and `capsules` further ones (anything else), `mesh` is the
+file of a body of one's own.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body import _render, _skin
 from liex_lab.body.capsules import Capsules
+from liex_lab.body.mesh import MeshBody
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
@@ -21,15 +23,16 @@ from liex_lab.geometry import SE3
 from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
-Body = BodyShape | Capsules
+Body = BodyShape | Capsules | MeshBody
 Window = tuple[int, int, int, int]
+_FAR, _SILHOUETTE_PX = 50.0, 400  # a silhouette is seen from so many times its reach, in a picture of so many pixels
 
 
 @dataclass(frozen=True)
 class Surface:
     """A mesh of fixed topology that follows a skeleton: `faces` (F, 3) index the vertices (V, 3) of every pose.
 
-    shape: the default animal of a tubular body; capsules: a capsule body. The other one is None.
+    shape: the default animal of a tubular body; capsules: a capsule body; mesh: that of a file. The others are None.
     """
 
     skeleton: Skeleton
@@ -37,6 +40,7 @@ class Surface:
     stations: Array
     shape: BodyShape | None
     capsules: Capsules | None
+    mesh: MeshBody | None = None
 
     @staticmethod
     def of(skeleton: Skeleton) -> Surface:
@@ -49,6 +53,9 @@ class Surface:
             parts += [(_skin.BLOB_RINGS, _skin.BLOB_SEGMENTS)] * len(shape.blobs)
             parts += [(_skin.TAIL_RINGS, _skin.TAIL_SEGMENTS)]
             return Surface(skeleton, _skin.joined_faces(parts), stations, shape, None)
+        if "vertices_mm" in table:
+            mesh = MeshBody.of(skeleton)
+            return Surface(skeleton, mesh.faces, np.zeros(0), None, None, mesh)
         capsules = Capsules.of(skeleton)
         return Surface(skeleton, capsules.faces, np.zeros(0), None, capsules)
 
@@ -70,6 +77,8 @@ class Surface:
     @property
     def area_mm2(self) -> float:
         """About the area of the home pose seen from above."""
+        if self.mesh is not None:
+            return self._silhouette_mm2()
         if self.capsules is not None:
             home = Pose.home(self.skeleton).joints(self.skeleton)
             first, last = (home[self.capsules.joints[:, k]] for k in range(2))
@@ -77,6 +86,16 @@ class Surface:
             return float((along * self.capsules.radii.sum(axis=-1)).sum())
         assert self.shape is not None
         return float(np.trapezoid(2.0 * self.shape.half_width, self.stations * self.skeleton.length))
+
+    def _silhouette_mm2(self) -> float:
+        """The area of the home pose from straight above, counted in a picture from very far away."""
+        mesh = self.vertices(Pose.home(self.skeleton))
+        reach = float(np.abs(mesh).max())
+        camera = Camera(_FAR * _SILHOUETTE_PX / 2, _FAR * _SILHOUETTE_PX / 2, _SILHOUETTE_PX / 2, _SILHOUETTE_PX / 2,
+                        _SILHOUETTE_PX, _SILHOUETTE_PX)  # fmt: skip
+        above = SE3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, _FAR * reach]))
+        seen = render_mesh(mesh, self.faces, camera, T_camera_mesh=above) > 0
+        return float(seen.sum()) * (2.0 * reach / _SILHOUETTE_PX) ** 2
 
     def vertices(
         self,
@@ -98,6 +117,11 @@ class Surface:
         n = len(joints)
         size = np.broadcast_to(pose.scale if girth is None else girth, batch).astype(float).reshape(n)
         rotations = np.ascontiguousarray(frames.rotation).reshape(n, self.skeleton.n_joints, 3, 3)
+        if self.mesh is not None:
+            own = shape if isinstance(shape, MeshBody) else self.mesh
+            scale = np.broadcast_to(pose.scale, batch).astype(float).reshape(n)
+            with threads(parallel):
+                return own.vertices(self.skeleton, rotations, joints, scale, size).reshape(*batch, -1, 3)
         if self.capsules is not None:
             flesh = shape if isinstance(shape, Capsules) else self.capsules
             scale = np.broadcast_to(pose.scale, batch).astype(float).reshape(n)

@@ -29,6 +29,9 @@ def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int)
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
     surface = Surface.of(skeleton)
     fur = rng.uniform(0.0, 0.4, n)
+    if surface.mesh is not None:
+        wide, high = _factors(rng, joint_reaches(skeleton), family, n)
+        return replace(surface.mesh.broadcast(n), width=np.sqrt(wide * high), fur=fur)
     if surface.capsules is not None:
         reach = joint_reaches(skeleton)
         wide, high = _factors(rng, reach, family, n)

@@ -1,15 +1,20 @@
-"""What the learned metric's score means in millimetres, found on images that no tree has seen."""
+"""What is learned of a model's own choices, on images that no tree has seen: their last correction, and how far off
+they are in millimetres.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.correction import moves_to, pose_samples
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
-from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, choose, clue_samples
+from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
 from liex_lab.estimation.training import TrainingSet, quantised
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
@@ -26,6 +31,7 @@ _EXPECTATION = GrowthPlan(
     bag_share=0.5,
 )  # fmt: skip
 _SHRINKAGE = 0.12
+_CORRECTED_MM, _CORRECTION_SHRINKAGE = 12.0, 0.1  # at the reference length: what is farther off is another pose
 _FOLDS = 4
 
 
@@ -41,35 +47,81 @@ class Trial:
     clues: Samples
 
 
-def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
-    """Let a model choose. Images are taken in order of size, and each group of them shares one guess of it."""
+@dataclass(frozen=True)
+class _Group:
+    """Images that share a guess of the size, as the frames of a recording do: their rows in the set, the guess over
+    home size, and the model's choices for them.
+    """
+
+    rows: NDArray[np.int64]
+    images: ImageSet
+    size: float
+    chosen: Chosen
+
+
+def _choices(model: Model, data: TrainingSet, rng: np.random.Generator) -> Iterator[_Group]:
+    """Let a model choose. Images of animals are taken in order of size, and each group of them shares one guess."""
     animals = np.flatnonzero(data.animal)
     order = animals[np.argsort(data.size[animals], kind="stable")]
-    estimator, skeleton = PoseEstimator(model), model.skeleton
-    scores_of, spreads, joint_errors, clues = [], [], [], []
+    estimator = PoseEstimator(model)
     for rows in np.array_split(order, max(1, len(order) // _GROUP)):
         size = float(np.median(data.size[rows]) * np.exp(_SIZE_SD * rng.standard_normal()))
         size = size if model.method.session_size else 1.0
-        looks, moments = data.images.looks[rows], data.images.moments[rows]
+        looks = data.images.looks[rows]
+        images = ImageSet(data.images.heights[rows], looks, data.images.moments[rows])
         crops = Crops(
-            data.images.heights[rows], looks[:, 14:16].astype(np.int32), looks[:, 16].astype(np.int32),
-            np.full(len(rows), 1), moments, looks[:, 13], np.ones(len(rows), np.int64),
+            images.heights, looks[:, 14:16].astype(np.int32), looks[:, 16].astype(np.int32), np.full(len(rows), 1),
+            images.moments, looks[:, 13], np.ones(len(rows), np.int64),
         )  # fmt: skip
         rotations, positions, _, scores = estimator.candidates(crops, looks, size)
-        picked = choose(skeleton, model.method, model.calibration, size, rotations, positions, scores)
-        off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[rows], axis=-1)
+        yield _Group(rows, images, size, estimator.pick(images, size, rotations, positions, scores))
+
+
+def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
+    """The choices of a model for the animals among the images, and how far off they are."""
+    skeleton = model.skeleton
+    scores_of, spreads, joint_errors, clues = [], [], [], []
+    for group in _choices(model, data, rng):
+        picked, images = group.chosen, group.images
+        off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1)
         scores_of.append(picked.score)
         spreads.append(picked.spread)
-        joint_errors.append(off / size)
-        clues.append(clue_samples(picked, skeleton, moments, looks, size).scalars)
+        joint_errors.append(off / group.size)
+        blank = clue_samples(picked, skeleton, images.moments, images.looks, group.size)
+        clues.append(blank.scalars)
     scalars = np.concatenate(clues)
-    blank = clue_samples(picked, skeleton, moments, looks, size)
     n = len(scalars)
     samples = Samples(
         blank.heights, np.zeros(n, np.int32), np.ones(n, np.float32),
         np.zeros((n, 1, blank.views.shape[2]), np.float32), scalars,
     )  # fmt: skip
     return Trial(np.concatenate(scores_of), np.concatenate(spreads), np.concatenate(joint_errors), samples)
+
+
+def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
+    """The model with the last correction of its choices, learned from images that no tree has seen.
+
+    What is off by more than an ordinary error, as a pose that points the other way, teaches nothing. Skeletons that
+    branch have no such correction: their poses do not follow from the places of their joints.
+    """
+    plan, worst = model.method.corrector, _CORRECTED_MM * model.skeleton.relative_size
+    if plan is None or not model.skeleton.is_chain:
+        return model
+    parts, moves = [], []
+    for group in _choices(model, data, rng):
+        true = data.truth.positions[group.rows]
+        off = np.linalg.norm(group.chosen.pose.joints(model.skeleton) - true, axis=-1).mean(axis=1)
+        near = np.flatnonzero(off < worst * group.size)
+        samples = pose_samples(group.chosen.pose, model, group.images, group.size)
+        samples = Samples(
+            data.images.heights, group.rows.astype(np.int32), samples.inverse_size, samples.views, samples.scalars
+        )
+        parts.append(samples[near])
+        moves.append(moves_to(group.chosen.pose, model, true, group.size)[near])
+    labels = np.concatenate(moves).astype(np.float32)
+    return replace(
+        model, corrector=quantised(boost_forest(Samples.join(parts), labels, plan, _CORRECTION_SHRINKAGE, rng))
+    )
 
 
 def _rows(samples: Samples, index: NDArray[np.int64]) -> Samples:

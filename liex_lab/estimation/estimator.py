@@ -14,6 +14,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
+from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
@@ -130,8 +132,8 @@ class PoseEstimator:
                 values[better] for values in (other_looks, found[0], found[1], found[3])
             )
         usable = crops.found
-        picked = choose(self.skeleton, method, self.model.calibration, size,
-                        rotations[usable], positions[usable], scores[usable])  # fmt: skip
+        images = ImageSet(crops.heights[usable], looks[usable], crops.moments[usable])
+        picked = self.pick(images, size, rotations[usable], positions[usable], scores[usable], parallel)
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         T_camera_view = SE3(
@@ -139,6 +141,14 @@ class PoseEstimator:
             np.stack([np.zeros(len(looks)), np.zeros(len(looks)), crops.distance], axis=-1),
         ).inverse()
         return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+
+    def pick(
+        self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
+    ) -> Chosen:
+        """One pose for each of n height maps out of its candidates, after the last correction."""
+        picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
+        with threads(parallel):
+            return corrected(picked, self.model, images, size)
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array

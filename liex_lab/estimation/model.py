@@ -21,7 +21,7 @@ from liex_lab.estimation.method import Method
 from liex_lab.forests.forest import Forest
 
 SCHEMA = 2
-_FORESTS = ("metric", "expectation", "pruner")  # that follow the regressors, as far as a model has them
+_FORESTS = ("metric", "expectation", "pruner", "corrector")  # that follow the regressors, as far as a model has them
 _DAMAGE = (
     OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
     lzma.LZMAError,
@@ -54,7 +54,7 @@ class Model:
     """Everything an estimator needs.
 
     expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
-    is the small metric that sees the base joint only.
+    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more.
     """
 
     cascade: Cascade
@@ -64,6 +64,7 @@ class Model:
     calibration: Calibration = field(default_factory=Calibration)
     card: dict[str, Any] = field(default_factory=dict)
     pruner: Forest | None = None
+    corrector: Forest | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -130,7 +131,10 @@ class Model:
             raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
         cascade = Cascade(skeleton, method, [forests[k * n : (k + 1) * n] for k in range(len(skeleton.solved))])
         named = dict(zip(extra, forests[n_regressors:], strict=True))
-        return Model(cascade, named["metric"], named.get("expectation"), table, calibration, card, named.get("pruner"))
+        metric, *others = (named.get(name) for name in _FORESTS)
+        assert metric is not None
+        expectation, pruner, corrector = others
+        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector)
 
     def digest(self) -> str:
         """SHA-256 of the model file."""

@@ -66,6 +66,18 @@ class Samples:
     def __len__(self) -> int:
         return len(self.image)
 
+    def __getitem__(self, index: NDArray[np.int64]) -> Samples:
+        """Some of the samples, on the same maps."""
+        return Samples(
+            self.heights, self.image[index], self.inverse_size[index], self.views[index], self.scalars[index]
+        )
+
+    @staticmethod
+    def join(parts: list[Samples]) -> Samples:
+        """The samples of several sets on the same maps, one after the other."""
+        fields = ("image", "inverse_size", "views", "scalars")
+        return Samples(parts[0].heights, *(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
+
 
 def predict(forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
     """Mean leaf value (n, D) of each sample.

@@ -23,6 +23,7 @@ def girths(skeleton: Skeleton, family: str, n: int = 800) -> np.ndarray:
     if isinstance(body, Capsules):
         assert surface.capsules is not None
         return (body.radii / surface.capsules.radii).reshape(n, -1)
+    assert isinstance(body, BodyShape)
     assert surface.shape is not None
     inner = slice(2, -2)
     return np.sqrt(body.half_width * body.half_height)[:, inner] / np.sqrt(

@@ -109,7 +109,7 @@ def tiny(variant: str) -> Method:
         method, rounds=2, n_candidates=8, training_candidates=4,
         regressors=replace(method.regressors, n_trees=4, max_depth=12, min_leaf=5, n_tests=60),
         metric=replace(method.metric, n_trees=12, max_depth=8, min_leaf=8, n_tests=60),
-        metric_shrinkage=0.4 if method.metric_shrinkage else 0.0, survivors=0, pruner=None,
+        metric_shrinkage=0.4 if method.metric_shrinkage else 0.0, survivors=0, pruner=None, corrector=None,
     )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A model of the snake, from few pictures and few shallow trees."""
     default = methods.METHODS["default"]
     small = replace(
-        default, rounds=2, n_candidates=6, training_candidates=4, survivors=0, pruner=None,
+        default, rounds=2, n_candidates=6, training_candidates=4, survivors=0, pruner=None, corrector=None,
         regressors=replace(default.regressors, n_trees=5, max_depth=12, n_tests=50),
         metric=replace(default.metric, n_trees=16, max_depth=7, n_tests=40),
     )  # fmt: skip

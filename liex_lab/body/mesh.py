@@ -1,0 +1,149 @@
+"""A body made of a user's own triangle mesh: bound to the bones at home, it follows them in every pose.
+
+Open3D reads the file and thins it out when a skeleton's TOML is loaded; from then on the mesh is part of the skeleton's
+table, so that a trained model carries its body with it and needs neither the file nor Open3D.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError
+
+Array = NDArray[np.float64]
+
+_BONES = 2  # that a vertex follows
+_SHARPNESS = 4  # a bone's pull falls off with the distance to this power
+_MOST_FACES, _FEWEST_FACES = 4000, 4
+
+
+@dataclass(frozen=True)
+class MeshBody:
+    """A mesh of V vertices that moves with a skeleton by linear blending; one body, or a batch (n). mm at scale 1.
+
+    faces (F, 3); bones (V, B): the joints that end the bones which a vertex follows; weight (V, B), of sum 1; along and
+    across (V, B, 3): where the vertex lies in the frame that carries the bone, along it and across; width (..., J): the
+    girth at each joint over the file's; fur (...) as in `BodyShape`.
+    """
+
+    faces: NDArray[np.int32]
+    bones: NDArray[np.int64]
+    weight: Array
+    along: Array
+    across: Array
+    width: Array
+    fur: Array = field(default_factory=lambda: np.array(0.0))
+
+    def __len__(self) -> int:
+        return len(self.fur)
+
+    def __getitem__(self, index: int | slice | NDArray[np.int64]) -> MeshBody:
+        """One body, or some, out of a batch."""
+        return replace(self, width=self.width[index], fur=self.fur[index])
+
+    def broadcast(self, n: int) -> MeshBody:
+        """A batch (n,) of this one body, or this batch."""
+        if self.fur.ndim == 1 and len(self.fur) == n:
+            return self
+        return replace(self, width=np.broadcast_to(self.width, (n, self.width.shape[-1])).copy(),
+                       fur=np.broadcast_to(self.fur, n).copy())  # fmt: skip
+
+    @staticmethod
+    def of(skeleton: Skeleton) -> MeshBody:
+        """The mesh of a skeleton's [surface] table, bound to the bones that are nearest at home."""
+        table = skeleton.surface
+        vertices, faces = np.array(table["vertices_mm"], float), np.array(table["faces"], np.int64)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
+            raise LiexError(f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm")
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
+            raise LiexError(f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its vertices")
+        home = Pose.home(skeleton).frames(skeleton)
+        ends = np.arange(1, skeleton.n_joints)
+        carriers = skeleton.parents[ends]
+        start, stop = home.translation[carriers], home.translation[ends]
+        bone = stop - start
+        length2 = np.maximum(np.sum(bone**2, axis=-1), 1e-12)
+        share = np.clip(np.einsum("vbd,bd->vb", vertices[:, None] - start, bone) / length2, 0.0, 1.0)
+        far = np.linalg.norm(vertices[:, None] - start - share[..., None] * bone, axis=-1)
+        n_bones = min(_BONES, len(ends))
+        near = np.argsort(far, axis=1, kind="stable")[:, :n_bones]
+        pull = 1.0 / np.maximum(np.take_along_axis(far, near, axis=1), 1e-6) ** _SHARPNESS
+        carrier = carriers[near]
+        local = np.einsum("vbji,vbj->vbi", home.rotation[carrier], vertices[:, None] - home.translation[carrier])
+        direction = skeleton.offsets[ends] / np.sqrt(length2)[:, None]
+        along = np.einsum("vbi,vbi->vb", local, direction[near])[..., None] * direction[near]
+        return MeshBody(
+            faces.astype(np.int32), ends[near], pull / pull.sum(axis=1, keepdims=True), along, local - along,
+            np.ones(skeleton.n_joints),
+        )  # fmt: skip
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of one pose's mesh."""
+        return len(self.weight)
+
+    def vertices(self, skeleton: Skeleton, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
+        """Mesh vertices (n, V, 3) mm for joints (n, J, 3, 3) and (n, J, 3) mm.
+
+        scale (n,) multiplies lengths along the bones, girth (n,) those across.
+        """
+        body = self.broadcast(len(positions))
+        out = np.empty((len(positions), self.n_vertices, 3))
+        carrier = skeleton.parents[self.bones]
+        _skin_mesh(rotations, positions, scale, girth, carrier, self.bones, self.weight, self.along, self.across,
+                   body.width, out)  # fmt: skip
+        return out
+
+
+@njit(cache=True, parallel=True)
+def _skin_mesh(rotations, positions, scale, girth, carrier, bones, weight, along, across, width, out):
+    """Linear blending for a batch; shapes as in `MeshBody`, out (n, V, 3)."""
+    for i in prange(len(positions)):
+        for v in range(len(weight)):
+            for axis in range(3):
+                out[i, v, axis] = 0.0
+            for b in range(weight.shape[1]):
+                j = carrier[v, b]
+                thick = girth[i] * 0.5 * (width[i, j] + width[i, bones[v, b]])
+                for axis in range(3):
+                    total = positions[i, j, axis]
+                    for k in range(3):
+                        total += rotations[i, j, axis, k] * (scale[i] * along[v, b, k] + thick * across[v, b, k])
+                    out[i, v, axis] += weight[v, b] * total
+
+
+def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
+    """The entries of a [surface] table for the mesh of a file (.stl, .obj, .ply, .glb ...), thinned out to what a depth
+    picture shows. unit_mm: how many mm one unit of the file is; origin names the TOML in errors. Raises LiexError.
+    """
+    if not path.is_file():
+        raise LiexError(f"{origin}: [surface] mesh should be a file beside the TOML, but there is no {path}")
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise LiexError(
+            f"{origin}: reading {path.name} needs Open3D ({error}); install it with: pip install 'liex_lab[mesh]'"
+        ) from None
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        mesh = open3d.io.read_triangle_mesh(path)
+        mesh.merge_close_vertices(1e-9)
+        mesh.remove_degenerate_triangles()
+        if len(mesh.triangles) > _MOST_FACES:
+            mesh = mesh.simplify_quadric_decimation(_MOST_FACES)
+        mesh.remove_unreferenced_vertices()
+    vertices, faces = np.asarray(mesh.vertices) * unit_mm, np.asarray(mesh.triangles)
+    if len(faces) < _FEWEST_FACES or not np.isfinite(vertices).all():
+        raise LiexError(
+            f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} holds {len(faces)} of "
+            "them; export it as STL, OBJ or PLY"
+        )
+    return {"vertices_mm": np.round(vertices, 3).tolist(), "faces": faces.tolist()}
+
