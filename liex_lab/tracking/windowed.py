@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
+from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.scoring import Chosen, with_expected_error
 from liex_lab.geometry import SE3
 from liex_lab.recordings.crops import Crops, Windows
 from liex_lab.tracking.track import Track
@@ -74,6 +75,6 @@ class WindowTracker:
         crops, looks = windows.extract(np.full(n, used), area, self.min_height_mm, model.method.camera_view)
         rotations, positions, _, scores = self.estimator.candidates(crops, looks, used)
         seen = crops.found
-        chosen = choose(self.estimator.skeleton, model.method, model.calibration, used, rotations[seen],
-                        positions[seen], scores[seen])  # fmt: skip
+        images = ImageSet(crops.heights[seen], looks[seen], crops.moments[seen])
+        chosen = self.estimator.pick(images, used, rotations[seen], positions[seen], scores[seen])
         return crops, looks, with_expected_error(chosen, model, crops.moments[seen], looks[seen], used)
