@@ -22,7 +22,8 @@ _SPEED, _HEIGHT, _ERROR = "#4477AA", "#228833", "#EE6677"
 _TABLES = {
     "frames": "frames.parquet", "poses": "poses.parquet", "rotations": "rotations.parquet",
     "kinematics": "kinematics.parquet", "bouts": "bouts.parquet", "gaps": "gaps.parquet", "flips": "flips.parquet",
-    "sessions": "sessions.parquet", "summary": "summary.csv",
+    "sessions": "sessions.parquet", "summary": "summary.csv", "transitions": "transitions.parquet",
+    "activity": "activity.parquet", "zones": "zones.parquet",
 }  # fmt: skip
 
 

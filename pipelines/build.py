@@ -12,6 +12,7 @@ from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.behaviour.bouts import MouseRules
+    from liex_lab.behaviour.places import Surroundings
     from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.recordings.foreground import Scene
@@ -171,6 +172,14 @@ def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
     from liex_lab.recordings.zones import read_zones
 
     return read_zones(plan.arena.zones) if plan.arena.zones else ()
+
+
+def build_surroundings(provenance: Provenance) -> Surroundings:
+    """What measures of behaviour have to know of arena, zones and water."""
+    from liex_lab.behaviour.places import Surroundings, surface_height_mm
+
+    surface = surface_height_mm(provenance.floor_distance_mm, provenance.optics)
+    return Surroundings(provenance.arena, [zone.name for zone in provenance.zones], surface)
 
 
 def build_rules(plan: Plan) -> MouseRules:

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_tracker
+from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_surroundings, build_tracker
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
@@ -52,7 +52,7 @@ def measure_session(
                 writer.add(frames, track)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
             writer.note(problems=opened.problems)
-            zones = [zone.name for zone in provenance.zones]
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
+            around = build_surroundings(provenance)
+            behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps)
             session = writer.close(timings_s=timings, **behaviour.for_session())
     return session.path

@@ -12,7 +12,7 @@ from liex_lab.pipelines.sample import LEFT_OUT, N_FRAMES, virtual_mouse
 import liex_lab
 from liex_lab import catalog
 from liex_lab.api import run_session
-from liex_lab.behaviour.columns import ACTIONS
+from liex_lab.behaviour import ACTIONS
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import FILES

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 FILES = (
     "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
-    "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "columns.json", "session.rrd",
-    "session.mcap",
+    "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "transitions.parquet",
+    "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap",
 )  # fmt: skip
-_OPTIONAL = {"kinematics.parquet", "summary.csv"}
+_OPTIONAL = {"kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet"}
 
 
 class Session:
@@ -157,9 +157,7 @@ class Session:
         """The plan as resolved, TOML text."""
         return (self.path / "plan.toml").read_text(encoding="utf-8")
 
-    def table(
-        self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
-    ) -> pd.DataFrame:
+    def table(self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None) -> pd.DataFrame:
         """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
         import pandas as pd
 

@@ -148,8 +148,13 @@ class SessionWriter:
         return pd.DataFrame({
             "frame_index": np.repeat(np.array(self._index, np.int64), n_joints),
             "joint": pd.Categorical.from_codes(codes, pd.Index(self.origin.skeleton.names)),
-            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2],
+            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2], "sd_mm": self.track.sd_mm.ravel(),
         })  # fmt: skip
+
+    @property
+    def gaps(self) -> pd.DataFrame:
+        """The table `gaps` of the track so far."""
+        return tables.to_pandas(tables.GAPS, self.rows.gaps())
 
     def note(self, **sections: Any) -> None:
         """Add facts found on the way to session.json: tables are merged, lists extended, the rest replaced."""
@@ -165,9 +170,7 @@ class SessionWriter:
     def close(
         self,
         *,
-        kinematics: pd.DataFrame | None = None,
-        bouts: pd.DataFrame | None = None,
-        summary: pd.DataFrame | None = None,
+        results: Mapping[str, pd.DataFrame] | None = None,
         columns: Sequence[Column] = (),
         actions: Mapping[str, str] | None = None,
         record: Mapping[str, Any] | None = None,
@@ -175,8 +178,9 @@ class SessionWriter:
     ) -> Session:
         """Write everything else and put the session in its place.
 
-        columns: describe those of kinematics and summary, and those that bouts has beyond `tables.BOUTS`; actions: the
-        ethogram's vocabulary, word -> definition; record: what else session.json should hold (see `note`).
+        results: tables by name (kinematics, bouts, summary and others); columns: describe theirs, of bouts those beyond
+        `tables.BOUTS`; actions: the ethogram's vocabulary, word -> definition; record: what else session.json should
+        hold (see `note`).
         """
         from liex_lab.sessions.session import Session
 
@@ -185,10 +189,11 @@ class SessionWriter:
         began = time.perf_counter()
         rows = self.rows
         _check_times(np.array(self._times_ns, np.int64), rows.track)
-        if bouts is None:
-            bouts = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
-        kinematics = rows_only(rows) if kinematics is None else kinematics
-        self._write_tables(rows, {"kinematics": kinematics, "bouts": bouts, "summary": summary}, columns)
+        results = dict(results or {})
+        if "bouts" not in results:
+            results["bouts"] = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
+        bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
+        self._write_tables(rows, results, columns)
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems)
@@ -207,9 +212,7 @@ class SessionWriter:
             self._publish()
         return Session.open(self.path)
 
-    def _write_tables(
-        self, rows: Rows, results: Mapping[str, pd.DataFrame | None], columns: Sequence[Column]
-    ) -> None:
+    def _write_tables(self, rows: Rows, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]) -> None:
         """All parquet files, summary.csv and columns.json."""
         described = self.origin.table_metadata()
         own: dict[str, Any] = {
@@ -221,7 +224,7 @@ class SessionWriter:
             tables.write_table(self._folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
         for name, result in results.items():
             schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
-            if result is None or not schema:
+            if not schema:  # kinematics without any measure
                 continue
             block = tables.from_pandas(schema, result)
             if name == "summary":

@@ -154,5 +154,7 @@ def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Se
     with Session.create(folder, mouse.provenance(**more), **own) as writer:
         for frames, track in mouse.chunks(chunk):
             writer.add(frames, track)
-        zones = [zone.name for zone in writer.origin.zones]
-        return writer.close(**behaviour.measure(writer.frames, writer.poses, zones=zones).for_session())
+        origin = writer.origin
+        around = behaviour.Surroundings(origin.arena, [zone.name for zone in origin.zones])
+        measured = behaviour.measure(writer.frames, writer.poses, None, around, writer.gaps)
+        return writer.close(**measured.for_session())
