@@ -181,18 +181,3 @@ def human_bouts(session: str | Path, labels: str | Path) -> pd.DataFrame:
     words = words_of(table, frames["time_s"].to_numpy(float), named)
     ethogram = Ethogram.of_words(words, frames["time_ns"].to_numpy(), source=HUMAN)
     return bout_rows(ethogram, frames, "")
-
-
-def ethogram_model(name: str | Path | None, skeleton: str) -> TimelineModel | None:
-    """The recogniser that `liex run` uses: the named one, or the animal's bundled one; None where there is none."""
-    from liex_lab.actions.storage import bundled_action_models, load_action_model
-
-    if name == "rules" or (name is None and skeleton not in bundled_action_models()):
-        return None
-    model = load_action_model(name or skeleton)
-    if model.skeleton != skeleton:
-        raise LiexError(
-            f"the action model '{name}' is for a {model.skeleton}, the plan says {skeleton}; set actions.model to "
-            "another, or to 'rules'"
-        )
-    return model

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from liex_lab.pipelines.acted import acted_tracks
 from liex_lab.pipelines.action_data import RATE_HZ, cut_sequences, test_recordings, training_recordings
-from liex_lab.pipelines.actions import ethogram_model, train_actions
+from liex_lab.pipelines.actions import train_actions
 from liex_lab.pipelines.evaluate import estimator_of
 from liex_lab.pipelines.train import cache_folder
 from numpy.typing import NDArray
@@ -49,6 +49,8 @@ def evaluate_actions(
     """
     from liex_lab.actions.scores import confusion, interval95
 
+    if animal not in RATE_HZ:
+        raise LiexError(f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of these")
     estimator = estimator_of(animal, "default", progress, pose_model)
     recogniser = _recogniser(animal, model, pose_model, progress)
     train, test = _sequences(animal, estimator, progress)
@@ -85,16 +87,13 @@ def evaluate_actions(
 def _recogniser(
     animal: str, model: str | Path | None, pose_model: str | Path | None, progress: Progress
 ) -> TimelineModel:
-    """The named model, the bundled one, or one that is trained now and kept."""
-    if found := ethogram_model(model, animal):
-        return found
-    if animal not in RATE_HZ:
-        raise LiexError(f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}")
-    path, _ = train_actions(cache_folder() / f"{animal}-actions", animal=animal, pose_model=pose_model,
-                            progress=progress)  # fmt: skip
-    found = ethogram_model(path, animal)
-    assert found is not None
-    return found
+    """The named model, the bundled one, or one that is trained now."""
+    from liex_lab.actions.storage import bundled_action_models, load_action_model
+
+    if model is not None or animal in bundled_action_models():
+        return load_action_model(model or animal)
+    out = cache_folder() / f"{animal}-actions"
+    return load_action_model(train_actions(out, animal=animal, pose_model=pose_model, progress=progress)[0])
 
 
 def _sequences(
