@@ -30,7 +30,7 @@ from liex_lab.tracking.windowed import WindowTracker
 
 Array = NDArray[np.float64]
 
-_SOURCES = ("acting.py", "fish_acts.py", "mouse_acts.py", "filming.py")
+_SOURCES = ("acting.py", "filming.py")  # and the animal's own acts
 _WALL_ERROR_MM = 4.0  # of the arena as it was found
 _FISH_STRIDE, _FISH_WINDOW, _MOUSE_WINDOW = 4, 128, 112
 _SIZE_FRAMES = 128  # frames in which an animal's size is measured
@@ -55,8 +55,9 @@ def acted_tracks(
     scenarios: list[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[LabelledTrack]:
     """The tracks of all scenarios, kept from earlier or measured now. Those of one individual share its size."""
-    key = hashlib.sha256(repr(scenarios).encode() + estimator.model.digest().encode() + _generator()).hexdigest()[:16]
-    path = cache_folder() / "acted" / f"{scenarios[0].animal}-{key}.npz"
+    animal, made_from = scenarios[0].animal, repr(scenarios) + estimator.model.digest()
+    key = hashlib.sha256(made_from.encode() + _generator(animal)).hexdigest()[:16]
+    path = cache_folder() / "acted" / f"{animal}-{key}.npz"
     if path.is_file():
         return _load(path, estimator)
     sizes: dict[int, float] = {}
@@ -118,7 +119,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     habits, own = MouseHabits(), np.random.default_rng([scenario.individual, 0])
     mouse = Individual.draw(own, (0.95, 1.3), scenario.novel)
     shape = habits.shapes(own, "train", 1)
-    half = rng.uniform([230.0, 200.0], [330.0, 280.0])
+    half = rng.uniform([290.0, 250.0], [400.0, 330.0])
     actor = mouse_acts.MouseActor.of(mouse, habits.skeleton, shape, half)
     motion = actor.uncut(rng, scenario.seconds)
     rows = _seen(motion, scenario)
@@ -143,10 +144,11 @@ def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
     return walls
 
 
-def _generator() -> bytes:
+def _generator(animal: str) -> bytes:
     """A hash of the code that acts."""
     folder = Path(recordings_package.__file__).parent
-    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in _SOURCES)).digest()
+    names = (*_SOURCES, f"{animal}_acts.py")
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).digest()
 
 
 def _save(path: Path, tracks: list[LabelledTrack]) -> None:

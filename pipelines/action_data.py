@@ -31,7 +31,7 @@ def training_recordings(animal: str) -> list[Scenario]:
     return usual + [Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _TRAIN_SET]
 
 
-def test_recordings(animal: str, fast: bool = False) -> list[Scenario]:
+def test_recordings(animal: str, fast: bool) -> list[Scenario]:
     """Uncut recordings, 30 minutes in all, of individuals whose traits no other has; fast: by a faster camera."""
     rate, seconds = (FAST_HZ, _TEST_FAST_SECONDS) if fast else (RATE_HZ[animal], _TEST_SECONDS)
     return [Scenario(animal, one, 3 + fast, rate, seconds, novel=True) for one in _TEST_SET]

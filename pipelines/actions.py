@@ -52,7 +52,7 @@ def train_actions(
     labels: tables of bouts or BORIS's projects or exports; without any, the sessions' own bouts whose source is human.
     Returns the model's path and, for sessions, its scores on each animal when it learned from the others only.
     """
-    from liex_lab.actions.learning import leave_one_animal_out, learn, with_card
+    from liex_lab.actions.learning import learn, leave_one_animal_out, with_card
     from liex_lab.actions.storage import save_action_model
     from liex_lab.actions.vocabulary import DEFINITIONS
 
@@ -92,8 +92,8 @@ def labelled_sessions(sessions: Sequence[str | Path], labels: Sequence[str | Pat
         named = session.name if table is not None and session.name in _sessions_named(table) else ""
         if table is not None and not named and len(sessions) > 1:
             raise LiexError(
-                f"the labels name no recording {session.name}; give each session's name as session_id (in BORIS: as the "
-                "observation's)"
+                f"the labels name no recording {session.name}; give each session's name as session_id (in BORIS: the "
+                "observation's name)"
             )
         words = words_of(own, (track.times_ns - track.times_ns[0]) * 1e-9, named)
         if (words == UNLABELLED).all():
@@ -125,9 +125,7 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
     return read_labels(source)
 
 
-def suggest(
-    session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5
-) -> pd.DataFrame:
+def suggest(session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5) -> pd.DataFrame:
     """The stretches of a session most worth labelling next: where the recogniser is least sure, one per kind of doubt
     first. Columns start_s, stop_s, guess, or_else, uncertainty (0 to 1).
     """

@@ -32,8 +32,9 @@ PROTOCOL = (
     "Virtual animals act by kinematic definitions, are rendered in depth and measured frame by frame; every feature "
     "comes from the measured track. Cut-out sequences: {n_train} to learn from and {n_test} to test on, of different "
     "individuals; tangent_accuracy and joint_accuracy: forests of 50 trees, depth 20, mean of {seeds} seeds, each with "
-    "Wilson's 95 % interval. default_accuracy: the timeline's recogniser on the same sequences. timeline: {minutes:.0f} "
-    "minutes of uncut recordings of {animals} individuals whose traits lie outside those it learned from; macro_f1: "
+    "Wilson's 95 % interval. default_accuracy: the timeline's recogniser on the same sequences. timeline: "
+    "{minutes:.0f} minutes of uncut recordings of {animals} individuals whose traits lie outside those it learned "
+    "from; macro_f1: "
     "mean over the actions of the frame-wise F1; segment_f1_50: bouts that share at least half of what either covers. "
     "by_fps: the same recordings thinned out to slower rates, and the same individuals filmed at 100 per second. "
     "speed_only_macro_f1: a decision tree on speed alone, to show that the task is not told by speed."
@@ -44,8 +45,8 @@ def evaluate_actions(
     animal: str = "fish", *, model: str | Path | None = None, pose_model: str | Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
-    """The figures of `liex evaluate actions`. model: an action model other than the bundled one or, where there is none,
-    one trained now; pose_model: that measures the frames, other than the animal's own.
+    """The figures of `liex evaluate actions`. model: an action model other than the bundled one or, where there is
+    none, one trained now; pose_model: that measures the frames, other than the animal's own.
     """
     from liex_lab.actions.scores import confusion, interval95
 

@@ -20,7 +20,7 @@ def track_of(session: Session) -> Track:
     frames, n, j = session.frames, len(session.frames), skeleton.n_joints
     poses, rotations = session.poses, session.rotations
     if len(poses) != n * j or len(rotations) != n * (j + 1):
-        raise SessionError(f"{session.path} holds {len(poses)} rows of poses for {n} frames of {j} joints; run it again")
+        raise SessionError(f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it again")
     track = Track.empty(skeleton, frames["time_ns"].to_numpy(np.int64))
     track.joints_mm[:] = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(n, j, 3)
     track.sd_mm[:] = poses["sd_mm"].to_numpy(float).reshape(n, j)

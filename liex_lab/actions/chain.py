@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ class ActionChain:
         for run in runs:
             for word, length in run:
                 lengths[word].append(length)
-            for (before, _), (after, _) in zip(run, run[1:], strict=False):
+            for (before, _), (after, _) in pairwise(run):
                 counts[before, after] += 1.0
         np.fill_diagonal(counts, 0.0)
         shortest = np.array([np.quantile(some, _SHORT) if some else 0.1 for some in lengths])

@@ -93,7 +93,7 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
 def _on_clock(
     track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, scale (m,) and distance from a wall (m,) at the clock's times."""
+    """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, scale (m,) and distance from a wall (m,) on the clock."""
     n = len(rows)
     columns = np.concatenate(
         [track.joints_mm[rows].reshape(n, -1), track.angles_rad[rows].reshape(n, -1), track.scale[rows, None],

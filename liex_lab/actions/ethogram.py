@@ -62,7 +62,8 @@ class Ethogram:
 
     @staticmethod
     def of_words(
-        words: Sequence[str] | NDArray[np.str_], times_ns: NDArray[np.int64], vocabulary: Mapping[str, str] | None = None,
+        words: Sequence[str] | NDArray[np.str_], times_ns: NDArray[np.int64],
+        vocabulary: Mapping[str, str] | None = None,
         score: NDArray[np.float64] | None = None, part: NDArray[np.int64] | None = None, source: str = "model",
     ) -> Ethogram:  # fmt: skip
         """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never leaves its `part`
@@ -76,9 +77,9 @@ class Ethogram:
         changes = (label[1:] != label[:-1]) | (part[1:] != part[:-1])
         starts = np.flatnonzero(np.append(True, changes))
         stops = np.append(starts[1:], n)
-        stop_ns = frame_stops(times_ns)
+        stop_ns, sure = frame_stops(times_ns), np.ones(n) if score is None else score
         bouts = [
-            Bout(int(times_ns[a]), int(stop_ns[b - 1]), str(label[a]), 1.0 if score is None else float(score[a:b].mean()))
+            Bout(int(times_ns[a]), int(stop_ns[b - 1]), str(label[a]), float(sure[a:b].mean()))
             for a, b in zip(starts, stops, strict=True)
             if label[a] != UNLABELLED
         ]

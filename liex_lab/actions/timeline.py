@@ -92,9 +92,9 @@ class TimelineModel:
             scores = self.scores(self.log_probabilities(stretch, names))
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz)
             certain = self.chain.probabilities(scores, 1.0 / self.clock_hz)
-            first, last = np.searchsorted(time_s, [stretch.times_s[0] - 1e-6, stretch.times_s[-1] + 1.0 / self.clock_hz])
-            rows = np.arange(first, last)
-            tick = np.clip(np.round((time_s[rows] - stretch.times_s[0]) * self.clock_hz).astype(int), 0, len(scores) - 1)
+            begin, step = stretch.times_s[0], 1.0 / self.clock_hz
+            rows = np.arange(*np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step]))
+            tick = np.clip(np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1)
             label[rows], probability[rows], part[rows] = words[decoded[tick]], certain[tick], number
         code = np.array([self.words.index(word) for word in self.words])
         chosen = np.searchsorted(words[np.argsort(words)], label)
@@ -185,9 +185,7 @@ def _runs(words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str,
         return []
     starts = np.flatnonzero(np.append(True, words[1:] != words[:-1]))
     stops, ends = np.append(starts[1:], len(words)), frame_stops(times_ns)
-    return [
-        (place[str(words[a])], float(ends[b - 1] - times_ns[a]) * 1e-9) for a, b in zip(starts, stops, strict=True)
-    ]
+    return [(place[str(words[a])], float(ends[b - 1] - times_ns[a]) * 1e-9) for a, b in zip(starts, stops, strict=True)]
 
 
 def _softmax(logits: Array) -> Array:

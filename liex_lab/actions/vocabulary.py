@@ -5,7 +5,7 @@ from __future__ import annotations
 DEFINITIONS: dict[str, dict[str, str]] = {
     "fish": {
         "scoot": "forward swim with tail beats, 0.7 to 4 lengths/s, bends below about 32 degrees in all, no turn",
-        "j_turn": "slow turn of up to 45 degrees by repeated one-sided bends of the far caudal part, front half straight",
+        "j_turn": "slow turn of up to 45 degrees by repeated one-sided bends far caudally, the front half straight",
         "c_turn": "C-bend of more than about 90 degrees in all within some 0.1 s, then a counter-bend and a burst",
         "r_turn": "routine turn by a single bend of about 45 to 110 degrees in all, without a strong counter-bend",
         "surface": "swims up, pitch above about 15 degrees",

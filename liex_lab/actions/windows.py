@@ -38,7 +38,7 @@ def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float3
 
 
 def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:
-    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C); beyond the ends, of the nearest tick."""
+    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C); beyond the ends, the nearest tick."""
     m = len(total) - 1
     rows = np.arange(m)
     low = np.clip(rows + round(start_s / step), 0, m - 1)

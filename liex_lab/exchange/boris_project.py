@@ -19,7 +19,9 @@ from liex_lab.actions.labels import HUMAN, checked
 from liex_lab.errors import LiexError
 
 _VERSION = "7.0"  # BORIS refuses projects that are newer than itself
-_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933", "#DDCC77")
+_COLOURS = (
+    "#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933", "#DDCC77",
+)  # fmt: skip
 _STATE = "State event"
 
 
@@ -119,7 +121,7 @@ def _pairs(
             rows.append({"session_id": name, "individual": key[0], "action": key[1], "start_s": start - offset,
                          "stop_s": float(time) - offset, "source": HUMAN})  # fmt: skip
     except (TypeError, ValueError, IndexError):
-        raise LiexError(f"{path}: the observation {name} holds an event that cannot be read; check it in BORIS") from None
+        raise LiexError(f"{path}: the observation {name} has an event that cannot be read; check it in BORIS") from None
     if begun:
         (_, code, _), start = next(iter(begun.items()))
         raise LiexError(

@@ -41,7 +41,9 @@ class Camerawork:
     floor_error: Array
 
     @staticmethod
-    def draw(rng: np.random.Generator, habits: Habits, sensor: Sensor, fur: Array, height_mm: float, stride: int) -> Camerawork:
+    def draw(
+        rng: np.random.Generator, habits: Habits, sensor: Sensor, fur: Array, height_mm: float, stride: int
+    ) -> Camerawork:
         """A camera of that make, so high above the floor, of whose pictures only every `stride`-th pixel is looked at.
 
         Its picture is half as large again as the sensor's, so that an animal has room for long stretches of action.
@@ -55,7 +57,7 @@ class Camerawork:
         picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
         error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * habits.setting.scale]
         return Camerawork(
-            np.array([*focal, camera.cx, camera.cy]) + [0.0, 0.0, *margin], picture, place, parameters, error
+            np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]), picture, place, parameters, error
         )
 
 
@@ -91,4 +93,3 @@ def film(
         unit = np.float32(camera.parameters[UNIT])
         floor = inverse_depth_plane(T, intrinsics, np.tile(camera.floor_error, (m, 1)))
         yield Windows(depth * unit, background * unit, intrinsics, origin.astype(float), floor, habits.skeleton.view)
-

@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.recordings.acting import (
-    CLIMB, SPEED, STEP_S, TURN, UNLABELLED, Individual, Motion, Story, bump, clock, slow_noise,
+    CLIMB,
+    SPEED,
+    STEP_S,
+    TURN,
+    UNLABELLED,
+    Individual,
+    Motion,
+    Story,
+    bump,
+    clock,
+    slow_noise,
 )
 from liex_lab.recordings.fish import FishHabits, bend_profile, hung
 from liex_lab.recordings.postures import root_rotation
@@ -69,9 +79,9 @@ class FishActor:
         for _ in range(50):
             story = self.begin(rng, word)
             before = story.play(UNLABELLED, lambda: self._between(rng, 0.25))
-            if before and story.play(word, lambda: self.act(rng, word)):
-                if story.play(UNLABELLED, lambda: self._between(rng, 0.25)):
-                    return story.told()
+            done = before and story.play(word, lambda: self.act(rng, word))
+            if done and story.play(UNLABELLED, lambda: self._between(rng, 0.25)):
+                return story.told()
         raise AssertionError(f"no room for {word}")
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
@@ -189,7 +199,8 @@ class FishActor:
         shape = bump(t, 1.4 * first + 0.5 * back)
         c[:, TURN] = way * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
         pace = self.fish.vigour * rng.uniform(2.5, 9.0)
-        c[:, SPEED] = pace * np.where(t < first, 0.15, np.exp(-np.maximum(t - first - 0.1, 0.0) / rng.uniform(0.2, 0.5)))
+        glide = np.exp(-np.maximum(t - first - 0.1, 0.0) / rng.uniform(0.2, 0.5))
+        c[:, SPEED] = pace * np.where(t < first, 0.15, glide)
         self._swim(rng, t, c, 0.5 * pace)
         c[:, _WAVE] *= np.clip((t - first) / 0.08, 0.0, 1.0)
         c[:, CLIMB] = np.radians(rng.normal(0.0, 9.0))
@@ -232,7 +243,7 @@ class FishActor:
         return c
 
     def _freeze(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.9, 2.7))
+        _, c = self._blank(rng, self._seconds(rng, 0.9, 2.7))
         c[:, SPEED] = rng.uniform(0.0, 0.08)
         bend = rng.normal(0.0, 0.5)
         c[:, _FRONT], c[:, _HIND] = bend, 1.5 * bend

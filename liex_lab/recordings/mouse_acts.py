@@ -1,8 +1,8 @@
 """The actions of a mouse, and what it does between them, by their kinematic definitions.
 
-Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are mm/s of a mouse of home
-size. A posture is one elevation for each of the four bones, a turn at each of the three inner joints, and how far the
-body is stretched.
+Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are mm/s of a mouse of
+home size. A posture is one elevation for each of the four bones, a turn at each of the three inner joints, and how far
+the body is stretched.
 """
 
 from __future__ import annotations
@@ -17,7 +17,16 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.recordings.acting import (
-    SPEED, STEP_S, TURN, UNLABELLED, Individual, Motion, Story, bump, clock, slow_noise,
+    SPEED,
+    STEP_S,
+    TURN,
+    UNLABELLED,
+    Individual,
+    Motion,
+    Story,
+    bump,
+    clock,
+    slow_noise,
 )  # fmt: skip
 from liex_lab.recordings.habits import MouseHabits
 from liex_lab.recordings.postures import Posture, resting_heights, stand
@@ -111,7 +120,8 @@ class MouseActor:
             if room < 0.8 * _WALL_MM or not np.isfinite(room):
                 return
             speed = self.mouse.vigour * self.mouse.size * rng.uniform(90.0, 240.0)
-            story.play("walk", lambda: self._stride(rng, max(0.3, (room - 0.3 * _WALL_MM) / speed), speed), 2)
+            seconds = max(0.3, (room - 0.3 * _WALL_MM) / speed)
+            story.play("walk", lambda seconds=seconds, speed=speed: self._stride(rng, seconds, speed), 2)  # type: ignore[misc]
 
     def _turn_home(self, rng: np.random.Generator, story: Story) -> None:
         """Turn to the middle of the box, on the spot where there is no room."""
@@ -132,7 +142,7 @@ class MouseActor:
         vigour, size = self.mouse.vigour, self.mouse.size
         table: dict[str, Callable[[], Array]] = {
             "walk": lambda: self._stride(rng, self._seconds(rng, 0.4, 2.8), vigour * size * rng.uniform(60.0, 290.0)),
-            "run": lambda: self._stride(rng, self._seconds(rng, 0.35, 1.0), vigour * size * rng.uniform(290.0, 560.0)),
+            "run": lambda: self._stride(rng, self._seconds(rng, 0.5, 1.3), vigour * size * rng.uniform(300.0, 540.0)),
             "dart": lambda: self._dart(rng),
             "turn_left": lambda: self._turning(rng, np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)),
             "turn_right": lambda: self._turning(rng, -np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)),
@@ -174,9 +184,10 @@ class MouseActor:
         return c
 
     def _dart(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.4, 1.0), 0.5)
-        peak = max(240.0, self.mouse.vigour * rng.uniform(250.0, 520.0)) * self.mouse.size
-        c[:, SPEED] = peak * bump(t, t[-1], rng.uniform(0.2, 0.4)) ** 0.7
+        t, c = self._blank(rng, 0.15 + self._seconds(rng, 0.4, 0.9), 0.5)
+        peak = max(245.0, self.mouse.vigour * rng.uniform(260.0, 520.0)) * self.mouse.size
+        burst = t[-1] - 0.15  # it starts from a stand and stops again
+        c[:, SPEED] = peak * bump(t - 0.05, burst, rng.uniform(0.2, 0.35)) ** 0.7
         c[:, TURN] = np.radians(rng.normal(0.0, 25.0))
         c[:, _STRETCH] += 0.03
         self._gait(c)
@@ -222,13 +233,13 @@ class MouseActor:
         return c
 
     def _pause(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4), 1.1)
+        t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4), 1.6)
         c[:, SPEED] = np.abs(rng.uniform(0.0, 32.0) + 10.0 * slow_noise(rng, len(t), 0.4)[:, 0])
         c[:, TURN] = np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0]
         return c
 
     def _freeze(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 1.1, 3.6), 0.0)
+        _, c = self._blank(rng, self._seconds(rng, 1.1, 3.6), 0.0)
         c[:, SPEED] = rng.uniform(0.0, 4.0)
         c[:, _RISE] -= np.radians(rng.uniform(0.0, 4.0))
         return c
@@ -237,8 +248,8 @@ class MouseActor:
         t, c = self._blank(rng, self._seconds(rng, 0.5, 2.4), 0.6)
         c[:, 6] += np.radians(-rng.uniform(10.0, 24.0))
         c[:, 5] += np.radians(-rng.uniform(2.0, 9.0))
-        sweep = 2 * np.pi * self.mouse.tempo * rng.uniform(1.0, 2.6) * t
-        c[:, 9] += np.radians(rng.uniform(6.0, 20.0)) * np.sin(sweep + rng.uniform(0, 6))
+        sweep = 2 * np.pi * self.mouse.tempo * rng.uniform(1.3, 2.8) * t
+        c[:, 9] += np.radians(rng.uniform(9.0, 24.0)) * np.sin(sweep + rng.uniform(0, 6))
         c[:, 6] += np.radians(rng.uniform(1.0, 3.0)) * np.sin(2 * np.pi * rng.uniform(7.0, 10.0) * t)
         c[:, SPEED] = rng.uniform(0.0, 90.0)
         c[:, TURN] = np.radians(10.0) * slow_noise(rng, len(t), 0.5)[:, 0]
@@ -255,22 +266,23 @@ class MouseActor:
         return c
 
     def _between(self, rng: np.random.Generator) -> Array:
-        """What has no name: slow turns, a nose half up, sitting hunched, backing."""
-        kind = rng.choice(4, p=[0.35, 0.25, 0.2, 0.2])
-        t, c = self._blank(rng, self._seconds(rng, 0.35, 1.6))
+        """What has no name: a nose half up, sitting hunched, backing, bending far to one side."""
+        kind = rng.choice(4, p=[0.25, 0.25, 0.25, 0.25])
+        t, c = self._blank(rng, self._seconds(rng, 0.4, 1.6))
         shape = bump(t, t[-1])
         if kind == 0:
-            angle = np.radians(rng.uniform(10.0, 26.0)) * self.mouse.way(rng)
-            c[:, TURN] = angle * shape / (shape.sum() * STEP_S)
-            c[:, SPEED] = rng.uniform(0.0, 60.0)
-        elif kind == 1:
-            c[:, _RISE] += np.radians(rng.uniform(8.0, 24.0)) * shape[:, None] * [0.5, 0.7, 1.0, 1.4]
+            c[:, _RISE] += np.radians(rng.uniform(9.0, 20.0)) * shape[:, None] ** 0.6 * [0.5, 0.7, 1.0, 1.4]
             c[:, SPEED] = rng.uniform(0.0, 50.0)
+        elif kind == 1:
+            deep = rng.uniform(0.7, 1.0) * (self._hunch(rng) - self.rest)
+            c[:, _RISE] += deep * np.minimum(1.0, 3.0 * shape[:, None])
         elif kind == 2:
-            c[:, _RISE] += 0.7 * (self._hunch(rng) - self.rest) * np.minimum(1.0, 3.0 * shape[:, None])
-        else:
-            c[:, SPEED] = -rng.uniform(10.0, 70.0)
+            c[:, SPEED] = -rng.uniform(25.0, 90.0)
             c[:, TURN] = np.radians(rng.normal(0.0, 20.0))
+        else:
+            flank = self.mouse.way(rng) * np.radians(rng.uniform(16.0, 34.0))
+            c[:, _BEND] += flank * shape[:, None] ** 0.6 * [0.7, 1.0, 1.4]
+            c[:, SPEED] = rng.uniform(0.0, 25.0)
         return c
 
 
