@@ -42,8 +42,9 @@ class Individual:
         """An animal; a novel one has traits at and beyond the ends of the range that all others come from."""
         low, high = (0.7, 1.5) if novel else (0.0, 1.0)
         reach = rng.uniform(low, high, len(_TRAITS)) * rng.choice([-1.0, 1.0], len(_TRAITS))
-        factors = [float(np.exp(spread * z)) for spread, z in zip(_TRAITS.values(), reach, strict=True)]
-        return Individual(float(rng.uniform(*sizes)), *factors, float(rng.random()), float(rng.uniform(-0.5, 0.5)))
+        factors = {name: float(np.exp(_TRAITS[name] * z)) for name, z in zip(_TRAITS, reach, strict=True)}
+        size, restless, side = rng.uniform(*sizes), rng.random(), rng.uniform(-0.5, 0.5)
+        return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
 
     def way(self, rng: np.random.Generator) -> float:
         """Left (1) or right (-1)."""
@@ -134,4 +135,4 @@ def slow_noise(rng: np.random.Generator, m: int, seconds: float, columns: int = 
     low = at.astype(int)
     share = 0.5 - 0.5 * np.cos(np.pi * (at - low))[:, None]
     values = rng.normal(0.0, 1.2, (knots + 1, columns))
-    return values[low] * (1.0 - share) + values[low + 1] * share
+    return np.asarray(values[low] * (1.0 - share) + values[low + 1] * share)
