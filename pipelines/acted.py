@@ -128,7 +128,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     sensor = habits.sensors[int(rng.integers(len(habits.sensors)))]
     camera = Camerawork.draw(rng, habits, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
     room = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
-    known = rng.random() < 0.75  # of some recordings nobody knows where the walls are
+    known = scenario.novel or rng.random() < 0.75  # of some to learn from nobody knows where the walls are
     return (motion, rows, pose, girth, _walls(rng, middle, half), habits, camera, shape,
             room if known else np.full(len(rows), np.nan))  # fmt: skip
 

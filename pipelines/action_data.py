@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from liex_lab.pipelines.acted import Scenario
 
+from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.recordings import fish_acts, mouse_acts
 
 WORDS = {"fish": fish_acts.ACTIONS, "mouse": mouse_acts.ACTIONS}
@@ -11,8 +14,8 @@ RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
 FAST_HZ = 100.0
 N_TRAIN, N_TEST = 426, 173  # cut-out sequences, as in the paper, of 5 and 2 fish
 _TRAIN_FISH, _TEST_FISH = (101, 102, 103, 104, 105), (106, 107)
-_TRAIN_SET, _TEST_SET = tuple(range(201, 211)), tuple(range(301, 307))
-_SECONDS, _FAST_SECONDS, _TEST_SECONDS, _TEST_FAST_SECONDS = 120.0, 40.0, 300.0, 60.0
+_TRAIN_SET, _FAST_SET, _TEST_SET = tuple(range(201, 225)), tuple(range(225, 233)), tuple(range(301, 307))
+_SECONDS, _FAST_SECONDS, _TEST_SECONDS, _TEST_FAST_SECONDS = 55.0, 25.0, 300.0, 40.0
 
 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
@@ -26,9 +29,14 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
 
 def training_recordings(animal: str) -> list[Scenario]:
-    """Uncut recordings to learn from, some of them by a faster camera."""
+    """Uncut recordings to learn from, the last ones by a faster camera."""
     usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
-    return usual + [Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _TRAIN_SET]
+    return usual + [Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET]
+
+
+def by_usual_camera(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
+    """Of the tracks of `training_recordings` those by the animal's usual camera."""
+    return list(tracks[: len(_TRAIN_SET)])
 
 
 def test_recordings(animal: str, fast: bool) -> list[Scenario]:

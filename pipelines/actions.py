@@ -32,13 +32,13 @@ def learning_set(
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
     from liex_lab.pipelines.acted import acted_tracks
-    from liex_lab.pipelines.action_data import RATE_HZ, WORDS, cut_sequences, training_recordings
+    from liex_lab.pipelines.action_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
 
     if animal not in WORDS:
         raise LiexError(f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions")
     tracks = acted_tracks(training_recordings(animal), estimator, progress)
-    usual = tracks[: len(tracks) // 2]
-    slower = [one.at_rate(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::2]]
+    usual = by_usual_camera(tracks)
+    slower = [one.at_rate(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
     cuts = acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
     return [*tracks, *slower], cuts
 

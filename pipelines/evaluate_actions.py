@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from liex_lab.pipelines.acted import acted_tracks
-from liex_lab.pipelines.action_data import RATE_HZ, cut_sequences, test_recordings, training_recordings
+from liex_lab.pipelines.action_data import (
+    RATE_HZ,
+    by_usual_camera,
+    cut_sequences,
+    test_recordings,
+    training_recordings,
+)
 from liex_lab.pipelines.actions import train_actions
 from liex_lab.pipelines.evaluate import estimator_of
 from liex_lab.pipelines.train import cache_folder
@@ -104,8 +110,7 @@ def _sequences(
     if animal == "fish":
         train, test = (acted_tracks(cut_sequences(animal, side), estimator, progress) for side in (False, True))
         return train, test
-    uncut = acted_tracks(training_recordings(animal), estimator, progress)
-    usual = uncut[: len(uncut) // 2]
+    usual = by_usual_camera(acted_tracks(training_recordings(animal), estimator, progress))
     return cut_out(usual), cut_out(acted_tracks(test_recordings(animal, False), estimator, progress))
 
 

@@ -38,7 +38,7 @@ def channel_names(skeleton: Skeleton) -> list[str]:
     floor = ["tip_height", "middle_height", "base_height", "tip_over_base"] if _stands(skeleton) else []
     return ["forward", "sideways~", "upward", "speed", "yaw_rate~", "climb", "climb_rate", "straightness", "length",
             *(f"bend_{k}~" for k in range(_GROUPS)), *(f"bend_rate_{k}~" for k in range(_GROUPS)), *pitches,
-            *(f"{p}_rate" for p in pitches), "twist", *floor, "wall"]  # fmt: skip
+            *(f"{p}_rate" for p in pitches), "twist", *floor, "wall", "doubt"]  # fmt: skip
 
 
 def stretches_of(track: Track, rate_hz: float, wall_mm: Array | None = None) -> list[Stretch]:
@@ -52,7 +52,7 @@ def stretches_of(track: Track, rate_hz: float, wall_mm: Array | None = None) -> 
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
     return [
-        Stretch(clock, _channels(track, length_mm, clock, *_on_clock(track, rows, time_s, wall, clock)))
+        Stretch(clock, _channels(track.skeleton, length_mm, clock, *_on_clock(track, rows, time_s, wall, clock)))
         for rows in np.split(good, cuts)
         for clock in [_clock(time_s[rows], rate_hz)]
     ]
@@ -93,11 +93,12 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
 def _on_clock(
     track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, scale (m,) and distance from a wall (m,) on the clock."""
+    """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm and predicted error (m,) mm."""
     n = len(rows)
+    distance, error = np.nan_to_num(wall[rows], nan=1e6), np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)
     columns = np.concatenate(
-        [track.joints_mm[rows].reshape(n, -1), track.angles_rad[rows].reshape(n, -1), track.scale[rows, None],
-         np.nan_to_num(wall[rows, None], nan=1e6)], axis=1,
+        [track.joints_mm[rows].reshape(n, -1), track.angles_rad[rows].reshape(n, -1), distance[:, None],
+         error[:, None]], axis=1,
     )  # fmt: skip
     times, step = time_s[rows], clock[1] - clock[0]
     if n > 2 and np.median(np.diff(times)) < 0.7 * step:  # a faster camera: the mean of what falls to each tick
@@ -120,10 +121,10 @@ def _interpolated(clock: Array, times: Array, rows: Array) -> Array:
 
 
 def _channels(
-    track: Track, length_mm: float, clock: Array, joints: Array, angles: Array, scale: Array, wall: Array
+    skeleton: Skeleton, length_mm: float, clock: Array, joints: Array, angles: Array, wall: Array, error: Array
 ) -> Array:
-    """Channels (m, C) from joints (m, J, 3) mm, angles (m, J, 3) rad and scale (m,)."""
-    skeleton, step = track.skeleton, clock[1] - clock[0]
+    """Channels (m, C) of joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and predicted errors (m,) mm."""
+    step = clock[1] - clock[0]
     rear, front = _forward(skeleton)
     axis = joints[:, front] - joints[:, rear]
     level = np.hypot(axis[:, 0], axis[:, 1])
@@ -152,7 +153,7 @@ def _channels(
     if _stands(skeleton):
         z = joints[..., 2] / length_mm
         columns += [z[:, -1], z.mean(axis=1), z[:, 0], z[:, -1] - z[:, 0]]
-    columns.append(np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)))
+    columns += [np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)), np.log1p(30.0 * error / length_mm)]
     return np.concatenate([c[:, None] if c.ndim == 1 else c for c in columns], axis=1)
 
 

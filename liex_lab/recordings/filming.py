@@ -46,14 +46,14 @@ class Camerawork:
     ) -> Camerawork:
         """A camera of that make, so high above the floor, of whose pictures only every `stride`-th pixel is looked at.
 
-        Its picture is half as large again as the sensor's, so that an animal has room for long stretches of action.
+        Its picture is twice as wide and high as the sensor's, so that an animal has room for long stretches of action.
         """
         camera = sensor.camera.every(stride)
         focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
         T = draw_views(rng, 1, habits.setting)
         place = SE3(T.rotation[0], np.array([0.0, 0.0, height_mm]))
         parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))[0]
-        margin = np.array([camera.width, camera.height]) / 4.0
+        margin = np.array([camera.width, camera.height]) / 2.0
         picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
         error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * habits.setting.scale]
         return Camerawork(

@@ -43,7 +43,7 @@ _CHANNELS = 12
 _BLEND_S = 0.035
 _SHARES = {
     "walk": 5.0, "run": 2.5, "turn_left": 1.2, "turn_right": 1.2, "rear_supported": 2.0, "rear_unsupported": 2.0,
-    "groom": 1.2, "pause": 4.0, "freeze": 1.3, "sniff": 2.2, "dart": 2.5, "stretch_attend": 1.5,
+    "groom": 1.2, "pause": 4.0, "freeze": 1.5, "sniff": 2.2, "dart": 2.5, "stretch_attend": 1.5,
 }  # fmt: skip
 _BETWEEN = 0.3  # of the acts are followed by something without a name
 _STRIDE_HZ_PER_SPINE = 1.6
@@ -239,7 +239,7 @@ class MouseActor:
         return c
 
     def _freeze(self, rng: np.random.Generator) -> Array:
-        _, c = self._blank(rng, self._seconds(rng, 1.1, 3.6), 0.0)
+        _, c = self._blank(rng, self._seconds(rng, 1.2, 5.0), 0.0)
         c[:, SPEED] = rng.uniform(0.0, 4.0)
         c[:, _RISE] -= np.radians(rng.uniform(0.0, 4.0))
         return c

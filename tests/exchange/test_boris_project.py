@@ -47,7 +47,7 @@ def test_what_a_person_added_stays_and_corrections_are_read(tmp_path: Path) -> N
     project = read_boris_project(path)
     project["my_own_key"] = {"kept": True}
     project["observations"]["another"] = {"events": [], "type": "LIVE"}
-    project["observations"]["ses-01"]["events"] = [[1.0, "m01", "dig", "", "mine"], [2.5, "m01", "dig", "", ""]]
+    project["observations"]["ses-01"]["events"] = [[1.0, "m01", "dig", "", ""], [2.5, "m01", "dig", "", ""]]
     again = read_boris_project(written(tmp_path / "b.boris", project=project))
     assert again["my_own_key"] == {"kept": True}
     assert "another" in again["observations"]
@@ -59,7 +59,7 @@ def test_what_a_person_added_stays_and_corrections_are_read(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("events", "complaint"),
-    [([[1.0, "m", "dig", "", ""]], "dig starts at 1 s and never stops"), ([["x", "m", "dig", "", ""]], "cannot be read"),
+    [([[1.0, "m", "dig", "", ""]], "starts at 1 s and never stops"), ([["x", "m", "dig", "", ""]], "cannot be read"),
      ([[1.0, "m"]], "cannot be read")],
 )  # fmt: skip
 def test_events_that_make_no_bouts_are_one_sentence(events: list, complaint: str, tmp_path: Path) -> None:
