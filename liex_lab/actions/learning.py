@@ -23,7 +23,7 @@ _HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 10, 512, 2
 _WEIGHT_DECAY = 2e-3
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
-_LEAST_BOUTS = 3  # of a word that is to be learned
+_NEVER = -30.0  # what a network says of a word that it has not seen
 
 
 def learn(
@@ -63,20 +63,24 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     features, code = examples.features[rows], examples.code[rows]
     centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
     inputs = np.clip((features - centre) / scale, -6.0, 6.0)
+    present = np.unique(code)  # of the vocabulary; stretches without a name may be missing
     classifier = MLPClassifier(
         (_HIDDEN,), alpha=_WEIGHT_DECAY, batch_size=_BATCH, learning_rate_init=1.5e-3, max_iter=1, warm_start=True,
         random_state=seed,
     )  # fmt: skip
     for epoch in range(_EPOCHS):
         classifier.learning_rate_init = 1.5e-3 * 0.5 * (1.0 + np.cos(np.pi * epoch / _EPOCHS)) + 1e-5
-        classifier.partial_fit(inputs, code, classes=np.arange(n_words) if epoch == 0 else None)
-    layers = [[w.astype(np.float32), b.astype(np.float32)]
-              for w, b in zip(classifier.coefs_, classifier.intercepts_, strict=True)]  # fmt: skip
-    if n_words == 2:  # one number decides between two words
-        layers[-1] = [np.hstack([0 * layers[-1][0], layers[-1][0]]), np.hstack([0 * layers[-1][1], layers[-1][1]])]
+        classifier.partial_fit(inputs, code, classes=present if epoch == 0 else None)
+    weights, bias = classifier.coefs_[-1], classifier.intercepts_[-1]
+    if len(present) == 2:  # one number decides between two words
+        weights, bias = np.hstack([0 * weights, weights]), np.hstack([0 * bias, bias])
+    last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
+    last[0][:, present], last[1][present] = weights, bias
+    layers = (classifier.coefs_[0], classifier.intercepts_[0]), last
     return Network(
-        centre.astype(np.float32), scale.astype(np.float32), tuple((np.asarray(w), np.asarray(b)) for w, b in layers)
-    )
+        centre.astype(np.float32), scale.astype(np.float32),
+        tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers),
+    )  # fmt: skip
 
 
 def leave_one_animal_out(

@@ -96,11 +96,11 @@ class MouseActor:
         return story.told()
 
     def _possible(self, story: Story, word: str) -> bool:
-        """Whether a rear here is of that kind: leaning on a wall needs one before the nose."""
-        if not word.startswith("rear"):
-            return True
-        near = self._room(story) < _WALL_MM
-        return near == (word == "rear_supported")
+        """Whether a rear here is of that kind: one on a wall has it before the nose, any other is away from walls."""
+        if word == "rear_supported":
+            return self._room(story) < _WALL_MM
+        nose = story.position[:2] + 0.5 * self.spine_mm * np.array([np.cos(story.heading), np.sin(story.heading)])
+        return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
 
     def _room(self, story: Story) -> float:
         """From the nose to the wall ahead, mm."""

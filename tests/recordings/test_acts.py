@@ -74,7 +74,8 @@ def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse
         assert word != "turn_left" or turn > 0
         assert word != "turn_right" or turn < 0
     near = (mouse.half - np.abs(motion.position[:, :2])).min(axis=1)
-    assert np.median(near[motion.word == "rear_supported"]) < 80 < np.median(near[motion.word == "rear_unsupported"])
+    supported, free = (np.median(near[motion.word == f"rear_{kind}"]) for kind in ("supported", "unsupported"))
+    assert supported < 65.0 < free
     speed = motion.channels[:, SPEED] / mouse.mouse.size
     assert np.median(speed[motion.word == "run"]) > 250 > np.median(speed[motion.word == "walk"]) > 50
     assert np.median(speed[motion.word == "freeze"]) < 5
