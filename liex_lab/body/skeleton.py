@@ -35,9 +35,10 @@ class View:
     """How an animal is looked at: the [view] table of its TOML.
 
     frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
-    behind_mm (at home size) behind its mean depth, for one that swims or is held up. smooth_mm: readings this near to
-    one another, at home size, are averaged. area: the smallest and the largest area seen from above, of the squared
-    length. min_height_mm: what stands out from the background by less is not the animal.
+    behind_mm behind its mean depth, for one that swims or is held up; the same for all sizes, or the height map would
+    tell the size for which it was cut. smooth_mm: readings this near to one another, at home size, are averaged. area:
+    the smallest and the largest area seen from above, of the squared length. min_height_mm: what stands out from the
+    background by less is not the animal.
     """
 
     frame: str = VIEWS[0]

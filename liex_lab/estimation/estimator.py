@@ -19,6 +19,7 @@ from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.settle import SURE_SHARE, Settler
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
@@ -145,10 +146,14 @@ class PoseEstimator:
     def pick(
         self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
     ) -> Chosen:
-        """One pose for each of n height maps out of its candidates, after the last correction."""
+        """One pose for each of n height maps out of its candidates, after the last correction, and settled."""
         picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
         with threads(parallel):
-            return corrected(picked, self.model, images, size)
+            picked = corrected(picked, self.model, images, size)
+            if self.model.settler is None or not len(scores):
+                return picked
+            settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, images, size)
+        return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
@@ -174,11 +179,12 @@ class PoseEstimator:
             return 1.0
         for _ in range(_SIZE_PASSES):
             estimates = self.estimate(sample, scene, guess)
-            scale, score = estimates.chosen.pose.scale, estimates.chosen.score
+            scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
             seen = np.flatnonzero(estimates.found)
             if not len(seen):
                 raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
-            trusted = seen[np.argsort(score[seen])[: max(8, len(seen) * 2 // 3)]]
+            n_trusted = len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+            trusted = seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]
             guess = float(np.median(scale[trusted]))
         return guess
 
@@ -220,4 +226,5 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
     return Chosen(
         pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
         rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+        rows(picked.told_scale), rows(picked.told_trust),
     )  # fmt: skip

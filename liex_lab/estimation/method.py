@@ -47,6 +47,7 @@ class Method:
     scale_lever_mm: float = 50.0
     survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
     pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
+    settle: bool = False  # the chosen pose of an animal that is one chain settles under its back, see `settle`
     base_reach_mm: float = 0.0  # offsets reach this far from the base joint; 0: as far as from the others
     corrector: GrowthPlan | None = None  # of the last correction, of the chosen pose; None: it stays as chosen
 
@@ -57,8 +58,8 @@ class Method:
         return reach
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the model file and its card."""
-        return asdict(self)
+        """Plain values, for the model file and its card; what only some animals have is left out where it is unset."""
+        return {name: value for name, value in asdict(self).items() if name not in _UNSET or value != _UNSET[name]}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Method:
@@ -72,6 +73,7 @@ class Method:
         return Method(**plain)
 
 
+_UNSET: dict[str, Any] = {"settle": False}
 _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
@@ -100,8 +102,10 @@ METHODS = {
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("fish", "default"): {
-        "rounds": 3, "training_candidates": 5, "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
-        "reach_mm": 12.5, "keep_off_mm": 4.0, "top_tau": 0.25, "top_radius_mm": 4.5, "base_lever_mm": 10.0,
+        "rounds": 2, "training_candidates": 6, "n_candidates": 12, "survivors": 6,
+        "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
+        "reach_mm": 12.5, "base_reach_mm": 30.0, "keep_off_mm": 4.0, "top_tau": 0.8, "top_radius_mm": 4.5,
+        "base_lever_mm": 10.0, "regress_scale": False, "corrector": None, "settle": True,
     },
     ("fish", "paper"): {
         "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),

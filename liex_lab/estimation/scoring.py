@@ -30,7 +30,8 @@ class Chosen:
     pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n, J) of each joint;
     error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home size behind it; doubts (n, 4) mm at
     home size: best score, the best score of a candidate that points the other way, the spread of the good scores, and
-    how far the candidates of all scores lie from the chosen pose.
+    how far the candidates of all scores lie from the chosen pose; told_scale (n,): the animal's size over home size as
+    this frame alone tells it, and told_trust (n,), the higher the better.
     """
 
     pose: Pose
@@ -41,6 +42,8 @@ class Chosen:
     score: Array
     spread: Array
     doubts: Array
+    told_scale: Array
+    told_trust: Array
 
 
 def choose(
@@ -74,7 +77,8 @@ def choose(
     sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
-    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts)
+    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, pose.scale,
+                  -mean_score)  # fmt: skip
 
 
 def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float) -> Array:

@@ -99,7 +99,7 @@ class Windows:
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
         kernels.extract_windows(
             self.depth, self.background, margin, area_mm2, rank, self.view.smooth_mm * size,
-            intrinsics, plane, rotation, (self.view.behind_mm if camera_view else 0.0) * size, crops.heights,
+            intrinsics, plane, rotation, np.full(n, self.view.behind_mm if camera_view else 0.0), crops.heights,
             crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
         )  # fmt: skip
         looks = np.concatenate(
