@@ -283,13 +283,14 @@ def evaluate_actions(
     pose_model: Annotated[
         str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
     ] = None,
+    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
     json_file: JsonFile = None,
 ) -> None:
     """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings."""
     from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
 
     with progress_bar() as progress:
-        result = measure(animal, model=model, pose_model=pose_model, progress=progress)
+        result = measure(animal, model=model, pose_model=pose_model, minutes=minutes, progress=progress)
     _tell_numbers(result, json_file)
 
 

@@ -54,18 +54,21 @@ class Scenario:
 def acted_tracks(
     scenarios: list[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[LabelledTrack]:
-    """The tracks of all scenarios, kept from earlier or measured now. Those of one individual share its size."""
-    animal, made_from = scenarios[0].animal, repr(scenarios) + estimator.model.digest()
-    key = hashlib.sha256(made_from.encode() + _generator(animal)).hexdigest()[:16]
-    path = cache_folder() / "acted" / f"{animal}-{key}.npz"
-    if path.is_file():
-        return _load(path, estimator)
-    sizes: dict[int, float] = {}
-    tracks = []
-    for k, scenario in enumerate(scenarios):
-        progress(k, len(scenarios), "acting, rendering and measuring")
-        tracks.append(act(scenario, estimator, sizes))
-    _save(path, tracks)
+    """The tracks of all scenarios, kept from earlier or measured now. Cut-outs of one individual share its size."""
+    model, tracks = estimator.model.digest(), []
+    groups = [[one] for one in scenarios] if scenarios[0].seconds else [scenarios]
+    for k, group in enumerate(groups):
+        animal = group[0].animal
+        key = hashlib.sha256((repr(group) + model).encode() + _generator(animal)).hexdigest()[:16]
+        path = cache_folder() / "acted" / f"{animal}-{key}.npz"
+        if not path.is_file():
+            sizes: dict[int, float] = {}
+            measured = []
+            for n, one in enumerate(group):
+                progress(k + n, max(len(groups), len(group)), "acting, rendering and measuring")
+                measured.append(act(one, estimator, sizes))
+            _save(path, measured)
+        tracks += _load(path, estimator)
     return tracks
 
 

@@ -15,7 +15,7 @@ FAST_HZ = 100.0
 N_TRAIN, N_TEST = 426, 173  # cut-out sequences, as in the paper, of 5 and 2 fish
 _TRAIN_FISH, _TEST_FISH = (101, 102, 103, 104, 105), (106, 107)
 _TRAIN_SET, _FAST_SET, _TEST_SET = tuple(range(201, 225)), tuple(range(225, 233)), tuple(range(301, 307))
-_SECONDS, _FAST_SECONDS, _TEST_SECONDS, _TEST_FAST_SECONDS = 55.0, 25.0, 300.0, 40.0
+_SECONDS, _FAST_SECONDS, _TEST_FAST_SECONDS = 40.0, 20.0, 30.0
 
 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
@@ -39,9 +39,10 @@ def by_usual_camera(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     return list(tracks[: len(_TRAIN_SET)])
 
 
-def test_recordings(animal: str, fast: bool) -> list[Scenario]:
-    """Uncut recordings, 30 minutes in all, of individuals whose traits no other has; fast: by a faster camera."""
-    rate, seconds = (FAST_HZ, _TEST_FAST_SECONDS) if fast else (RATE_HZ[animal], _TEST_SECONDS)
+def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
+    """Uncut recordings, so many minutes in all, of individuals whose traits no other has; fast: by a faster camera."""
+    seconds = _TEST_FAST_SECONDS if fast else 60.0 * minutes / len(_TEST_SET)
+    rate = FAST_HZ if fast else RATE_HZ[animal]
     return [Scenario(animal, one, 3 + fast, rate, seconds, novel=True) for one in _TEST_SET]
 
 

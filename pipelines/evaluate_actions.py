@@ -49,10 +49,11 @@ PROTOCOL = (
 
 def evaluate_actions(
     animal: str = "fish", *, model: str | Path | None = None, pose_model: str | Path | None = None,
-    progress: Progress = silent,
+    minutes: float = 30.0, progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """The figures of `liex evaluate actions`. model: an action model other than the bundled one or, where there is
-    none, one trained now; pose_model: that measures the frames, other than the animal's own.
+    none, one trained now; pose_model: that measures the frames, other than the animal's own; minutes: of uncut
+    test recordings.
     """
     from liex_lab.actions.scores import confusion, interval95
 
@@ -60,14 +61,14 @@ def evaluate_actions(
         raise LiexError(f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of these")
     estimator = estimator_of(animal, "default", progress, pose_model)
     recogniser = _recogniser(animal, model, pose_model, progress)
-    train, test = _sequences(animal, estimator, progress)
+    train, test = _sequences(animal, estimator, minutes, progress)
     true = [str(one.words[0]) for one in test]
     words = sorted(set(true))
     found = paper_names(train, test)
     shares = {kind: float(np.mean([_share(true, names) for names in all_of])) for kind, all_of in found.items()}
     own = [recogniser.name(one.track, one.wall_mm) for one in test]
-    recordings = acted_tracks(test_recordings(animal, False), estimator, progress)
-    fast = acted_tracks(test_recordings(animal, True), estimator, progress)
+    recordings = acted_tracks(test_recordings(animal, False, minutes), estimator, progress)
+    fast = acted_tracks(test_recordings(animal, True, minutes), estimator, progress)
     timeline, by_fps = _timelines(recogniser, recordings, fast, RATE_HZ[animal])
     speed = speed_only(acted_tracks(training_recordings(animal), estimator, progress), recordings, recogniser)
     n, seconds = len(test), sum((one.track.times_ns[-1] - one.track.times_ns[0]) * 1e-9 for one in recordings)
@@ -104,14 +105,14 @@ def _recogniser(
 
 
 def _sequences(
-    animal: str, estimator: PoseEstimator, progress: Progress
+    animal: str, estimator: PoseEstimator, minutes: float, progress: Progress
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Cut-out actions to learn from and to test on: the fish's as in the paper, others' out of uncut recordings."""
     if animal == "fish":
         train, test = (acted_tracks(cut_sequences(animal, side), estimator, progress) for side in (False, True))
         return train, test
     usual = by_usual_camera(acted_tracks(training_recordings(animal), estimator, progress))
-    return cut_out(usual), cut_out(acted_tracks(test_recordings(animal, False), estimator, progress))
+    return cut_out(usual), cut_out(acted_tracks(test_recordings(animal, False, minutes), estimator, progress))
 
 
 def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:

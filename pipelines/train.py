@@ -39,10 +39,13 @@ class Recipe:
     n_correction: int = 12_288  # further images, for the last correction
     n_calibration: int = 24_576  # and further ones, for the predicted error
     degraded_share: float = 0.5
-    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (0.0, 144), (100.0, 232))
+    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (45.0, 144), (100.0, 232))
 
 
 _CALIBRATION, _CORRECTION = 1, 2  # numbers of their own random numbers, so that each can be made again by itself
+# of the images that an animal's predicted error is calibrated on show bodies that vary as individuals do; intervals for
+# bodies that vary far more, as the others do, are wider than most animals need
+_ORDINARY_SHARE = {"mouse": 0.5}
 _AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
 
 RECIPES = {
@@ -141,15 +144,16 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
         first = recipe.n_images + recipe.n_correction
-        unseen = rendered_set(skeleton, method, recipe, first, recipe.n_calibration, silent)
+        unseen = calibration_set(skeleton, method, recipe, first)
         model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
     return model
 
 
 def rendered_set(
-    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress
-) -> TrainingSet:
-    """N training images from number `first` on, cut out by the product's own foreground."""
+    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress,
+    family: str = "augmented",
+) -> TrainingSet:  # fmt: skip
+    """N training images from number `first` on, of bodies of a family, cut out by the product's own foreground."""
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.recordings.windows import BLOCK
     from liex_lab.recordings.worlds import world_of
@@ -161,11 +165,25 @@ def rendered_set(
         progress(number - begin, blocks, "rendering training images")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
         (windows,) = world.training_blocks(
-            recipe.seed, 1, first=number, family="augmented", degraded_share=recipe.degraded_share,
+            recipe.seed, 1, first=number, family=family, degraded_share=recipe.degraded_share,
             spine_mm=spine_mm or None, window_px=window_px,
         )  # fmt: skip
         parts.append(cut_out(skeleton, method, windows))
     return TrainingSet.join(parts)
+
+
+def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
+    """Training images from number `first` on as a model is calibrated on them: some of ordinary bodies, see
+    `_ORDINARY_SHARE`, the rest as varied as those that it was trained on.
+    """
+    from liex_lab.estimation.training import TrainingSet
+
+    ordinary = round(_ORDINARY_SHARE.get(skeleton.name, 0.0) * recipe.n_calibration)
+    varied = rendered_set(skeleton, method, recipe, first, recipe.n_calibration - ordinary, silent)
+    if not ordinary:
+        return varied
+    first += recipe.n_calibration - ordinary
+    return TrainingSet.join([varied, rendered_set(skeleton, method, recipe, first, ordinary, silent, "train")])
 
 
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:

@@ -20,6 +20,8 @@ from liex_lab.forests.forest import Samples, predict
 
 Array = NDArray[np.float64]
 
+_LOG_UNIT = 500.0  # a threshold is an integer
+
 
 def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Chosen:
     """The chosen poses of n frames, whose height maps are `images`, after the model's last correction."""
@@ -33,12 +35,18 @@ def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Ch
 
 
 def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Samples:
-    """What a corrector sees of one pose for each of n height maps: what lies about every joint."""
+    """What a corrector sees of one pose for each of n height maps: what lies about every joint, and beside the numbers
+    that every forest sees how many mm a pixel covers, for an outline loses about one of them all round.
+    """
     frames, n = pose.frames(model.skeleton), len(pose.scale)
     candidates = Candidates(
         np.arange(n, dtype=np.int32), frames.rotation, frames.translation, pose.scale, np.full(n, size)
     )
-    return model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
+    samples = model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
+    looks = images.looks
+    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / size
+    scalars = np.column_stack([samples.scalars, _LOG_UNIT * np.log(mm_per_px)]).astype(np.float32)
+    return replace(samples, scalars=scalars)
 
 
 def moves_to(pose: Pose, model: Model, joints: Array, size: float) -> Array:

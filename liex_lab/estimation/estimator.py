@@ -177,8 +177,10 @@ class PoseEstimator:
         guess = self.size_from_area(scene.area_mm2)
         if not self.model.method.session_size:
             return 1.0
+        # the last correction has learned how long animals of usual shape are: it would pull this one's size to theirs
+        uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
-            estimates = self.estimate(sample, scene, guess)
+            estimates = uncorrected.estimate(sample, scene, guess)
             scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
             seen = np.flatnonzero(estimates.found)
             if not len(seen):

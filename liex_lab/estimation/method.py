@@ -78,14 +78,14 @@ _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
     "default": Method(
-        variant="default", rounds=4, n_candidates=12, training_candidates=8,
+        variant="default", rounds=4, n_candidates=16, training_candidates=8,
         regressors=GrowthPlan(16, 18, 22, 120, 0.3, 0.15, 0.3, 0.63),
         metric=GrowthPlan(120, 10, 50, 120, 0.45, 0.1, 0.3, 0.5),
         reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
         keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
         metric_shrinkage=0.15, mean_shift_mm=0.0,
         top_k=10, top_tau=1.0, top_radius_mm=15.0,
-        survivors=4, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
+        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
         corrector=GrowthPlan(160, 6, 40, 200, 0.4, 0.15, 0.3, 0.5),
     ),
     "paper": Method(

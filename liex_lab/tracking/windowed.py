@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
-_SIZE_PASSES = 5
-_SURE = 2.0 / 3.0  # of the frames measure the size: those of which the model is surest
+_SIZE_PASSES = 4
+_SURE = 0.5  # of the frames measure the size: those of which the model is surest
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class WindowTracker:
 
     def find_size(self, windows: Windows) -> float:
         """The animal's length over the home length, measured in some windows as over a recording's sample."""
-        model = self.estimator.model
-        size = 1.0
+        model, size = self.estimator.model, 1.0
+        uncorrected = replace(self, estimator=replace(self.estimator, model=replace(model, corrector=None)))
         for _ in range(_SIZE_PASSES if model.method.session_size else 0):
-            crops, _, chosen = self._estimate(windows, size)
+            crops, _, chosen = uncorrected._estimate(windows, size)
             if not crops.found.any():
                 return 1.0
-            best = np.argsort(chosen.score)[: max(8, int(_SURE * len(chosen.score)))]
-            size = float(np.median(chosen.pose.scale[best]))
+            sure = np.argsort(-chosen.told_trust)[: max(8, int(_SURE * len(chosen.score)))]
+            size = float(np.median(chosen.told_scale[sure]))
         return size
 
     def follow(self, parts: Iterable[Windows], times_ns: NDArray[np.int64], size: float) -> Track:
