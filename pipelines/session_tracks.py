@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 
 def track_of(session: Session) -> Track:
     """The track of a session, as far as its tables tell."""
-    skeleton = Skeleton.load(session.metadata["plan"]["animal"]["skeleton"])
+    planned = session.metadata["plan"].get("animal")
+    skeleton = Skeleton.load(planned["skeleton"] if isinstance(planned, dict) else session.metadata["animal"]["name"])
     frames, n, j = session.frames, len(session.frames), skeleton.n_joints
     poses, rotations = session.poses, session.rotations
     if len(poses) != n * j or len(rotations) != n * (j + 1):

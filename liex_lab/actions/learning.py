@@ -20,6 +20,7 @@ from liex_lab.progress import Progress, silent
 Array = NDArray[np.float64]
 
 _HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 10, 512, 2
+_LEAST_STEPS, _MOST_EPOCHS = 1500, 200  # of few labels
 _WEIGHT_DECAY = 2e-3
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
@@ -63,13 +64,15 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     features, code = examples.features[rows], examples.code[rows]
     centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
     inputs = np.clip((features - centre) / scale, -6.0, 6.0)
+    batch = int(np.clip(len(code) // 8, 1, _BATCH))
+    epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
     present = np.unique(code)  # of the vocabulary; stretches without a name may be missing
     classifier = MLPClassifier(
-        (_HIDDEN,), alpha=_WEIGHT_DECAY, batch_size=_BATCH, learning_rate_init=1.5e-3, max_iter=1, warm_start=True,
+        (_HIDDEN,), alpha=_WEIGHT_DECAY, batch_size=batch, learning_rate_init=1.5e-3, max_iter=1, warm_start=True,
         random_state=seed,
     )  # fmt: skip
-    for epoch in range(_EPOCHS):
-        classifier.learning_rate_init = 1.5e-3 * 0.5 * (1.0 + np.cos(np.pi * epoch / _EPOCHS)) + 1e-5
+    for epoch in range(epochs):
+        classifier.learning_rate_init = 1.5e-3 * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs)) + 1e-5
         classifier.partial_fit(inputs, code, classes=present if epoch == 0 else None)
     weights, bias = classifier.coefs_[-1], classifier.intercepts_[-1]
     if len(present) == 2:  # one number decides between two words
