@@ -206,6 +206,8 @@ def _optics(session: Session) -> str:
             f"the refraction at a water surface {water['height_mm']:g} mm below the lens (index "
             f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')} camera)"
         )
+    if optics.get("mirrored"):
+        undone.append("the mirroring of the pictures")
     what = " and ".join(undone)
     return f"{what} undone; camera and pictures are those of an ideal camera in air" if undone else ""
 

@@ -208,9 +208,7 @@ def evaluate_pose(
     from liex_lab.pipelines.evaluate import evaluate_pose as measure
 
     with progress_bar() as progress:
-        result = measure(
-            animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress
-        )
+        result = measure(animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
     _tell_numbers(result, json_file)
 
 
@@ -292,6 +290,25 @@ def evaluate_actions(
     with progress_bar() as progress:
         result = measure(animal, model=model, pose_model=pose_model, minutes=minutes, progress=progress)
     _tell_numbers(result, json_file)
+
+
+@evaluate.command("nyu")
+def evaluate_nyu(
+    reference: Annotated[
+        Path, typer.Option("--reference", metavar="DIR", help="Labels, published answers and frames of the NYU data.")
+    ],
+    model: Annotated[str | None, typer.Option("--model", help="A hand model of your own, .npz.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and ours."""
+    from liex_lab.pipelines.nyu import evaluate_nyu as measure
+    from liex_lab.pipelines.nyu import in_short
+
+    with progress_bar() as progress:
+        result = measure(reference, model=model, progress=progress)
+    _tell_numbers(in_short(result), None)
+    if json_file is not None:
+        _keep_numbers(result, json_file)
 
 
 @evaluate.command("reference")
@@ -414,13 +431,17 @@ def _tell_session(session: Path) -> None:
 def _tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(_json(result) + "\n", encoding="utf-8")
+        _keep_numbers(result, json_file)
     table = Table(show_header=False)
     for name, value in result.items():
         shown = f"{value:.4g}" if isinstance(value, float) else _json(value) if isinstance(value, dict) else str(value)
         table.add_row(name, Text(shown))
     Console().print(table)
+
+
+def _keep_numbers(result: dict[str, Any], json_file: Path) -> None:
+    json_file.parent.mkdir(parents=True, exist_ok=True)
+    json_file.write_text(_json(result) + "\n", encoding="utf-8")
 
 
 def _json(result: Any) -> str:

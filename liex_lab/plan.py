@@ -114,6 +114,9 @@ class RecordingOptions(_Table):
     accept_truncated: bool = Field(
         False, description="true: use the whole frames of a recording that ends in the middle of one"
     )
+    mirrored: bool = Field(
+        False, description="true: exchange left and right, for pictures that come mirrored, or to measure a left hand"
+    )
 
 
 class Foreground(_Table):
@@ -125,6 +128,14 @@ class Foreground(_Table):
     n_background_frames: int = Field(
         96, ge=3, description="frames, spread over the recording, that show the background"
     )
+    near_mm: Positive = Field(250.0, description="a hand is not nearer to the camera than this")
+    far_mm: Positive = Field(1600.0, description="a hand is not farther from the camera than this")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Foreground:
+        if not self.near_mm < self.far_mm:
+            raise ValueError(f"near_mm={self.near_mm} should be below far_mm={self.far_mm}")
+        return self
 
 
 class Estimation(_Table):

@@ -11,13 +11,16 @@ from liex_lab.plan import Plan, known_plans
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from liex_lab.actions.timeline import TimelineModel
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.behaviour.places import Surroundings
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.crops import Foreground
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.walls import Arena
     from liex_lab.recordings.zones import DrawnZone, Zone
@@ -32,11 +35,12 @@ _SPANS = (0.6, 1.8)  # of the home length: how small and how large an animal of 
 def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
     """The recording at a path, or one that is open already, as an ideal camera in air would have made it.
 
-    Lens distortion and the water's refraction are undone whenever a frame is read.
+    Lens distortion, the water's refraction and a mirror are undone whenever a frame is read.
     """
-    from liex_lab.recordings.rectify import rectified
+    from liex_lab.recordings.rectify import mirrored, rectified
 
-    return rectified(open_planned(recording, plan, progress), build_water(plan))
+    seen = rectified(open_planned(recording, plan, progress), build_water(plan))
+    return mirrored(seen) if plan.recording.mirrored else seen
 
 
 def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
@@ -124,17 +128,27 @@ def build_estimator(plan: Plan) -> PoseEstimator:
 
 def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     """The tracker of a recording: its scene learned, the animal's size and girth found."""
-    from liex_lab.recordings.foreground import Scene
     from liex_lab.tracking.tracker import FrameTracker
 
     build_zones(plan)  # a slip in their file is told before any work is done
     estimator = build_estimator(plan)
+    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, plan.estimation.doubtful_above_mm)
+
+
+def build_scene(
+    recording: Recording, plan: Plan, skeleton: Skeleton, n_frames: int
+) -> tuple[Foreground, NDArray[np.float32]]:
+    """What tells the animal from the rest of the pictures, and the sample (n, H, W) mm that it was learned from."""
+    from liex_lab.body.skeleton import FOREGROUNDS
+    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.nearest import NearestScene
+
     animal, foreground = plan.animal, plan.foreground
-    scene, sample = Scene.learn(
-        recording, (animal.spine_min_mm, animal.spine_max_mm), foreground.n_background_frames,
-        foreground.min_height_mm, estimator.skeleton.view,
-    )  # fmt: skip
-    return FrameTracker.prepare(estimator, scene, sample, animal.spine_mm, plan.estimation.doubtful_above_mm)
+    if skeleton.view.foreground == FOREGROUNDS[1]:
+        return NearestScene.learn(recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm))
+    sizes = (animal.spine_min_mm, animal.spine_max_mm)
+    return Scene.learn(recording, sizes, n_frames, foreground.min_height_mm, skeleton.view)
 
 
 def build_provenance(
@@ -159,13 +173,16 @@ def build_provenance(
     )
 
 
-def build_arena(scene: Scene, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
-    """The shape of the arena, and the plan's zones in it."""
+def build_arena(scene: Foreground, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+    """The shape of the arena, where there is one, and the plan's zones in it."""
     from liex_lab.recordings.arena import Floor
-    from liex_lab.recordings.walls import find_arena
+    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.walls import UNKNOWN, find_arena
 
-    floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
-    arena = find_arena(scene.background, floor, scene.grid)
+    arena = UNKNOWN
+    if isinstance(scene, Scene):
+        floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
+        arena = find_arena(scene.background, floor, scene.grid)
     return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
 
 

@@ -18,8 +18,8 @@ from liex_lab.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.foreground import Scene
-    from liex_lab.recordings.synthetic import SyntheticSession
+    from liex_lab.recordings.crops import Foreground
+    from liex_lab.recordings.synthetic import TrueRecording
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ def subject_of(
 
 
 def measure(
-    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Scene
+    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Foreground
 ) -> tuple[Array, Array, Array]:
     """Joints (n, J, 3) mm in the camera frame, their predicted error (n,) mm, NaN where the subject predicts none, and
     the quantiles (2,) of its 90 % interval; the animal's size is found over the frames (n, H, W) mm.
@@ -83,27 +83,25 @@ def measure(
 
 
 def errors_of(
-    subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[SyntheticSession], plan: Plan,
+    subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording], plan: Plan,
     progress: Progress,
 ) -> dict[str, PoseErrors]:  # fmt: skip
     """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
-    from liex_lab.recordings.foreground import Scene
+    from liex_lab.pipelines.build import build_scene
 
     parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
-        sizes = (plan.animal.spine_min_mm, plan.animal.spine_max_mm)
-        view = next(iter(subjects.values())).skeleton.view
-        scene, frames = Scene.learn(recording, sizes, len(recording), plan.foreground.min_height_mm, view)
+        scene, frames = build_scene(recording, plan, next(iter(subjects.values())).skeleton, len(recording))
         for name, subject in subjects.items():
             joints, predicted_mm, quantiles = measure(subject, frames, scene)
-            tip = subject.skeleton.n_joints - 1
+            tip = subject.skeleton.tip
             parts[name].append(PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles))
     return {name: PoseErrors.join(some) for name, some in parts.items()}
 
 
 def pose_errors(
-    subject: PoseEstimator | Baseline, sessions: Sequence[SyntheticSession], plan: Plan, progress: Progress
+    subject: PoseEstimator | Baseline, sessions: Sequence[TrueRecording], plan: Plan, progress: Progress
 ) -> PoseErrors:
     """`errors_of` one subject."""
     return errors_of({"": subject}, sessions, plan, progress)[""]
@@ -123,15 +121,13 @@ def evaluate_pose(
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
 
-    sessions = world_of(Skeleton.load(animal)).test_split(split, spine_mm=spine_mm)
+    world = world_of(Skeleton.load(animal))
+    sessions = world.test_split(split, spine_mm=spine_mm)
     subject = subject_of(animal, variant, progress, model)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
     errors = pose_errors(subject, sessions, plan_of(animal), progress)
-    how = (
-        f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, each with its own camera, arena, animal; "
-        "the background, the floor, the blob and the animal's size are found by the product, nothing is handed over. "
-    )
+    how = f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, {world.protocol}"
     return {"animal": animal, "split": split, "variant": variant, "n_frames": len(errors.error_mm),
             **errors.summary(), "protocol": how + POSE_PROTOCOL}  # fmt: skip
 

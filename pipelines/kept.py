@@ -13,7 +13,7 @@ from liex_lab.catalog import kept_results_folder
 from liex_lab.errors import LiexError
 
 if TYPE_CHECKING:
-    from liex_lab.recordings.synthetic import SyntheticSession
+    from liex_lab.recordings.synthetic import TrueRecording
 
 SCHEMA = 1
 _SAME_MM = 0.05  # joints of the same test frame differ by less than this between machines
@@ -42,7 +42,7 @@ def keep_results(folder: Path, animal: str, rows: Mapping[str, Any], sensitivity
     return path
 
 
-def fits(row: Mapping[str, Any], made_from: Mapping[str, Any], tests: Mapping[str, Sequence[SyntheticSession]]) -> bool:
+def fits(row: Mapping[str, Any], made_from: Mapping[str, Any], tests: Mapping[str, Sequence[TrueRecording]]) -> bool:
     """Whether a kept row is of the same training and of the same test frames as would be measured now."""
     if row["made"]["from"] != json.loads(json.dumps(made_from)):
         return False
@@ -53,6 +53,6 @@ def fits(row: Mapping[str, Any], made_from: Mapping[str, Any], tests: Mapping[st
     return True
 
 
-def first_joints(sessions: Sequence[SyntheticSession]) -> list[list[float]]:
+def first_joints(sessions: Sequence[TrueRecording]) -> list[list[float]]:
     """The true joints (J, 3) mm of a split's first frame, camera frame: what the test frames are recognised by."""
     return [[round(float(x), 3) for x in joint] for joint in sessions[0].joints_camera[0]]

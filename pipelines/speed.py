@@ -17,7 +17,7 @@ from liex_lab.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.foreground import Scene
+    from liex_lab.recordings.crops import Foreground
 
 Array = NDArray[Any]
 N_FRAMES = 128
@@ -32,7 +32,7 @@ class _Footage:
 
     name: str
     frames: NDArray[np.float32]
-    scene: Scene
+    scene: Foreground
     size: float
 
     @property
@@ -98,19 +98,15 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
 
 def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
     """Frames of a rendered recording, as many as are timed, and the scene learned from it."""
-    from liex_lab.pipelines.build import plan_of
+    from liex_lab.pipelines.build import build_scene, plan_of
 
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.recordings.foreground import Scene
     from liex_lab.recordings.worlds import world_of
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
     recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
     plan = plan_of(animal)
-    scene, sample = Scene.learn(
-        recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm), 96, plan.foreground.min_height_mm,
-        estimator.skeleton.view,
-    )  # fmt: skip
+    scene, sample = build_scene(recording, plan, estimator.skeleton, 96)
     frames = recording.depths(0, min(len(recording), N_FRAMES))  # whole ones, which those of the sample need not be
     frames = frames[np.arange(N_FRAMES) % len(frames)]
     return _Footage(recording.name, frames, scene, estimator.find_size(sample, scene))
@@ -209,15 +205,8 @@ def _cut(footage: _Footage) -> None:
 
 def _sizes(footage: _Footage) -> list[_Footage]:
     """The same frames with every second pixel and with all of them."""
-    from liex_lab.recordings.arena import Floor
-
-    out, scene = [], footage.scene
+    out = []
     for step in _SHRINK:
-        camera, cut = scene.camera.every(step), (slice(None, None, step), slice(None, None, step))
-        floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, camera)
-        smaller = replace(
-            scene, camera=camera, floor=floor, background=np.ascontiguousarray(scene.background[cut]),
-            limit=np.ascontiguousarray(scene.limit[cut]), on_floor=np.ascontiguousarray(scene.on_floor[cut]),
-        )  # fmt: skip
-        out.append(replace(footage, frames=np.ascontiguousarray(footage.frames[(slice(None), *cut)]), scene=smaller))
+        frames = np.ascontiguousarray(footage.frames[:, ::step, ::step])
+        out.append(replace(footage, frames=frames, scene=footage.scene.every(step)))
     return out

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.synthetic import SyntheticSession
+    from liex_lab.recordings.synthetic import TrueRecording
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
 SWEPT = ("paper", "default")  # variants whose sensitivity is drawn
@@ -179,7 +179,7 @@ def _made_by() -> dict[str, str]:
 
 
 def measured_rows(
-    animal: str, subjects: Mapping[str, PoseEstimator | Baseline], tests: Mapping[str, Sequence[SyntheticSession]],
+    animal: str, subjects: Mapping[str, PoseEstimator | Baseline], tests: Mapping[str, Sequence[TrueRecording]],
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """The numbers of each subject: `splits` and `rate`."""
@@ -209,19 +209,15 @@ def _numbers(errors: PoseErrors) -> dict[str, Any]:
 
 
 def rates_of(
-    animal: str, subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[SyntheticSession]
+    animal: str, subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording]
 ) -> dict[str, dict[str, Any]]:
     """Frames per second of each subject on at most two cores, foreground included, all on the same frames in memory."""
     import numba
+    from liex_lab.pipelines.build import build_scene
     from liex_lab.pipelines.speed import best_seconds
 
-    from liex_lab.recordings.foreground import Scene
-
     recording, plan = max(sessions[:2], key=lambda session: session.width), plan_of(animal)
-    view = next(iter(subjects.values())).skeleton.view
-    scene, sample = Scene.learn(
-        recording, (plan.animal.spine_min_mm, plan.animal.spine_max_mm), 96, plan.foreground.min_height_mm, view
-    )
+    scene, sample = build_scene(recording, plan, next(iter(subjects.values())).skeleton, 96)
     frames = recording.depths(0, min(len(recording), _RATE_FRAMES))
     frames = frames[np.arange(_RATE_FRAMES) % len(frames)]
     cores = min(2, numba.config.NUMBA_NUM_THREADS)

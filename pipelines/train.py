@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from liex_lab.estimation.method import Method
     from liex_lab.estimation.model import Model
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.foreground import Crops
     from liex_lab.recordings.windows import TrainingWindows
 
 Array = NDArray[np.float64]
@@ -60,6 +60,10 @@ _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES),
     ("fish", "paper"): Recipe(
         seed=31, n_images=6_144, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)
+    ),
+    ("hand", "default"): Recipe(n_images=20_480, n_correction=0, n_calibration=4_096, sizes=((0.0, 320),)),
+    ("hand", "paper"): Recipe(
+        n_images=8_192, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 320),)
     ),
 }
 
@@ -118,6 +122,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_settler
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
+    from liex_lab.recordings.worlds import world_of
 
     rng = np.random.default_rng(recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
@@ -133,7 +138,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
-        "images": "rendered from a seed; no recording of an animal was used",
+        "images": world_of(skeleton).sources,
     }  # fmt: skip
     model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_correction and (method.corrector is not None or method.settle):
@@ -188,40 +193,44 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
 
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
     """Training images of what the foreground found in the windows, with the truth in their view frames."""
+    from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.recordings.foreground import Windows
+    from liex_lab.recordings.foreground import SPREADS, Windows
+    from liex_lab.recordings.nearest import NearestWindows
 
-    size = windows.spine_mm / skeleton.length
-    depth, background = (
-        picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
-        for picture in (windows.depth, windows.background)
-    )
-    cut = Windows(depth, background, windows.intrinsics, windows.origin.astype(float), windows.floor, skeleton.view)
+    size, origin = windows.spine_mm / skeleton.length, windows.origin.astype(float)
     shown = size if method.session_size else np.ones(len(size))
-    parts = [cut_rank(skeleton, method, windows, cut, shown, rank) for rank in (0, 1)]
-    return TrainingSet.join(parts)
+    if skeleton.view.foreground == FOREGROUNDS[1]:
+        held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
+        cuts = [held.extract(shown, method.camera_view, rank) for rank in (0, 1)]
+    else:
+        depth, background = (
+            picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+            for picture in (windows.depth, windows.background)
+        )
+        cut = Windows(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+        area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
+        # a scene learned from a recording knows how much its readings spread
+        least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+        cuts = [cut.extract(shown, area, least, method.camera_view, rank) for rank in (0, 1)]
+    return TrainingSet.join([with_truth(skeleton, method, windows, crops, looks) for crops, looks in cuts])
 
 
-def cut_rank(
-    skeleton: Skeleton, method: Method, windows: TrainingWindows, cut: Windows, shown: Array, rank: int
-) -> TrainingSet:
-    """Training images of the blobs that come first (rank 0) or second in likeness to the animal's area."""
+def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
+    """Training images of blobs that were cut from the windows, with the truth in their view frames."""
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.geometry import SE3
-    from liex_lab.recordings.foreground import SPREADS
+    from liex_lab.recordings.crops import view_of
 
-    size = windows.spine_mm / skeleton.length
-    area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
-    # a scene learned from a recording knows how much its readings spread
-    least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-    crops, looks = cut.extract(shown, area, least, method.camera_view, rank)
-    rotation = looks[:, 4:13].reshape(-1, 3, 3)
-    T_view_camera = SE3(rotation, np.stack([0 * looks[:, 13], 0 * looks[:, 13], looks[:, 13]], axis=1))
+    T_view_camera = view_of(looks)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
-    middle = frames.translation.mean(axis=1)
+    joints = frames.translation
+    if windows.own_bones:
+        joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
+    middle = joints.mean(axis=1)
     off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
     if method.camera_view:  # what is beside it in depth is another thing as well
         off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
@@ -229,8 +238,8 @@ def cut_rank(
     good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
     return TrainingSet(
         ImageSet(crops.heights[good], looks[good], crops.moments[good]),
-        Truth(frames.rotation[good], frames.translation[good], pose.scale[good]),
-        size[good],
+        Truth(frames.rotation[good], joints[good], pose.scale[good]),
+        (windows.spine_mm / skeleton.length)[good],
         animal[good],
     )
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from liex_lab.baselines.baseline import Guesses, in_camera_frame, see
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class PlainMean:
         """The animal's skeleton."""
         return self.estimator.skeleton
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """As the paper's variant: the home size."""
         return self.estimator.find_size(sample, scene)
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Guesses:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
         """The mean over all candidates of each joint's position."""
         crops, looks = see(depths, scene, parallel)
         _, positions, _, _ = self.estimator.candidates(crops, looks, size, parallel)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.recordings.foreground import Crops, Scene
+from liex_lab.recordings.crops import Crops, Foreground
 
 Array = NDArray[np.float64]
 
@@ -33,14 +33,14 @@ class Baseline(Protocol):
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """The animal's size over home size; 1 where the baseline knows of no such thing, as the paper's do not."""
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Guesses:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame; on one core unless `parallel`."""
 
 
-def see(depths: NDArray[np.float32], scene: Scene, parallel: bool) -> tuple[Crops, Array]:
+def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple[Crops, Array]:
     """The animal of each frame (n, H, W) mm as the paper's features see it, and how it was cut (n, 17).
 
     Heights along the optical axis, no size known. Where two things have about the animal's area, the one that is more

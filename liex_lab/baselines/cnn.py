@@ -28,7 +28,7 @@ from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground
 from liex_lab.threads import threads
 
 if TYPE_CHECKING:
@@ -118,11 +118,11 @@ class Cnn:
     skeleton: Skeleton
     net: torch.nn.Sequential
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """1: the network knows nothing of size."""
         return 1.0
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Guesses:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame."""
         crops, looks = see(depths, scene, parallel)
         joints = np.full((len(looks), self.skeleton.n_joints, 3), np.nan)

@@ -36,7 +36,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground
 from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
@@ -71,11 +71,11 @@ class RegressionForest:
     where: Forest
     pose: Forest
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """1: the paper's forests know nothing of size."""
         return 1.0
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Guesses:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame."""
         crops, looks = see(depths, scene, parallel)
         s, n = self.skeleton, len(looks)

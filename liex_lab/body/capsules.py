@@ -15,6 +15,7 @@ from liex_lab.errors import LiexError
 Array = NDArray[np.float64]
 
 _KEYS = {"from", "to", "from_mm", "to_mm", "radii_mm"}
+PARTS = ("capsules", "beyond")
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,24 @@ class Capsules:
             )
         joints = [[int(skeleton.parents[j]), j] for j in range(1, skeleton.n_joints)]
         at_ends = [[radii[a], radii[b]] for a, b in joints]
-        offsets = [[[0.0] * 3, [0.0] * 3] for _ in joints]
-        for table in skeleton.surface.get("capsules", []):
-            ends, where, thick = _parsed(table, skeleton)
-            joints.append(ends)
-            offsets.append(where)
-            at_ends.append(thick)
-        return Capsules(np.array(joints, np.int64), np.array(offsets, float), np.array(at_ends, float))
+        more = Capsules.listed(skeleton, PARTS[0])
+        return Capsules(
+            np.concatenate([np.array(joints, np.int64).reshape(-1, 2), more.joints]),
+            np.concatenate([np.zeros((len(joints), 2, 3)), more.offsets]),
+            np.concatenate([np.array(at_ends, float).reshape(-1, 2), more.radii]),
+        )
+
+    @staticmethod
+    def listed(skeleton: Skeleton, part: str) -> Capsules:
+        """The capsules of one of the lists in a skeleton's [surface]: 'capsules' belong to the body, and 'beyond' says
+        where something may go on that does not, as an arm behind a hand.
+        """
+        rows = [_parsed(table, skeleton, part) for table in skeleton.surface.get(part, [])]
+        return Capsules(
+            np.array([row[0] for row in rows], np.int64).reshape(-1, 2),
+            np.array([row[1] for row in rows], float).reshape(-1, 2, 3),
+            np.array([row[2] for row in rows], float).reshape(-1, 2),
+        )
 
     @property
     def faces(self) -> NDArray[np.int32]:
@@ -85,9 +97,9 @@ class Capsules:
         return out
 
 
-def _parsed(table: Any, skeleton: Skeleton) -> tuple[list[int], list[list[float]], list[float]]:
-    """Joints, offsets and radii of one [[surface.capsules]]."""
-    where = f"the [[surface.capsules]] of '{skeleton.name}'"
+def _parsed(table: Any, skeleton: Skeleton, part: str) -> tuple[list[int], list[list[float]], list[float]]:
+    """Joints, offsets and radii of one [[surface.capsules]] or [[surface.beyond]]."""
+    where = f"the [[surface.{part}]] of '{skeleton.name}'"
     if not isinstance(table, dict) or not set(table) <= _KEYS:
         raise LiexError(f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}")
     names = [table.get("from"), table.get("to")]

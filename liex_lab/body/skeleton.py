@@ -25,6 +25,7 @@ _JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
 _ROOT_DOF = 6
 REFERENCE_MM = 52.834  # home length of the mouse: lengths that hold for every animal are stated for it
 VIEWS = ("floor", "camera")
+FOREGROUNDS = ("background", "nearest")
 _BEHIND_MM, _SMOOTH_MM = 120.0, 2.0  # of an animal of the reference length
 _MIN_HEIGHT_MM = 7.0
 _AREA = (0.12, 1.3)
@@ -35,10 +36,11 @@ class View:
     """How an animal is looked at: the [view] table of its TOML.
 
     frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
-    behind_mm behind its mean depth, for one that swims or is held up; the same for all sizes, or the height map would
-    tell the size for which it was cut. smooth_mm: readings this near to one another, at home size, are averaged. area:
-    the smallest and the largest area seen from above, of the squared length. min_height_mm: what stands out from the
-    background by less is not the animal.
+    behind_mm behind its mean depth, for one that swims (the same for all sizes, or the height map would tell the size
+    for which it was cut) or is held up (at home size). smooth_mm: readings this near to one another, at home size, are
+    averaged. area: the smallest and the largest area seen from above, of the squared length. min_height_mm: what stands
+    out from the background by less is not the animal. foreground: 'background', it stands out from a still scene,
+    or 'nearest', nothing is nearer to the camera.
     """
 
     frame: str = VIEWS[0]
@@ -46,6 +48,7 @@ class View:
     smooth_mm: float = _SMOOTH_MM
     area: tuple[float, float] = _AREA
     min_height_mm: float = _MIN_HEIGHT_MM
+    foreground: str = FOREGROUNDS[0]
 
     @staticmethod
     def from_table(table: dict[str, Any], relative_size: float, origin: str) -> View:
@@ -55,6 +58,9 @@ class View:
             if key not in known:
                 raise LiexError(f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}")
         frame, area = table.get("frame", VIEWS[0]), table.get("area", list(_AREA))
+        foreground = table.get("foreground", FOREGROUNDS[0])
+        if foreground not in FOREGROUNDS:
+            raise LiexError(f"{origin}: [view] foreground is one of {', '.join(FOREGROUNDS)}, got {foreground!r}")
         if frame not in VIEWS:
             raise LiexError(f"{origin}: [view] frame is one of {', '.join(VIEWS)}, got {frame!r}")
         if not (isinstance(area, list) and [_is_number(a) for a in area] == [True, True] and 0 < area[0] < area[1]):
@@ -69,7 +75,7 @@ class View:
             if not (_is_number(value) and value > 0):
                 raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
-        return View(frame=frame, area=(float(area[0]), float(area[1])), **lengths)
+        return View(frame=frame, area=(float(area[0]), float(area[1])), foreground=foreground, **lengths)
 
 
 MOUSE_VIEW = View()
@@ -187,6 +193,11 @@ class Skeleton:
         for parent, child in reversed(self.edges):
             first[parent] = child
         return first
+
+    @cached_property
+    def tip(self) -> int:
+        """The joint whose direction from the base says which way the animal lies: a chain's last, a tree's second."""
+        return self.n_joints - 1 if self.is_chain else int(self.next_joint[0])
 
     @cached_property
     def solved(self) -> list[int]:

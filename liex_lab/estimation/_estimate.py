@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from liex_lab.estimation._explain import N_FIT, explain_pose
 from liex_lab.estimation._kernels import (
     N_SCALARS,
     correct_base,
@@ -50,10 +51,11 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C; reach (J,) mm of the offsets from each joint; levers (3,) of base, joints and scale; bandwidth mm of
-    the mean shift, 0 for the mean; how many candidates outlive the base joint.
+    """Rounds C, of the base and of the other joints; reach (J,) mm of the offsets from each joint; levers (3,) of base,
+    joints and scale; bandwidth mm of the mean shift, 0 for the mean; how many candidates outlive the base joint.
     """
 
+    base_rounds: int
     rounds: int
     reach: Any
     levers: Any
@@ -127,10 +129,10 @@ def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
 
 
 @njit(cache=True)
-def _write_scalars(lanes, k, scalars):
-    """Put a lane's scalars behind the pixels, rounded down."""
-    at = lanes.scalar_base[k]
-    for c in range(N_SCALARS):
+def _write_scalars(lanes, k, first, scalars):
+    """Put a lane's scalars behind the pixels, from number `first` on, rounded down."""
+    at = lanes.scalar_base[k] + first
+    for c in range(scalars.size):
         lanes.pixels[at + c] = np.int16(np.floor(min(max(scalars[c], np.float32(-32768.0)), np.float32(32767.0))))
 
 
@@ -145,14 +147,14 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
         for c in range(VIEW):
             lanes.views[c * n_lanes + s] = view[c]
         fill_scalars(rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars)
-        _write_scalars(lanes, s, scalars)
+        _write_scalars(lanes, s, 0, scalars)
 
 
 @njit(cache=True)
-def _see_all(lanes, n, looks, moments, size, reach, rotations, positions, scales):
-    """Fill the lanes' views from all joints, and their scalars from the base."""
+def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, positions, scales):
+    """Fill the lanes' views from all joints, and their scalars from the base and from the posed body."""
     n_joints = positions.shape[2]
-    view, scalars = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32)
+    view, scalars, fit = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32), np.empty(N_FIT, np.float32)
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
         for joint in range(n_joints):
@@ -160,15 +162,19 @@ def _see_all(lanes, n, looks, moments, size, reach, rotations, positions, scales
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
         fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)
-        _write_scalars(lanes, s, scalars)
+        _write_scalars(lanes, s, 0, scalars)
+        if body.radius.size > 0:
+            explain_pose(heights[i], looks[i], moments[i, 5], rotations[i, k], positions[i, k], scales[i, k], size,
+                         body, fit)  # fmt: skip
+            _write_scalars(lanes, s, N_SCALARS, fit)
 
 
 @njit(cache=True)
 def _lanes_for(heights, frames, n_poses, n_joints, size):
     """Lanes for n_poses candidates of each of the frames, with the frames' height maps beside one another."""
     side, n = heights.shape[1], frames.size * n_poses
-    area, n_lanes = side * side, LANES * ((n + LANES - 1) // LANES)
-    pixels = np.zeros(frames.size * area + n_lanes * N_SCALARS, np.int16)
+    area, n_lanes, n_scalars = side * side, LANES * ((n + LANES - 1) // LANES), N_SCALARS + N_FIT
+    pixels = np.zeros(frames.size * area + n_lanes * n_scalars, np.int16)
     base, scalar_base = np.zeros(n_lanes, np.int32), np.zeros(n_lanes, np.int32)
     frame, pose = np.zeros(n_lanes, np.int64), np.zeros(n_lanes, np.int64)
     for m in range(frames.size):
@@ -176,7 +182,7 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
             for c in range(side):
                 pixels[m * area + r * side + c] = heights[frames[m], r, c]
     for s in range(n_lanes):
-        scalar_base[s] = frames.size * area + s * N_SCALARS
+        scalar_base[s] = frames.size * area + s * n_scalars
         if s < n:
             base[s], frame[s], pose[s] = (s // n_poses) * area, frames[s // n_poses], s % n_poses
     inverse = np.full(n_lanes, 1.0 / size, np.float32)
@@ -221,8 +227,9 @@ def _solve_joint(joint, j, chain, regressors, tuning, lanes, n, side, looks, mom
         if joint > 0:
             i, k = lanes.frame[s], lanes.pose[s]
             place_joint(joint, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k], positions[i, k])
-    for c in range(tuning.rounds):
-        forest = j * tuning.rounds + c
+    first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
+    for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
+        forest = first + c
         _see(lanes, n, joint, looks, moments, size, tuning.reach, rotations, positions, scales)
         _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
         for s in range(n):
@@ -237,7 +244,9 @@ def _solve_joint(joint, j, chain, regressors, tuning, lanes, n, side, looks, mom
 
 
 @njit(cache=True)
-def _estimate_block(heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, starts, poses):
+def _estimate_block(
+    heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, body, starts, poses
+):  # fmt: skip
     """Candidates of a few frames: `starts` (rotations, positions, scales) of their bases in, `poses` and scores out."""
     start_rotations, start_positions, start_scales = starts
     rotations, positions, scales, scores = poses
@@ -273,14 +282,14 @@ def _estimate_block(heights, looks, moments, frames, size, chain, regressors, pr
         i, k = lanes.frame[s], lanes.pose[s]
         place_rest(chain.solved, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k],
                    positions[i, k])  # fmt: skip
-    _see_all(lanes, n, looks, moments, size, tuning.reach, rotations, positions, scales)
+    _see_all(lanes, n, heights, looks, moments, size, tuning.reach, body, rotations, positions, scales)
     _predict(metric, first, lanes, n, n_joints, side, 0.0, values)
     for s in range(n):
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 
 
 @njit(cache=True, parallel=True)
-def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner, metric, tuning, starts, poses):
+def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner, metric, tuning, body, starts, poses):
     """Algorithm 1 for the frames `seen`, in which an animal was found.
 
     starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it moves; poses: rotations
@@ -289,4 +298,5 @@ def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner,
     n_blocks = (seen.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):
         frames = seen[b * FRAMES : (b + 1) * FRAMES]
-        _estimate_block(heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, starts, poses)
+        _estimate_block(heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, body, starts,
+                        poses)  # fmt: skip

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.balls import Balls
 from liex_lab.body.kinematics import aim
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.estimation import _explain as explaining
 from liex_lab.estimation import _kernels as kernels
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
@@ -57,11 +60,12 @@ class ImageSet:
 
 @dataclass(frozen=True)
 class Cascade:
-    """A skeleton, a method, and one forest per solved joint and round, in order."""
+    """A skeleton, a method, and one forest per solved joint and round, in order; proposals say where to start."""
 
     skeleton: Skeleton
     method: Method
     forests: list[list[Forest]]
+    proposals: Forest | None = None
 
     def n_values(self, joint: int) -> int:
         """Length of a joint's correction: base 6, or 7 with the scale; others one for each free axis."""
@@ -93,6 +97,23 @@ class Cascade:
         )  # fmt: skip
         inverse_size = (1.0 / candidates.size).astype(np.float32)
         return Samples(images.heights, candidates.image, inverse_size, views, scalars)
+
+    @cached_property
+    def balls(self) -> Balls:
+        """The body that candidates are held against the picture with."""
+        return Balls.of(self.skeleton)
+
+    def metric_samples(self, images: ImageSet, candidates: Candidates) -> Samples:
+        """What the learned metric sees of finished candidates: all joints, and how well they explain the picture."""
+        samples = self.samples(images, candidates, list(range(self.skeleton.n_joints)))
+        if not self.method.explains:
+            return samples
+        fit = np.empty((len(candidates), explaining.N_FIT), np.float32)
+        explaining.explain_all(
+            images.heights, images.looks, images.moments, candidates.image, candidates.rotations, candidates.positions,
+            candidates.scale, candidates.size, body_of(self.balls), fit,
+        )  # fmt: skip
+        return replace(samples, scalars=np.concatenate([samples.scalars, fit], axis=1))
 
     def apply(self, candidates: Candidates, joint: int, values: NDArray[np.float32]) -> None:
         """Move the candidates by a forest's prediction (n, n_values), Eq. 10."""
@@ -133,6 +154,11 @@ class Cascade:
         off = np.linalg.norm(true.translation - estimate.translation, axis=1) / candidates.size
         keep = (np.linalg.norm(turn, axis=1) < method.keep_bent) & (off < method.keep_off_mm)
         return turn * method.joint_lever_mm, keep
+
+
+def body_of(balls: Balls) -> explaining.Body:
+    """A body of balls as the kernels want it."""
+    return explaining.Body(balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius)
 
 
 @dataclass(frozen=True)

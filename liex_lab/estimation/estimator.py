@@ -14,16 +14,19 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _estimate as kernels
-from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation._explain import Body
+from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.correction import corrected
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
-from liex_lab.estimation.scoring import Chosen, choose, with_expected_error
+from liex_lab.estimation.proposals import N_WAYS, propose
+from liex_lab.estimation.refine import Refiner
+from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
 from liex_lab.estimation.settle import SURE_SHARE, Settler
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
-from liex_lab.recordings.foreground import Crops, Scene
+from liex_lab.recordings.crops import Crops, Foreground, view_of
 from liex_lab.threads import threads
 
 Array = NDArray[np.float64]
@@ -78,14 +81,27 @@ class PoseEstimator:
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.Tuning(
-            method.rounds, method.reaches(self.skeleton.n_joints),
+            method.rounds_of(0), method.rounds, method.reaches(self.skeleton.n_joints),
             np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
             min(keep or n_starts, n_starts),
         )  # fmt: skip
 
     @cached_property
+    def _body(self) -> Body:
+        """The body that candidates are held against the picture with."""
+        if not self.model.method.explains:
+            return Body(1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+        return body_of(self.model.cascade.balls)
+
+    @cached_property
+    def _refiner(self) -> Refiner:
+        return Refiner.of(self.skeleton, self.model.cascade.balls)
+
+    @cached_property
     def _starts(self) -> Array:
         k = self.n_candidates or self.model.method.n_candidates
+        if self.model.cascade.proposals is not None:
+            k = N_WAYS * self.model.cascade.proposals.n_trees
         return draw_starts(np.random.default_rng(_START_SEED), 1, k)
 
     def candidates(
@@ -99,8 +115,11 @@ class PoseEstimator:
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
             crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
-            method.camera_view,
+            method.camera_view, method.home_turn,
         )  # fmt: skip
+        if self.model.cascade.proposals is not None:
+            images = ImageSet(crops.heights, looks, crops.moments)
+            base_rotation, base_position = propose(self.model.cascade.proposals, images, sizes[:, 0], method)
         tuning = self._tuning(k)
         starts = np.ascontiguousarray(base_rotation[:, :, None]), base_position[:, :, None].copy(), scales
         rotations = np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3))
@@ -109,11 +128,11 @@ class PoseEstimator:
         with threads(parallel):
             kernels.estimate_all(
                 crops.heights, looks, crops.moments, np.flatnonzero(crops.found), size, self._chain, *self._packed,
-                tuning, starts, poses,
+                tuning, self._body, starts, poses,
             )  # fmt: skip
         return poses
 
-    def estimate(self, depths: NDArray[np.float32], scene: Scene, size: float, parallel: bool = True) -> Estimates:
+    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
         method = self.model.method
         size = size if method.session_size else 1.0
@@ -137,18 +156,22 @@ class PoseEstimator:
         picked = self.pick(images, size, rotations[usable], positions[usable], scores[usable], parallel)
         picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        T_camera_view = SE3(
-            np.broadcast_to(scene.view_rotation(method.camera_view), (len(looks), 3, 3)),
-            np.stack([np.zeros(len(looks)), np.zeros(len(looks)), crops.distance], axis=-1),
-        ).inverse()
-        return Estimates(replace(whole, pose=whole.pose.moved(T_camera_view)), usable, crops)
+        return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops)
 
     def pick(
         self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
     ) -> Chosen:
-        """One pose for each of n height maps out of its candidates, after the last correction, and settled."""
-        picked = choose(self.skeleton, self.model.method, self.model.calibration, size, rotations, positions, scores)
+        """One pose for each of n height maps out of its candidates, after the last correction, and settled.
+
+        Where the method takes poses into the picture, it is of the mean and the best ones the one that then fits best.
+        """
+        method = self.model.method
+        picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
         with threads(parallel):
+            if method.refine_steps and len(scores):
+                poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
+                pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
+                picked = replace(picked, pose=pose, fit=fit, told_scale=pose.scale)
             picked = corrected(picked, self.model, images, size)
             if self.model.settler is None or not len(scores):
                 return picked
@@ -156,7 +179,7 @@ class PoseEstimator:
         return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
 
     def _is_animal(
-        self, depths: NDArray[np.float32], scene: Scene, size: float, first: Array, second: Array
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array
     ) -> NDArray[np.bool_]:
         """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
 
@@ -168,7 +191,7 @@ class PoseEstimator:
             return likeness[1] < likeness[0]
         return second + likeness[1] < first + likeness[0]
 
-    def find_size(self, sample: NDArray[np.float32], scene: Scene) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm of the recording.
 
         The area seen from above gives the first guess; the model then measures the spine in every frame, the median of
@@ -228,5 +251,6 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
     return Chosen(
         pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
         rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+        rows(picked.fit, picked.fit.shape[1]),
         rows(picked.told_scale), rows(picked.told_trust),
     )  # fmt: skip

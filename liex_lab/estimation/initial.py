@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import REFERENCE_MM
+from liex_lab.geometry import so3
 
 Array = NDArray[np.float64]
 
@@ -26,7 +27,7 @@ def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> A
 
 def start_poses(
     moments: Array, starts: Array, size: Array, home_length: float, base_at_front: bool, axis_start: bool,
-    camera_view: bool = False,
+    camera_view: bool = False, home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n animals.
 
@@ -34,7 +35,8 @@ def start_poses(
     axis_start: along the animal's long axis, every other start the other way round, the more spread out the rounder
     the animal looks (METHOD lesson 8). Otherwise the paper's start: any heading in (-pi, pi), the base at the centroid
     and at the animal's mean height, bones scaled by 0.9 to 1.1. camera_view: heights are not those above a floor, and
-    such an animal, started along its axis, rises or sinks as its back does.
+    such an animal, started along its axis, rises or sinks as its back does. home_turn: rotation vector by which the
+    home pose lies otherwise than seen from above, as a palm that is shown.
     """
     n, k = size.shape
     starts = np.broadcast_to(starts, (n, k, 4))
@@ -66,6 +68,8 @@ def start_poses(
         rotation = rotation @ _lifted(rise)
         # the base lies ahead of or behind the middle of the animal
         position[..., 2] -= behind * np.sin(rise)
+    if any(home_turn):
+        rotation = rotation @ so3.exp(np.array(home_turn))
     return rotation, position, scale
 
 

@@ -50,6 +50,17 @@ class Method:
     settle: bool = False  # the chosen pose of an animal that is one chain settles under its back, see `settle`
     base_reach_mm: float = 0.0  # offsets reach this far from the base joint; 0: as far as from the others
     corrector: GrowthPlan | None = None  # of the last correction, of the chosen pose; None: it stays as chosen
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotation vector by which starts are turned out of the home pose
+    proposals: GrowthPlan | None = None  # trees that say where a start may be, for an animal of any orientation
+    proposal_reach_mm: float = 0.0  # offsets of their features reach this far from the animal's centre
+    base_rounds: int = 0  # rounds of the base joint where they are not as many as the others'; 0: as many
+    refine_steps: int = 0  # of taking a pose into the picture
+    refined: int = 0  # candidates that are taken there beside the mean of the best; the one that fits is chosen
+    explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
+
+    def rounds_of(self, joint: int) -> int:
+        """Rounds of a joint."""
+        return self.base_rounds or self.rounds if joint == 0 else self.rounds
 
     def reaches(self, n_joints: int) -> NDArray[np.float64]:
         """How far (J,) mm offsets reach from each joint."""
@@ -67,13 +78,17 @@ class Method:
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
-        for name in ("pruner", "corrector"):
+        plain["home_turn"] = tuple(plain.get("home_turn", _UNSET["home_turn"]))
+        for name in ("pruner", "corrector", "proposals"):
             if plain.get(name):
                 plain[name] = GrowthPlan(**plain[name])
         return Method(**plain)
 
 
-_UNSET: dict[str, Any] = {"settle": False}
+_UNSET: dict[str, Any] = {
+    "home_turn": (0.0, 0.0, 0.0), "proposals": None, "proposal_reach_mm": 0.0, "base_rounds": 0, "refine_steps": 0,
+    "refined": 0, "explains": False, "settle": False,
+}  # fmt: skip
 _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
@@ -99,6 +114,19 @@ METHODS = {
 }  # fmt: skip
 
 
+# a hand may turn any side to the camera, and its fingers' bones are short beside their distance from the base
+_HAND: dict[str, Any] = {
+    "camera_view": False, "rounds": 3, "base_rounds": 6, "n_candidates": 24, "training_candidates": 6,
+    "regressors": GrowthPlan(10, 16, 12, 60, 0.3, 0.15, 0.4, 0.63),
+    "metric": GrowthPlan(60, 9, 40, 100, 0.35, 0.3, 0.4, 0.5),
+    "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63), "proposal_reach_mm": 100.0,
+    "explains": True, "refine_steps": 4, "refined": 4, "corrector": None,
+    "reach_mm": 60.0, "base_lever_mm": 65.0, "joint_lever_mm": 40.0, "scale_lever_mm": 60.0, "keep_turned": 1.3,
+    "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0,
+    "survivors": 8, "pruner": GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
+}  # fmt: skip
+
+
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("fish", "default"): {
@@ -110,8 +138,10 @@ _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("fish", "paper"): {
         "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
     },
+    ("hand", "default"): _HAND,
     ("hand", "paper"): {
         "n_candidates": 20, "reach_mm": 50.0, "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        "home_turn": (3.1416, 0.0, 0.0),  # the palm is shown
     },
 }  # fmt: skip
 _LENGTHS = (

@@ -21,7 +21,8 @@ from liex_lab.estimation.method import Method
 from liex_lab.forests.forest import Forest
 
 SCHEMA = 2
-_FORESTS = ("metric", "expectation", "pruner", "corrector")  # that follow the regressors, as far as a model has them
+# that follow the regressors, as far as a model has them
+_FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
 _DAMAGE = (
     OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
     lzma.LZMAError,
@@ -78,6 +79,11 @@ class Model:
         """The variant of the method."""
         return self.cascade.method
 
+    @property
+    def proposals(self) -> Forest | None:
+        """What says where starts may be."""
+        return self.cascade.proposals
+
     def to_bytes(self) -> bytes:
         """The model file's content; equal models give equal bytes."""
         extra = [name for name in _FORESTS if getattr(self, name) is not None]
@@ -129,16 +135,18 @@ class Model:
         except _DAMAGE as error:
             raise ModelError(f"{path} is not a whole model file ({error}); train it again or copy it anew") from None
         skeleton = Skeleton.from_table(table, str(path))
-        n = method.rounds
-        n_regressors = n * len(skeleton.solved)
+        rounds = [method.rounds_of(joint) for joint in skeleton.solved]
+        n_regressors = sum(rounds)
         extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
             raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
-        cascade = Cascade(skeleton, method, [forests[k * n : (k + 1) * n] for k in range(len(skeleton.solved))])
         named = dict(zip(extra, forests[n_regressors:], strict=True))
+        stops = np.cumsum(rounds).tolist()
+        each = [forests[stop - n : stop] for n, stop in zip(rounds, stops, strict=True)]
         metric, *others = (named.get(name) for name in _FORESTS)
         assert metric is not None
-        expectation, pruner, corrector = others
+        expectation, pruner, corrector, proposals = others
+        cascade = Cascade(skeleton, method, each, proposals)
         return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector, settler)
 
     def digest(self) -> str:

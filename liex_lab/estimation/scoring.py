@@ -30,8 +30,9 @@ class Chosen:
     pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n, J) of each joint;
     error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home size behind it; doubts (n, 4) mm at
     home size: best score, the best score of a candidate that points the other way, the spread of the good scores, and
-    how far the candidates of all scores lie from the chosen pose; told_scale (n,): the animal's size over home size as
-    this frame alone tells it, and told_trust (n,), the higher the better.
+    how far the candidates of all scores lie from the chosen pose; fit (n, F): how well the pose explains the picture,
+    where that is asked, see `_explain`; told_scale (n,): the animal's size over home size as this frame alone tells it,
+    and told_trust (n,), the higher the better.
     """
 
     pose: Pose
@@ -42,6 +43,7 @@ class Chosen:
     score: Array
     spread: Array
     doubts: Array
+    fit: Array
     told_scale: Array
     told_trust: Array
 
@@ -54,8 +56,8 @@ def choose(
 
     rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k` candidates with the
     lowest predicted error that lie near the best one are averaged with weights exp(-(score - best) / tau) (METHOD
-    lesson 3); each bone then turns by the smallest rotation onto its mean direction and the scale follows from the
-    total length.
+    lesson 3). In a chain each bone then turns by the smallest rotation onto its mean direction, and the scale follows
+    from the total length; a tree is averaged joint by joint, see `mean_pose`.
     """
     order = np.argsort(scores, axis=1, kind="stable")[:, : method.top_k]
     score = np.take_along_axis(scores, order, axis=1)
@@ -65,8 +67,11 @@ def choose(
     weight = np.where(near, np.exp(-(score - score[:, :1]) / method.top_tau), 0.0)
     weight = weight / weight.sum(axis=1, keepdims=True)
     mean = np.einsum("nk,nkjd->njd", weight, joints)
-    up = np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2])
-    pose = Pose.from_joints(skeleton, mean, up)
+    if skeleton.is_chain:
+        pose = Pose.from_joints(skeleton, mean, np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2]))
+    else:
+        pose = mean_pose(skeleton, turned, joints, weight)
+        mean = pose.joints(skeleton)
     off = np.linalg.norm(joints - mean[:, None], axis=-1)
     variance = np.einsum("nk,nkj->nj", weight, off**2)
     mean_score = np.sum(weight * score, axis=1)
@@ -77,8 +82,44 @@ def choose(
     sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
-    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, pose.scale,
-                  -mean_score)  # fmt: skip
+    fit = np.zeros((len(score), 0))
+    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, fit, pose.scale, -mean_score)
+
+
+def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
+    """The weighted mean of poses of a tree, on the group: n means over k poses each.
+
+    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the chordal mean rotation
+    and the mean place; every other joint the mean of its turns relative to its parent about the axes that are free, so
+    bones keep their lengths and hinges their axes; the scale is the mean scale.
+    """
+    root = SE3(
+        so3.nearest_rotation(np.einsum("nk,nkab->nab", weight, turned[:, :, 0])),
+        np.einsum("nk,nkd->nd", weight, joints[:, :, 0]),
+    )
+    moving = np.array(skeleton.solved[1:])
+    parents = skeleton.parents[moving]
+    local = np.swapaxes(turned[:, :, parents] @ skeleton.rest[moving], -1, -2) @ turned[:, :, moving]
+    angles = np.zeros((len(turned), skeleton.n_joints, 3))
+    angles[:, moving] = np.einsum("nk,nkjd->njd", weight, so3.log(local)) * skeleton.axes[moving]
+    bones = np.linalg.norm(joints[:, :, 1:] - joints[:, :, skeleton.parents[1:]], axis=-1).sum(axis=2)
+    scale = np.einsum("nk,nk->n", weight, bones) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
+    return Pose(root, angles, scale)
+
+
+def with_best(skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array) -> Pose:
+    """Poses (n, 1 + k): the given ones (n), and the k candidates with the lowest scores (n, K) of each frame."""
+    order = np.argsort(scores, axis=1, kind="stable")[:, :k]
+    n, k, j = *order.shape, skeleton.n_joints
+    turned = np.take_along_axis(rotations, order[..., None, None, None], axis=1).reshape(n * k, 1, j, 3, 3)
+    joints = np.take_along_axis(positions, order[..., None, None], axis=1).reshape(n * k, 1, j, 3)
+    best = mean_pose(skeleton, turned, joints, np.ones((n * k, 1)))
+
+    def beside(first: Array, others: Array) -> Array:
+        return np.concatenate([first[:, None], others.reshape(n, k, *first.shape[1:])], axis=1)
+
+    root = SE3(beside(pose.root.rotation, best.root.rotation), beside(pose.root.translation, best.root.translation))
+    return Pose(root, beside(pose.angles, best.angles), beside(pose.scale, best.scale))
 
 
 def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float) -> Array:
@@ -107,7 +148,7 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
     """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
 
     Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high
-    the animal looks; how many millimetres a pixel covers.
+    the animal looks; how many millimetres a pixel covers; how well the pose explains the picture.
     """
     pose = chosen.pose
     unit, whole = skeleton.relative_size, size * skeleton.relative_size
@@ -118,7 +159,7 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
             10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
             5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
             moments[:, 6] / whole, moments[:, 7] / whole, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
-            *chosen.sd_root.T[3:] / whole, 10 * chosen.sd_angles.sum(axis=(1, 2)),
+            *chosen.sd_root.T[3:] / whole, 10 * chosen.sd_angles.sum(axis=(1, 2)), *chosen.fit.T / 50,
         ],
         axis=1,
     )  # fmt: skip

@@ -12,6 +12,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.cascade import Candidates, Cascade, ImageSet, Truth
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.method import Method
+from liex_lab.estimation.proposals import N_WAYS, propose, train_proposals
 from liex_lab.forests.forest import Forest, predict
 from liex_lab.forests.grow import boost_forest, grow_forest
 from liex_lab.geometry import SE3, so3
@@ -56,8 +57,34 @@ def base_at_front(skeleton: Skeleton) -> bool:
     return bool(skeleton.offsets[skeleton.next_joint[0], 0] < 0)
 
 
-def start_candidates(data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator) -> Candidates:
-    """K starts for every training image, each with its own guess of the animal's size."""
+@dataclass(frozen=True)
+class Proposals:
+    """A forest that says where a start may be, and which images each of its trees saw (T, m)."""
+
+    forest: Forest
+    in_bag: NDArray[np.bool_]
+
+    @staticmethod
+    def train(data: TrainingSet, method: Method, rng: np.random.Generator) -> Proposals:
+        """Learned from the bases of the images that show the animal."""
+        truth = data.truth
+        return Proposals(*train_proposals(data.images, truth.rotations[:, 0], truth.positions[:, 0], data.size,
+                                          data.animal, method, rng))  # fmt: skip
+
+    def draw(self, rng: np.random.Generator, m: int, k: int) -> NDArray[np.int64]:
+        """K different candidates (m, k) for every image, of trees that have not seen it as far as these go."""
+        order = rng.random((m, N_WAYS * self.forest.n_trees))
+        order += np.repeat(self.in_bag, N_WAYS, axis=0).T
+        return np.argsort(order, axis=1)[:, :k]
+
+
+def start_candidates(
+    data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator, seen: Proposals | None = None
+) -> Candidates:
+    """K starts for every training image, each with its own guess of the animal's size.
+
+    seen: proposals, where the method starts from them; each start is what a tree says that has not seen the image.
+    """
     m, k = len(data.size), method.training_candidates
     starts = draw_starts(rng, m, k)
     if method.session_size:
@@ -66,8 +93,13 @@ def start_candidates(data: TrainingSet, skeleton: Skeleton, method: Method, rng:
         size = np.ones((m, k))
     rotation, position, scale = start_poses(
         data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start,
-        method.camera_view,
+        method.camera_view, method.home_turn,
     )  # fmt: skip
+    if seen is not None:
+        bases, places = propose(seen.forest, data.images, data.size, method)
+        chosen = seen.draw(rng, m, k)
+        rotation = np.take_along_axis(bases, chosen[..., None, None], axis=1)
+        position = np.take_along_axis(places, chosen[..., None], axis=1)
     image = np.repeat(np.arange(m, dtype=np.int32), k)
     return Candidates.start(
         skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), size.ravel()
@@ -78,15 +110,17 @@ def train_cascade(
     data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator, tell: Tell
 ) -> tuple[Cascade, Candidates]:
     """Algorithm 2: every forest is trained on the state its predecessors left. Also returns that final state."""
-    cascade = Cascade(skeleton, method, [])
-    candidates = start_candidates(data, skeleton, method, rng)
-    n_steps = len(skeleton.solved) * method.rounds
+    seen = Proposals.train(data, method, rng) if method.proposals is not None else None
+    cascade = Cascade(skeleton, method, [], seen.forest if seen is not None else None)
+    candidates = start_candidates(data, skeleton, method, rng, seen)
+    n_steps = sum(method.rounds_of(joint) for joint in skeleton.solved)
+    n_done = 0
     for joint in skeleton.solved:
         if joint:
             cascade.place(candidates, joint)
         rounds: list[Forest] = []
-        for c in range(method.rounds):
-            tell((len(cascade.forests) * method.rounds + c) / n_steps, f"{skeleton.names[joint]}, round {c + 1}")
+        for c in range(method.rounds_of(joint)):
+            tell((n_done + c) / n_steps, f"{skeleton.names[joint]}, round {c + 1}")
             labels, keep = cascade.labels(candidates, joint, data.truth)
             samples = cascade.samples(data.images, candidates, [joint])
             keep &= data.animal[candidates.image]
@@ -96,6 +130,7 @@ def train_cascade(
             cascade.apply(candidates, joint, predict(forest, samples, in_bag if method.out_of_bag else None))
             rounds.append(forest)
         cascade.forests.append(rounds)
+        n_done += len(rounds)
     cascade.place_ends(candidates)
     return cascade, candidates
 
@@ -141,7 +176,7 @@ def train_metric(data: TrainingSet, cascade: Cascade, candidates: Candidates, rn
     if not cascade.method.metric_on_own:
         candidates = perturbed_truth(data, cascade, rng)
     error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
-    samples = cascade.samples(data.images, candidates, list(range(cascade.skeleton.n_joints)))
+    samples = cascade.metric_samples(data.images, candidates)
     labels, method = error[:, None].astype(np.float32), cascade.method
     if method.metric_shrinkage > 0:
         return quantised(boost_forest(samples, labels, method.metric, method.metric_shrinkage, rng))

@@ -93,6 +93,24 @@ def predict(forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None =
     return out
 
 
+def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
+    """Every tree's own leaf value (n, T, D) of each sample."""
+    out = np.empty((len(samples), forest.n_trees, forest.leaves.shape[1]), np.float32)
+    _predict_each(
+        forest.nodes, forest.roots, forest.leaves, samples.heights, samples.image, samples.inverse_size, samples.views,
+        samples.scalars, out,
+    )  # fmt: skip
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _predict_each(nodes, roots, leaves, heights, image, inverse_size, views, scalars, out):
+    for s in prange(image.size):
+        for t in range(roots.size):
+            leaf = descend(nodes, roots[t], heights[image[s]], inverse_size[s], views[s], scalars[s])
+            out[s, t] = leaves[leaf]
+
+
 @njit(cache=True, parallel=True)
 def _predict(nodes, roots, leaves, heights, image, inverse_size, views, scalars, in_bag, out):
     n_trees, n_values = roots.size, leaves.shape[1]

@@ -96,7 +96,7 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
                 continue
             if n_blobs == MAX_BLOBS:
                 slot = int(np.argmin(blobs[:, 0]))
-                _forget(labels, slot)
+                forget(labels, slot)
             else:
                 slot = n_blobs
                 n_blobs += 1
@@ -105,7 +105,7 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
 
 
 @njit(cache=True)
-def _forget(labels, slot):
+def forget(labels, slot):
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if labels[i, j] == slot:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.camera import Camera
+from liex_lab.geometry import SE3
 from liex_lab.recordings import _crops as kernels
 from liex_lab.recordings._segment import N_MOMENTS
 from liex_lab.recordings.arena import Floor
@@ -53,6 +55,55 @@ class Crops:
         """(n,) True where an animal is in view."""
         return self.n_px > 0
 
+    @property
+    def centroid(self) -> Array:
+        """The middle (n, 3) mm of the animal's mass, at its mean height, in the view frame."""
+        moments = self.moments
+        return np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
+
+
+class Foreground(Protocol):
+    """What finds the animal in the pictures of one camera: `foreground.Scene`, or `nearest.NearestScene`."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that looks."""
+
+    @property
+    def floor(self) -> Floor:
+        """Where heights of a recording's results are measured from."""
+
+    @property
+    def area_mm2(self) -> float:
+        """The animal's usual area seen by the camera."""
+
+    def extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0
+    ) -> Crops:
+        """The animal of each frame (n, H, W) mm, or (rank 1) what may be it as well."""
+
+    def looks(self, crops: Crops, camera_view: bool = False) -> Array:
+        """How each height map was cut (n, 17)."""
+
+    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+
+    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+
+    def misfit(self, crops: Crops) -> Array:
+        """How unlike the animal each crop (n) is."""
+
+    def every(self, step: int) -> Foreground:
+        """The same with every `step`-th pixel along rows and columns."""
+
+
+def view_of(looks: Array) -> SE3:
+    """T_view_camera (n) of looks (n, 17)."""
+    translation = np.zeros((len(looks), 3))
+    translation[:, 2] = looks[:, 13]
+    return SE3(looks[:, 4:13].reshape(-1, 3, 3), translation)
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -76,7 +127,11 @@ class Windows:
         return Floor.from_inverse_depth(self.inverse_depth[k], Camera(fx, fy, cx, cy, 1, 1))
 
     def extract(
-        self, size: Array, area_mm2: Array, min_height_mm: Array | float = 7.0, camera_view: bool = False,
+        self,
+        size: Array,
+        area_mm2: Array,
+        min_height_mm: Array | float = 7.0,
+        camera_view: bool = False,
         rank: int = 0,
     ) -> tuple[Crops, Array]:
         """The blobs of each window whose areas are nearest to area_mm2 (n,), by rank, and their looks (n, 17); see

@@ -175,6 +175,15 @@ class Scene:
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
 
+    def every(self, step: int) -> Scene:
+        """The same with every `step`-th pixel along rows and columns."""
+        camera, cut = self.camera.every(step), (slice(None, None, step), slice(None, None, step))
+        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
+        return replace(
+            self, camera=camera, floor=floor, background=np.ascontiguousarray(self.background[cut]),
+            limit=np.ascontiguousarray(self.limit[cut]), on_floor=np.ascontiguousarray(self.on_floor[cut]),
+        )  # fmt: skip
+
     def misfit(self, crops: Crops) -> Array:
         """How unlike the animal each crop (n) is in area and volume: the square of a number of standard deviations."""
         area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)
@@ -193,6 +202,14 @@ class Scene:
         level = np.zeros((len(crops.step), 3))
         level[:, 2] = 1.0 / crops.distance
         return level
+
+    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+        middle = crops.centroid
+        if camera_view:  # the view's frame is not the arena's
+            middle[:, 2] -= crops.distance
+            middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
+        return middle
 
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
+from liex_lab.recordings.nyu import JOINT_FILE, read_nyu_joints
 
 Array = NDArray[np.float64]
 
@@ -39,6 +41,7 @@ POINTS: dict[str, dict[str, float]] = {
     "wrist_b": {"wrist_left": 1.0},
     "palm": {"palm": 1.0},
 }
+NYU_IDS = (0, 3, 6, 9, 12, 15, 18, 21, 24, 25, 27, 30, 31, 32)  # of the data set's 36 points, from 0
 _LITTLE_WRIST, _THUMB_WRIST = 11, 12
 _START_BEND = 0.3  # rad: a straight finger does not know which way to bend
 
@@ -67,16 +70,22 @@ class NyuReference:
 
     @staticmethod
     def load(folder: str | Path) -> NyuReference:
-        """From the folder that holds nyu_test_14joints.npz. Raises LiexError."""
+        """From the folder that holds nyu_test_14joints.npz, or else the data set's own joint_data.mat, which holds no
+        answers. Raises LiexError.
+        """
         path = Path(folder) / REFERENCE_FILE
+        if not path.is_file() and (Path(folder) / JOINT_FILE).is_file():
+            return NyuReference(uvd_to_mm(read_nyu_joints(Path(folder)).uvd[:, NYU_IDS]), {})
         if not path.is_file():
-            raise LiexError(f"the NYU reference should be a folder with {REFERENCE_FILE}, but there is no {path}")
+            raise LiexError(
+                f"the NYU reference should be a folder with {REFERENCE_FILE} or {JOINT_FILE}, but {folder} has neither"
+            )
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as table:
                 truth = uvd_to_mm(table["groundtruth_uvd"])
                 found = {name.removesuffix("_uvd"): uvd_to_mm(table[name]) for name in table.files if "_uvd" in name}
                 names = [str(name) for name in table["joint_names"]]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise LiexError(f"{path} is not a whole file of NYU labels ({error}); copy it anew") from None
         if names != list(POINTS) or truth.shape[1:] != (len(POINTS), 3):
             raise LiexError(f"{path} should label {', '.join(POINTS)}, in this order, but labels {', '.join(names)}")

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 STATISTICS = Path(__file__).with_name("hand_postures.toml")
 _N_POSTURES, _N_TURNS, _N_AXES = 8, 8, 6
 _FREE_SHARE = 0.45  # of the training postures are what a hand can do, not what was seen
+_FAN_DEG = {"index": 10.0, "middle": 1.0, "ring": -8.0, "little": -19.0}  # how fingers part when a hand is spread
 _BLEND_SHARE = 0.3  # of the seen ones lie between two
 
 
@@ -95,11 +96,12 @@ def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     alike, together = rng.random((n, 1)) < 0.35, rng.random((n, 1))
     each = np.clip(rng.beta(0.5, 0.5, (n, 4)), 0.0, 1.0)
     bent = np.clip(np.where(alike, together, each) + rng.normal(0.0, 0.05, (n, 4)), 0.0, 1.0)
-    for f, finger in enumerate(("index", "middle", "ring", "little")):
+    spread = rng.uniform(-0.6, 1.6, n)  # fingers closed up, or fanned out
+    for f, (finger, fan) in enumerate(_FAN_DEG.items()):
         root, middle, end = (skeleton.names.index(f"{finger}_{part}") for part in ("root", "middle", "end"))
         curl = bent[:, f]
         angles[:, root, 1] = np.radians(-8.0 + 80.0 * curl * rng.uniform(0.2, 1.1, n) + rng.normal(0.0, 8.0, n))
-        angles[:, root, 2] = np.radians(rng.normal(0.0, 9.0, n)) * (1.0 - 0.7 * curl)
+        angles[:, root, 2] = np.radians(fan * spread + rng.normal(0.0, 7.0, n)) * (1.0 - 0.7 * curl)
         angles[:, middle, 1] = np.radians(100.0 * curl + rng.normal(0.0, 8.0, n))
         angles[:, end, 1] = angles[:, middle, 1] * rng.uniform(0.4, 0.8, n) + np.radians(rng.normal(0.0, 6.0, n))
     root, middle, end = (skeleton.names.index(f"thumb_{part}") for part in ("root", "middle", "end"))

@@ -67,6 +67,11 @@ def open_nyu(
     return Folder(path, files, told, stack, told.decode).recording("nyu", camera, fps)
 
 
+def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
+    """The numbers, from 1, of the pictures that `open_nyu` reads, in its order."""
+    return [int(path.stem.split("_")[2]) for path in _pictures(folder, view)]
+
+
 def _pictures(folder: Path, view: int) -> list[Path]:
     named = {path: _NAME.fullmatch(path.name) for path in folder.iterdir()}
     files = [path for path, match in named.items() if match and int(match[1]) == view]

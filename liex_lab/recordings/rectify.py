@@ -46,6 +46,17 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
     return seen
 
 
+def mirrored(recording: Recording) -> Recording:
+    """The recording with left and right exchanged in every picture.
+
+    Drivers of some cameras deliver mirrored pictures; and a left hand in the mirror is a right one.
+    """
+    camera = recording.camera
+    turned = replace(camera, cx=camera.width - 1.0 - camera.cx)
+    optics = {**recording.optics, "mirrored": True}
+    return recording.seen_by(turned, lambda depth: np.ascontiguousarray(depth[:, ::-1]), optics)
+
+
 def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
     """The ideal pinhole to which pictures of this camera are carried."""
     straight = straight_camera(camera)

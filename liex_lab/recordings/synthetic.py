@@ -58,12 +58,29 @@ class Cast:
     seeds: NDArray[np.uint64]
 
 
-class SyntheticSession(Recording):
+class TrueRecording(Recording):
     """A virtual recording and its truth.
 
     spine_mm: the animal's size over the session; pose (n): root T_camera_root, angles, scale; joints_camera (n, J, 3)
-    and joints_arena (n, J, 3) mm; T_arena_camera: exact; floor: the exact plane; shape: the animal.
+    and joints_arena (n, J, 3) mm; T_arena_camera: exact; floor: the exact plane, or what stands for it.
     """
+
+    skeleton: Skeleton
+    surface: Surface
+    spine_mm: float
+    pose: Pose
+    joints_camera: Array
+    joints_arena: Array
+    T_arena_camera: SE3
+    floor: Floor
+
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        raise NotImplementedError
+
+
+class SyntheticSession(TrueRecording):
+    """A virtual animal in a virtual arena; shape: its body."""
 
     def __init__(self, name: str, stage: Stage, cast: Cast, times_ns: NDArray[np.int64] | None = None) -> None:
         n = len(cast.seeds)

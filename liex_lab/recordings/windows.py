@@ -41,7 +41,8 @@ class TrainingWindows:
     T_arena_camera (n), exact. root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones;
     joints_mm (n, J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
     whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture. spread_mm
-    (n,): standard deviation of the floor's readings, where it matters.
+    (n,): standard deviation of the floor's readings, where it matters. own_bones: `joints_mm` are those of each
+    body's own proportions, from which the skeleton's differ.
     """
 
     depth: NDArray[np.uint16]
@@ -61,6 +62,7 @@ class TrainingWindows:
     kind: NDArray[np.int64]
     unit_mm: float = 1.0
     spread_mm: Array | float = 0.0
+    own_bones: bool = False
 
     def __len__(self) -> int:
         return len(self.depth)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +11,8 @@ from liex_lab.recordings import generic, swimming, synthetic, walking, windows
 from liex_lab.recordings.fish import FishHabits
 from liex_lab.recordings.generic import GenericHabits
 from liex_lab.recordings.habits import Habits, MouseHabits
-from liex_lab.recordings.synthetic import SyntheticSession
+from liex_lab.recordings.hand_world import HandWorld, find_reference
+from liex_lab.recordings.synthetic import SyntheticSession, TrueRecording
 from liex_lab.recordings.windows import TrainingWindows
 
 
@@ -25,6 +26,14 @@ class World(Protocol):
     @property
     def splits(self) -> tuple[str, ...]:
         """The names of the test splits."""
+
+    @property
+    def protocol(self) -> str:
+        """What to say of the test splits beside figures measured on them."""
+
+    @property
+    def sources(self) -> str:
+        """What the training images were made from, for a model's card."""
 
     def training_blocks(
         self,
@@ -42,10 +51,10 @@ class World(Protocol):
     ) -> Iterator[TrainingWindows]:
         """Blocks of training images from block `first` on; see `windows.training_blocks`."""
 
-    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> Sequence[TrueRecording]:
         """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing it."""
 
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
         """A recording in which one animal moves; settings as in `walking.walking_session`."""
 
 
@@ -60,6 +69,19 @@ class RenderedWorld:
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
         return self.habits.skeleton
+
+    @property
+    def protocol(self) -> str:
+        """What to say of the test splits beside figures measured on them."""
+        return (
+            "each with its own camera, arena, animal; the background, the floor, the blob and the animal's size are "
+            "found by the product, nothing is handed over. "
+        )
+
+    @property
+    def sources(self) -> str:
+        """What the training images were made from."""
+        return "rendered from a seed; no recording of an animal was used"
 
     def training_blocks(self, seed: int, n_blocks: int, **settings: Any) -> Iterator[TrainingWindows]:
         """Blocks of training images."""
@@ -111,4 +133,6 @@ def world_of(skeleton: Skeleton) -> World:
         return MouseWorld(MouseHabits(skeleton))
     if skeleton.name == "fish":
         return FishWorld(FishHabits(skeleton))
+    if skeleton.name == "hand":
+        return HandWorld(skeleton, find_reference())
     return GenericWorld(GenericHabits(skeleton))

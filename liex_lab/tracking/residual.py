@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
-from liex_lab.recordings.foreground import CROP, Crops, Scene
+from liex_lab.recordings.crops import CROP, Crops, Foreground
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class BodyResidual:
     girth: float = 1.0
     camera_view: bool = False
 
-    def of(self, pose_arena: Pose, crops: Crops, scene: Scene) -> Array:
+    def of(self, pose_arena: Pose, crops: Crops, scene: Foreground) -> Array:
         """Median absolute difference (n,) mm between body and reading over the pixels that both cover; NaN without.
 
         pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth.
@@ -46,7 +46,7 @@ class BodyResidual:
 
     @staticmethod
     def fit(
-        surface: Surface, pose_arena: Pose, crops: Crops, scene: Scene, camera_view: bool = False
+        surface: Surface, pose_arena: Pose, crops: Crops, scene: Foreground, camera_view: bool = False
     ) -> BodyResidual:
         """The girth with which the default body explains these frames best."""
         bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
@@ -55,7 +55,7 @@ class BodyResidual:
 
 
 def render_crops(
-    surface: Surface, pose_arena: Pose, girth: float, crops: Crops, scene: Scene
+    surface: Surface, pose_arena: Pose, girth: float, crops: Crops, scene: Foreground
 ) -> NDArray[np.float32]:
     """The body's depth (n, CROP, CROP) mm on the pixels of the height maps, 0 where it is not."""
     camera = scene.camera

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.recordings.foreground import Scene
+from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Track
@@ -26,7 +26,7 @@ class FrameTracker:
     """
 
     estimator: PoseEstimator
-    scene: Scene
+    scene: Foreground
     size: float
     size_origin: str
     body: BodyResidual
@@ -35,7 +35,7 @@ class FrameTracker:
     @staticmethod
     def prepare(
         estimator: PoseEstimator,
-        scene: Scene,
+        scene: Foreground,
         sample: NDArray[np.float32],
         spine_mm: float | None = None,
         doubtful_mm: float | None = None,
@@ -81,14 +81,10 @@ class FrameTracker:
         track.sd_mm[:], track.sd_root[:], track.sd_angles_rad[:] = chosen.sd_mm, chosen.sd_root, chosen.sd_angles
         track.predicted_error_mm[:] = chosen.error_mm
         track.n_foreground_px[:] = estimates.crops.n_px
-        moments, camera_view = estimates.crops.moments[seen], self.estimator.model.method.camera_view
-        centre = np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
-        T_arena_camera = self.scene.floor.T_arena_camera
-        if camera_view:  # the view's frame is not the arena's
-            centre[:, 2] -= estimates.crops.distance[seen]
-            centre = T_arena_camera @ (centre @ self.scene.view_rotation(camera_view))
-        track.centroid_mm[seen] = centre
-        track.centroid_px[seen] = self.scene.camera.project(T_arena_camera.inverse() @ track.centroid_mm[seen])
+        camera_view = self.estimator.model.method.camera_view
+        track.centroid_mm[seen] = self.scene.middles(estimates.crops[seen], camera_view)
+        to_camera = self.scene.floor.T_arena_camera.inverse()
+        track.centroid_px[seen] = self.scene.camera.project(to_camera @ track.centroid_mm[seen])
         track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene)
         track.flag[seen] = np.where(chosen.error_mm[seen] > self.doubtful_mm, "doubtful", "")
         track.flag[~seen & ~(depths > 0).any(axis=(1, 2))] = "no_depth"

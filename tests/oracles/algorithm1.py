@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.balls import Balls
 from liex_lab.estimation.model import Model
 from liex_lab.forests.forest import Forest
 from tests.oracles import motion
+from tests.oracles.explain import explained
 from tests.oracles.forest import leaf_by_hand
 
 Array = NDArray[np.float64]
@@ -109,6 +111,23 @@ def start(model: Model, moments: Array, number: int, drawn: Array, size: float) 
     return Candidate([base] + [np.eye(4)] * (model.skeleton.n_joints - 1), scale)
 
 
+def seen_start(model: Model, picture: Picture, number: int, size: float) -> Candidate:
+    """Candidate `number` where the method starts from proposals: what one tree says, the axis taken one way."""
+    method, forest, (tree, way) = model.method, model.cascade.proposals, divmod(number, 2)
+    assert forest is not None
+    _, area, volume, x, y, axis, *_ = picture.moments
+    frame = motion.exp([0, 0, axis + np.pi * way, 0, 0, 0])
+    frame[:3, 3] = [x, y, volume / max(area, 1)]
+    told = np.append(picture.scalars(frame, size), np.float32(1000 - 2000 * way))
+    wide = Picture(picture.heights, picture.look, picture.moments, size, method.proposal_reach_mm)
+    vote = votes_of(forest, wide, wide.view(frame)[None], told)[tree]
+    u, _, vt = np.linalg.svd(vote[:9].reshape(3, 3))
+    base = np.eye(4)
+    base[:3, :3] = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    base[:3, 3] = size * vote[9:]
+    return Candidate([frame @ base] + [np.eye(4)] * (model.skeleton.n_joints - 1), size)
+
+
 def placed(model: Model, candidate: Candidate, joint: int) -> Array:
     """Where its parent carries a joint, at its home angle."""
     skeleton = model.skeleton
@@ -139,5 +158,10 @@ def solve(model: Model, picture: Picture, candidate: Candidate) -> Candidate:
             candidate.joints[joint] = placed(model, candidate, joint)
     views = np.stack([picture.view(joint) for joint in candidate.joints])
     scalars = picture.scalars(candidate.joints[0], candidate.scale)
+    if method.explains:
+        joints = np.array(candidate.joints)
+        fit = explained(picture.heights, picture.look, picture.moments[5], Balls.of(skeleton), joints[:, :3, :3],
+                        joints[:, :3, 3], candidate.scale, picture.size)  # fmt: skip
+        scalars = np.append(scalars, np.floor(np.clip(fit, -32768, 32767)).astype(np.float32))
     candidate.score = float(votes_of(model.metric, picture, views, scalars).mean())
     return candidate

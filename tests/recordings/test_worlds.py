@@ -58,6 +58,7 @@ def test_splits_are_drawn_of_the_animal_and_a_stated_size_is_taken(animal):
     assert first.skeleton.name == animal
     assert {first.spine_mm, second.spine_mm} == {1.2 * world.skeleton.length}
     assert len(first) == 50
+    assert isinstance(first, SyntheticSession)
     assert first.cast.shown.any()
     uv = first.camera.project(first.joints_camera)
     assert (uv > 0).all()

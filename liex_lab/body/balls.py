@@ -1,0 +1,89 @@
+"""A body as a heap of balls that move with its joints: coarse, but quickly held against a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.capsules import PARTS, Capsules
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+_SPACING = 1.3  # radii between the middles of two balls
+
+
+@dataclass(frozen=True)
+class Balls:
+    """B balls. Each lies between two points that two joints carry; lengths in mm at scale 1.
+
+    joints (B, 2); offsets (B, 2, 3) of the points in the joints' frames; share (B,) of the way from the first point to
+    the second; radius (B,). The first n_own balls are the body; the others lie where something may go on that is not
+    the body, as an arm behind a hand, and what is seen there says nothing about it.
+    """
+
+    joints: NDArray[np.int64]
+    offsets: Array
+    share: Array
+    radius: Array
+    n_own: int
+
+    @property
+    def unit_mm(self) -> float:
+        """A tenth of the usual radius at scale 1: by what distances from this body are measured."""
+        return float(self.radius[: self.n_own].mean()) / 10.0
+
+    @staticmethod
+    def of(skeleton: Skeleton) -> Balls:
+        """Balls along the capsules of a body, or along the chain of a tubular one."""
+        if "stations" in skeleton.surface:
+            ends, offsets, radii = _tube(skeleton)
+        else:
+            body = Capsules.of(skeleton)
+            ends, offsets, radii = body.joints, body.offsets, body.radii
+        rows = _along(skeleton, ends, offsets, radii)
+        n_own, more = len(rows), Capsules.listed(skeleton, PARTS[1])
+        rows += _along(skeleton, more.joints, more.offsets, more.radii)
+        return Balls(
+            np.array([row[:2] for row in rows], np.int64),
+            np.array([row[2:4] for row in rows], float),
+            np.array([row[4] for row in rows], float),
+            np.array([row[5] for row in rows], float),
+            n_own,
+        )
+
+
+def _along(skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array) -> list[tuple[Any, ...]]:
+    """Balls along capsules, so near to one another at home that they make a body: rows of the fields of `Balls`."""
+    home, rows = _home(skeleton), []
+    bones = {(p, j) for p, j in skeleton.edges}
+    for (a, b), (at_a, at_b), (first, last) in zip(ends, offsets, radii, strict=True):
+        length = float(np.linalg.norm(home[b] + at_b - home[a] - at_a))
+        is_bone = (int(a), int(b)) in bones and not np.any(at_a) and not np.any(at_b)  # another ends where it begins
+        n = max(1, round(length / (_SPACING * 0.5 * (first + last))))
+        rows += [(a, b, at_a, at_b, s, first + s * (last - first)) for s in np.arange(int(is_bone), n + 1) / n]
+    return rows
+
+
+def _tube(skeleton: Skeleton) -> tuple[NDArray[np.int64], Array, Array]:
+    """Ends, offsets and radii of capsules that fill a tubular body: as thick as it is where it is thinner."""
+    shape, stations = BodyShape.default(skeleton), np.array(skeleton.surface["stations"], float)
+    reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
+    thick = np.interp(reach / reach[-1], stations, np.minimum(shape.half_width, shape.half_height))
+    thick = np.maximum(thick, 0.05 * thick.max())
+    bones = np.array([[p, j] for p, j in skeleton.edges], np.int64)
+    return bones, np.zeros((len(bones), 2, 3)), thick[bones]
+
+
+def _home(skeleton: Skeleton) -> Array:
+    """Joint positions (J, 3) mm at home."""
+    turned, at = [np.eye(3)], [np.zeros(3)]
+    for j in range(1, skeleton.n_joints):
+        p = int(skeleton.parents[j])
+        at.append(at[p] + turned[p] @ skeleton.offsets[j])
+        turned.append(turned[p] @ skeleton.rest[j])
+    return np.array(at)

@@ -1,0 +1,135 @@
+"""Hands of many people: how long and thick their fingers are, how broad their palms, and the arm that carries them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.capsules import Capsules
+from liex_lab.body.kinematics import aim
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import FAMILIES
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError
+from liex_lab.geometry import so3
+
+Array = NDArray[np.float64]
+
+_FINGERS = ("thumb", "index", "middle", "ring", "little")
+ARM_MM = 260.0  # from the wrist to the elbow, at scale 1
+_ELBOW, _SHOULDER = 1, 2
+_MOST_AWAY = 0.0  # a forearm's direction points away from the camera by no more than this share
+N_ARM_CAPSULES = 4
+
+
+@dataclass(frozen=True)
+class HandShape:
+    """The hands of n people. Lengths in mm at scale 1.
+
+    offsets (n, J, 3): the joints as in `Skeleton.offsets`; flesh: capsules, a batch (n); arm (n, 4): radii at
+    wrist and elbow, how much wider than thick, and where on the forearm a sleeve begins (1: none), as a share.
+    """
+
+    offsets: Array
+    flesh: Capsules
+    arm: Array
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> HandShape:
+        """Some of the people."""
+        return HandShape(self.offsets[index], self.flesh[index], self.arm[index])
+
+    def joints(self, skeleton: Skeleton, pose: Pose) -> tuple[Array, Array]:
+        """Rotations (n, J, 3, 3) and positions (n, J, 3) mm of each person's own hand in a pose (n)."""
+        rotations = pose.frames(skeleton).rotation
+        positions = np.empty(self.offsets.shape)
+        positions[:, 0] = pose.root.translation
+        for j in range(1, skeleton.n_joints):
+            p = skeleton.parents[j]
+            step = np.einsum("nij,nj->ni", rotations[:, p], self.offsets[:, j])
+            positions[:, j] = positions[:, p] + pose.scale[:, None] * step
+        return rotations, positions
+
+
+def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> HandShape:
+    """Draw the hands of n people of a family.
+
+    'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds hands that no model is trained
+    on: short and plump ones, and long and slender ones.
+    """
+    if family not in FAMILIES:
+        raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
+    wide = {"train": 1.0, "augmented": 1.5, "other": 1.0}[family]
+
+    def draw(sd: float, *shape: int) -> Array:
+        return np.exp(wide * sd * np.clip(rng.standard_normal((n, *shape)), -2.0, 2.0))
+
+    lengths, girth, breadth = draw(0.03, 5), draw(0.09), draw(0.05)
+    if family == "other":
+        plump = rng.random(n) < 0.5
+        lengths *= np.where(plump, rng.uniform(0.82, 0.9, n), rng.uniform(1.1, 1.18, n))[:, None]
+        girth *= np.where(plump, rng.uniform(1.25, 1.4, n), rng.uniform(0.72, 0.8, n))
+        breadth *= np.where(plump, rng.uniform(1.08, 1.16, n), rng.uniform(0.84, 0.92, n))
+    offsets = np.broadcast_to(skeleton.offsets, (n, skeleton.n_joints, 3)).copy()
+    for j, name in enumerate(skeleton.names[1:], start=1):
+        finger = name.split("_")[0]
+        if skeleton.parents[j] == 0:
+            offsets[:, j] *= np.stack([draw(0.03), breadth, np.ones(n)], axis=1)
+        else:
+            offsets[:, j] *= (lengths[:, _FINGERS.index(finger)] * draw(0.02))[:, None]
+    flesh = Capsules.of(skeleton)
+    n_capsules = len(flesh.joints)
+    radii = flesh.radii * girth[:, None, None] * draw(0.05, n_capsules, 1)
+    bones = flesh.joints[: skeleton.n_joints - 1]
+    of_finger = np.concatenate([bones[:, 0] > 0, np.zeros(n_capsules - len(bones), bool)])
+    radii *= np.where(of_finger[None, :], draw(0.06)[:, None], 1.0)[..., None]
+    wrist = rng.uniform(22.0, 29.0, n) * np.sqrt(girth)
+    sleeve = np.where(rng.random(n) < 0.5, rng.uniform(0.0, 0.7, n), 1.0)
+    arm = np.stack([wrist, wrist * rng.uniform(1.15, 1.55, n), rng.uniform(1.1, 1.45, n), sleeve], axis=1)
+    ends = np.broadcast_to(flesh.offsets, (n, *flesh.offsets.shape)).copy()
+    return HandShape(offsets, Capsules(flesh.joints, ends, radii, np.zeros(n)), arm)
+
+
+def forearms(rng: np.random.Generator, rotations: Array, positions: Array, scale: Array) -> tuple[Array, Array]:
+    """Frames (n, 3, 3) of forearms, x from the elbow to the wrist, and elbows (n, 3) mm of hands in the camera frame.
+
+    rotations (n, J, 3, 3), positions (n, J, 3) mm; scale (n,). The wrist bends as wrists do, and further where the arm
+    would otherwise come from the camera's side: who holds out a hand stands behind it.
+    """
+    n = len(scale)
+    bend = np.zeros((n, 3))
+    bend[:, 1] = np.clip(np.radians(rng.normal(0.0, 22.0, n)), -1.0, 1.0)
+    bend[:, 2] = np.clip(np.radians(rng.normal(0.0, 12.0, n)), -0.4, 0.4)
+    bent = rotations[:, 0] @ so3.exp(bend)
+    forward = bent[:, :, 0].copy()
+    forward[:, 2] = np.minimum(forward[:, 2], _MOST_AWAY)
+    frame = so3.exp(aim(bent[:, :, 0], forward)) @ bent
+    return frame, positions[:, 1:3].mean(axis=1) - (scale * ARM_MM)[:, None] * frame[:, :, 0]
+
+
+def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm: Array) -> Array:
+    """Meshes (n, V, 3) mm of forearm, sleeve and upper arm; frame and elbow from `forearms`, shoulder (n, 3) mm,
+    scale (n,), arm (n, 4) as in `HandShape`.
+    """
+    n = len(scale)
+    wrist = elbow + (scale * ARM_MM)[:, None] * frame[:, :, 0]
+    joints = np.stack([wrist, elbow, shoulder], axis=1)
+    # two tubes beside one another make an arm that is wider than thick
+    side = 0.5 * arm[:, 0] * (arm[:, 2] - 1.0) * 2.0
+    offsets, radii = np.zeros((n, 4, 2, 3)), np.zeros((n, 4, 2))
+    for c, sign in enumerate((1.0, -1.0)):
+        offsets[:, c, :, 1] = sign * side[:, None]
+        offsets[:, c, 0, 0] = 12.0
+        radii[:, c] = arm[:, :2]
+    sleeve = arm[:, 3]
+    offsets[:, 2, 0, 0] = -np.minimum(sleeve, 0.98) * ARM_MM  # a tube needs some length
+    wide = 1.25 * (arm[:, 0] + sleeve * (arm[:, 1] - arm[:, 0]) + side)
+    radii[:, 2] = np.where(sleeve < 1.0, [wide, 1.3 * arm[:, 1]], 1.0).T
+    radii[:, 3] = 1.3 * arm[:, 1:2]
+    ends = np.array([[0, _ELBOW], [0, _ELBOW], [0, _ELBOW], [_ELBOW, _SHOULDER]])
+    tubes = Capsules(ends, offsets, radii, np.zeros(n))
+    return tubes.vertices(np.repeat(frame[:, None], 3, axis=1), joints, scale, scale)

@@ -1,0 +1,309 @@
+"""Numba kernels that cut the hand at an end of a surface from its arm, and its height map from the picture.
+
+blocks and labels are those of `_ends`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.recordings import _segment as segment
+from liex_lab.recordings._ends import (
+    AROUND_MM,
+    MAX_SURFACES,
+    block_depths,
+    label_surfaces,
+    nearest_ends,
+    point_of_block,
+)
+from liex_lab.recordings._segment import BLOCK
+
+_TIP_MM = 60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
+_AS_NEAR_MM = 150.0  # a second end is worth a look while it is not farther behind the first
+_LEAST_MM2 = 2500.0  # no hand is smaller
+_LENGTH_MM = 185.0  # of a home-sized hand
+_SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
+_SHELL_MM2 = 900.0
+_BIN_MM = 5.0
+_RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
+FIELDS = 8  # of a find: middle x y z, direction of the fingers x y z, where along it the arm is cut, area
+
+
+@njit(cache=True)
+def locate(blocks, labels, tip, size, intrinsics, found):
+    """Where the hand at an end of a surface is: fill `found` (FIELDS,), mark its blocks with MAX_SURFACES in labels.
+
+    What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's length long.
+    """
+    middle, moved, fingers = np.empty(3), np.empty(3), np.zeros(3)
+    slot = labels[int(tip[1]), int(tip[2])]
+    point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
+    _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
+    around = AROUND_MM * size
+    cut, area, base = -1e9, 0.0, 0.0
+    for step in range(3):
+        has_arm = _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers)
+        cut = _wrist(blocks, labels, slot, size, intrinsics, middle, fingers) if has_arm else -1e9
+        base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
+        area = _beyond(blocks, labels, slot, around, intrinsics, middle, fingers, cut, step == 2, moved)
+        for k in range(3):
+            middle[k] = moved[k]
+    for k in range(3):
+        found[k], found[3 + k] = middle[k], fingers[k]
+    found[6], found[7] = cut + base, area
+
+
+@njit(cache=True)
+def _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers):
+    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm leaves the sphere."""
+    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
+    p, shell = np.empty(3), 0.0
+    for k in range(3):
+        fingers[k] = 0.0
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] != slot:
+                continue
+            point_of_block(blocks, i, j, intrinsics, p)
+            off = np.sqrt((p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2)
+            if _SHELL * around < off < around:
+                w = BLOCK * BLOCK * p[2] * p[2] / focal2
+                shell += w
+                for k in range(3):
+                    fingers[k] -= w * (p[k] - middle[k]) / off
+    norm = np.sqrt(fingers[0] ** 2 + fingers[1] ** 2 + fingers[2] ** 2)
+    has_arm = shell > _SHELL_MM2 * size * size and norm > 0.3 * shell
+    for k in range(3):
+        fingers[k] = fingers[k] / norm if has_arm else 0.0
+    return has_arm
+
+
+@njit(cache=True)
+def _wrist(blocks, labels, slot, size, intrinsics, middle, fingers):
+    """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the fingertips."""
+    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
+    p, along = np.empty(3), np.zeros(int(2.0 * around / _BIN_MM) + 2)
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] == slot:
+                point_of_block(blocks, i, j, intrinsics, p)
+                s, off = _along(p, middle, fingers)
+                if off < around * around:
+                    along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * p[2] * p[2] / focal2
+    b, tip = along.size - 1, 0.0
+    while b > 0 and tip < 100.0 * size * size:
+        tip += along[b]
+        b -= 1
+    return b * _BIN_MM - around - _LENGTH_MM * size
+
+
+@njit(cache=True)
+def _beyond(blocks, labels, slot, around, intrinsics, middle, fingers, cut, mark, moved):
+    """The middle `moved` (3,) of what lies in the sphere and beyond the cut, marked in labels if so asked; its area."""
+    p, total = np.empty(3), 0.0
+    for k in range(3):
+        moved[k] = 0.0
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] == slot:
+                point_of_block(blocks, i, j, intrinsics, p)
+                s, off = _along(p, middle, fingers)
+                if off < around * around and s > cut:
+                    w = p[2] * p[2]
+                    total += w
+                    for k in range(3):
+                        moved[k] += w * p[k]
+                    if mark:
+                        labels[i, j] = MAX_SURFACES
+    for k in range(3):
+        moved[k] /= max(total, 1e-9)
+    return BLOCK * BLOCK * total / (intrinsics[0] * intrinsics[1])
+
+
+@njit(cache=True)
+def _along(p, middle, fingers):
+    """How far p (3,) lies from `middle` along `fingers`, and the square of its distance."""
+    s, off = 0.0, 0.0
+    for k in range(3):
+        s += (p[k] - middle[k]) * fingers[k]
+        off += (p[k] - middle[k]) ** 2
+    return s, off
+
+
+@njit(cache=True)
+def _settle(blocks, labels, slot, radius, intrinsics, middle):
+    """Move `middle` (3,) to the middle of what the surface has within `radius` mm of it."""
+    p, total, moved = np.empty(3), 0.0, np.zeros(3)
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            if labels[i, j] == slot:
+                point_of_block(blocks, i, j, intrinsics, p)
+                off = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
+                if off < radius * radius:
+                    w = p[2] * p[2]
+                    total += w
+                    for k in range(3):
+                        moved[k] += w * p[k]
+    for k in range(3):
+        middle[k] = moved[k] / total
+
+
+@njit(cache=True)
+def box_of(labels, mark, box):
+    """First and last row and column of the blocks labelled `mark` into box (4,)."""
+    box[0], box[1], box[2], box[3] = labels.shape[0], -1, labels.shape[1], -1
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] == mark:
+                box[0], box[1] = min(box[0], i), max(box[1], i)
+                box[2], box[3] = min(box[2], j), max(box[3], j)
+
+
+@njit(cache=True)
+def sight_rotation(x, y, rotation):
+    """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as the camera's."""
+    length = np.sqrt(x * x + y * y + 1.0)
+    up = np.array([-x / length, -y / length, -1.0 / length])
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]
+    norm = np.sqrt(rotation[0, 0] ** 2 + rotation[0, 1] ** 2 + rotation[0, 2] ** 2)
+    for k in range(3):
+        rotation[0, k] /= norm
+        rotation[2, k] = up[k]
+    rotation[1, 0] = up[1] * rotation[0, 2] - up[2] * rotation[0, 1]
+    rotation[1, 1] = up[2] * rotation[0, 0] - up[0] * rotation[0, 2]
+    rotation[1, 2] = up[0] * rotation[0, 1] - up[1] * rotation[0, 0]
+
+
+@njit(cache=True)
+def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw):
+    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 not read."""
+    size = raw.shape[0]
+    for r in range(size):
+        v = origin[1] + step * r
+        for c in range(size):
+            u = origin[0] + step * c
+            raw[r, c] = -1.0
+            if not (0 < r < size - 1 and 0 < c < size - 1 and 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]):
+                continue
+            reach = _reach(blocks, labels, v // BLOCK, u // BLOCK)
+            z = depth[v, u]
+            if reach == 0.0 or z >= min(reach, far):
+                continue
+            if z <= near:
+                raw[r, c] = -2.0
+                continue
+            x, y = (u - intrinsics[2]) / intrinsics[0] * z, (v - intrinsics[3]) / intrinsics[1] * z
+            if x * found[3] + y * found[4] + z * found[5] <= found[6]:
+                continue
+            above = distance * (1.0 - z * (plane[0] * u + plane[1] * v + plane[2]))
+            if above > 0.0:
+                raw[r, c] = above
+
+
+@njit(cache=True)
+def _reach(blocks, labels, row, column):
+    """How far, mm, a pixel of this block may be to belong to the hand; 0 where no block near it does."""
+    farthest = np.float32(0.0)
+    for a in range(max(row - 1, 0), min(row + 2, labels.shape[0])):
+        for b in range(max(column - 1, 0), min(column + 2, labels.shape[1])):
+            if labels[a, b] == MAX_SURFACES:
+                farthest = max(farthest, blocks[a, b])
+    return farthest + np.float32(_RIM_MM) if farthest > 0 else farthest
+
+
+@njit(cache=True)
+def extract_one(
+    depth, near, far, rank, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
+    distance, n_blobs, k,
+):  # fmt: skip
+    """Find the hand in one frame (H, W) mm and fill row k of the batch; see `NearestScene.extract`."""
+    blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
+    labels = np.empty(blocks.shape, np.int32)
+    areas, chosen = np.empty(MAX_SURFACES), np.empty((2, 4))
+    focal2 = intrinsics[0] * intrinsics[1]
+    block_depths(depth, near, far, blocks)
+    n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
+    found, box = np.empty(FIELDS), np.empty(4, np.int64)
+    n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen)
+    if n_ends == 2 and chosen[1, 3] > chosen[0, 3] + _AS_NEAR_MM * size:
+        n_ends = 1
+    n_blobs[k] = n_ends
+    if rank >= n_ends:
+        return
+    locate(blocks, labels, chosen[rank], size, intrinsics, found)
+    box_of(labels, MAX_SURFACES, box)
+    if box[1] < 0:
+        return
+    crop = heights.shape[1]
+    span = BLOCK * (max(box[1] - box[0], box[3] - box[2]) + 3)
+    step = max(1, int(np.ceil(span / (crop - 4))))
+    middle_u, middle_v = 0.5 * BLOCK * (box[2] + box[3] + 1), 0.5 * BLOCK * (box[0] + box[1] + 1)
+    origin[k, 0], origin[k, 1] = int(middle_u - step * crop / 2), int(middle_v - step * crop / 2)
+    n_steps[k] = step
+    rotation = np.empty((3, 3))
+    x, y = view_axis(origin[k], step, crop, intrinsics, along_axis)
+    sight_rotation(x, y, rotation)
+    distance[k] = behind - (rotation[2, 0] * found[0] + rotation[2, 1] * found[1] + rotation[2, 2] * found[2])
+    plane = view_plane(rotation, distance[k], intrinsics)
+    raw = np.empty((crop, crop), np.float32)
+    cut_heights(depth, blocks, labels, found, plane, distance[k], intrinsics, origin[k], step, near, far, raw)
+    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    mm_per_px = step * found[2] / np.sqrt(focal2)
+    radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
+    segment.smooth_heights(raw, radius, heights[k])
+    segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k])
+    # the arm tells which way along the long axis the fingers point
+    along = rotation @ found[3:6]
+    if along[0] * np.cos(moments[k, 5]) + along[1] * np.sin(moments[k, 5]) < 0.0:
+        moments[k, 5] += np.pi
+    n_px[k] = int(moments[k, 0])
+
+
+@njit(cache=True)
+def view_axis(origin, step, crop, intrinsics, along_axis):
+    """Where the view's axis goes, (x, y) at z = 1: through the middle of the crop, or along the optical axis."""
+    if along_axis:
+        return 0.0, 0.0
+    return (
+        (origin[0] + step * crop / 2.0 - intrinsics[2]) / intrinsics[0],
+        (origin[1] + step * crop / 2.0 - intrinsics[3]) / intrinsics[1],
+    )
+
+
+@njit(cache=True)
+def view_plane(rotation, distance, intrinsics):
+    """Coefficients (3,) of the plane that a view measures heights from: 1 / z = a u + b v + c."""
+    a = -rotation[2, 0] / intrinsics[0] / distance
+    b = -rotation[2, 1] / intrinsics[1] / distance
+    return np.array([a, b, -rotation[2, 2] / distance - a * intrinsics[2] - b * intrinsics[3]])
+
+
+@njit(cache=True, parallel=True)
+def extract_all(
+    depths, near, far, rank, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
+    distance, n_blobs,
+):  # fmt: skip
+    """`extract_one` for a batch; size, behind, smooth (n,) and intrinsics (n, 4) differ."""
+    for k in prange(depths.shape[0]):
+        extract_one(depths[k], near, far, rank, size[k], behind[k], smooth[k], intrinsics[k], along_axis, heights,
+                    origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+
+
+@njit(cache=True)
+def fill_looks(intrinsics, origin, step, distance, crop, along_axis, looks):
+    """How each height map was cut (n, 17): see `Scene.looks`."""
+    rotation = np.empty((3, 3))
+    for k in range(len(step)):
+        x, y = view_axis(origin[k], step[k], crop, intrinsics[k], along_axis)
+        sight_rotation(x, y, rotation)
+        looks[k, :4] = intrinsics[k]
+        looks[k, 4:13] = rotation.ravel()
+        looks[k, 13], looks[k, 14], looks[k, 15], looks[k, 16] = distance[k], origin[k, 0], origin[k, 1], step[k]
+
+
+@njit(cache=True)
+def view_planes(looks, planes):
+    """`view_plane` of looks (n, 17) into planes (n, 3)."""
+    for k in range(len(looks)):
+        planes[k] = view_plane(looks[k, 4:13].reshape(3, 3), looks[k, 13], looks[k, :4])

@@ -1,0 +1,22 @@
+"""The bundled hand: somebody's gestures before a camera, from the pictures alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.recordings.hand_world import HandWorld
+from liex_lab.recordings.nearest import NearestScene
+
+
+def test_gestures_are_measured_from_the_pictures_alone() -> None:
+    estimator = PoseEstimator.load("hand")
+    gestures = HandWorld(estimator.skeleton).motion(3, 24)
+    scene, sample = NearestScene.learn(gestures, estimator.skeleton.view, 24)
+    size = estimator.find_size(sample, scene)
+    found = estimator.estimate(sample, scene, size)
+    assert found.found.all()
+    assert abs(size * estimator.skeleton.length / gestures.spine_mm - 1.0) < 0.12
+    off = np.linalg.norm(found.chosen.pose.joints(estimator.skeleton) - gestures.joints_camera, axis=-1).mean(axis=1)
+    assert np.median(off) < 15.0
+    assert (found.chosen.pose.scale > 0).all()
