@@ -1,4 +1,4 @@
-"""The jobs behind `liex train actions`, `liex evaluate actions`, `liex suggest` and the way to BORIS and back."""
+"""The jobs behind `liex train actions` and `liex suggest`, and labels that people made."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def labelled_sessions(sessions: Sequence[str | Path], labels: Sequence[str | Pat
         if (words == UNLABELLED).all():
             raise LiexError(
                 f"the session {session.path} has no bout that a person labelled; give them with --labels, or correct "
-                "them in BORIS (`liex boris`)"
+                "them in BORIS (`liex export --to boris`)"
             )
         about = session.table("sessions").iloc[0]
         tracks.append(LabelledTrack(track, words, str(about["subject_id"]) or session.name, wall_of(session)))
@@ -113,7 +113,7 @@ def _sessions_named(table: pd.DataFrame) -> set[str]:
 def read_any_labels(path: str | Path) -> pd.DataFrame:
     """Labels from our table, a CSV, a BORIS project or BORIS's export of aggregated events."""
     from liex_lab.actions.labels import read_labels
-    from liex_lab.exchange.boris_project import boris_export_labels, boris_labels, is_boris_export
+    from liex_lab.exchange.boris_labels import boris_export_labels, boris_labels, is_boris_export
 
     source = Path(path)
     if not source.is_file():
@@ -150,19 +150,6 @@ def _session_and_model(session: str | Path, model: str | Path | None) -> tuple[S
     if recogniser.skeleton != skeleton:
         raise LiexError(f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use another")
     return opened, recogniser
-
-
-def session_to_boris(session: str | Path, out: str | Path, media: str = "") -> Path:
-    """A session's ethogram as a BORIS project that a person can correct."""
-    from liex_lab.exchange.boris_project import write_boris_project
-    from liex_lab.sessions import Session
-
-    opened = Session.open(session)
-    counts = opened.metadata["frames"]
-    return write_boris_project(
-        out, opened.bouts, opened.metadata.get("actions", {}), observation=opened.name, media=media,
-        duration_s=float(counts["duration_s"]), fps=float(counts["fps_median"] or 30.0),
-    )  # fmt: skip
 
 
 def human_bouts(session: str | Path, labels: str | Path) -> pd.DataFrame:

@@ -133,7 +133,8 @@ def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     build_zones(plan)  # a slip in their file is told before any work is done
     estimator = build_estimator(plan)
     scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
-    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, plan.estimation.doubtful_above_mm)
+    limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
+    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)
 
 
 def build_scene(

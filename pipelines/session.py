@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from liex_lab.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
     from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions import Session
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
 CHUNK = 32  # frames in memory at a time
@@ -31,41 +33,60 @@ def measure_session(
     plan: Plan,
     out: str | Path,
     *,
+    folder: Path | None = None,
     overwrite: bool = False,
+    notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`.
+    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
 
-    blueprint and report make the views that lie in the folder; see `Session.create`.
+    notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
+    lie in the folder, see `Session.create`.
     """
-    from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
-    from liex_lab.sessions.writer import check_place
+    from liex_lab.sessions.checkpoint import check_free, hash_once
+    from liex_lab.sessions.place import check_place, part_folder
+    from liex_lab.tracking.observations import Observations
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
-        folder = Path(out) / f"{opened.name}.liex"
+        folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
         check_place(folder, overwrite)
+        check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
         tracker = build_tracker(opened, plan)
-        recogniser = build_recogniser(plan, tracker.estimator.skeleton)
+        build_recogniser(plan, tracker.estimator.skeleton)  # a slip in its name is told before any work is done
+        hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
-            for frames in opened.chunks(CHUNK):
+            writer.go_on(lambda row: opened.frame(row).depth)
+            for frames in opened.chunks(CHUNK, writer.n_frames):
                 began = time.perf_counter()
-                track = tracker.follow(frames)
+                seen = tracker.observe(frames)
                 timings["track"] += time.perf_counter() - began
-                writer.add(frames, track)
+                writer.add(frames, seen=seen)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
-            writer.note(problems=opened.problems)
-            around = build_surroundings(provenance)
-            named = {} if recogniser is None else name_actions(recogniser, writer)
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
-            session = writer.close(timings_s=timings, **behaviour.for_session())
+            began = time.perf_counter()
+            whole = writer.seen(Observations)
+            writer.take(tracker.track(whole), whole, tracker.subject)
+            timings["track"] += time.perf_counter() - began
+            writer.note(problems=opened.problems, **dict(notes or {}))
+            session = conclude(writer, plan, timings)
     return session.path
+
+
+def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
+    """Measure the behaviour of a session whose track is known, and put the session in its place."""
+    from liex_lab.behaviour.summary import measure
+
+    around = build_surroundings(writer.origin)
+    recogniser = build_recogniser(plan, writer.origin.skeleton)
+    named = {} if recogniser is None else name_actions(recogniser, writer)
+    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
+    return writer.close(timings_s=timings, **behaviour.for_session())
 
 
 def name_actions(recogniser: TimelineModel, writer: SessionWriter) -> dict[str, Any]:

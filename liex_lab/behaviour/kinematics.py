@@ -2,7 +2,8 @@
 
 Every derivative is taken over the frames' true times and never across a gap, and carries the standard deviation that
 follows from the joints' own. Errors of the joints of one frame are taken as one common error (the body is off as a
-whole), those of different frames and of the two ends of a line as independent.
+whole), those of different frames and of the two ends of a line as independent. Errors last longer than a frame, so the
+standard deviations of speeds are upper bounds.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ class Skeleton:
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise LiexError(f"the skeleton {path} is not a TOML file: {error}") from None
         return Skeleton.from_table(_with_mesh(table, path), str(path))
 

@@ -118,7 +118,7 @@ class Story:
 
 def clock(seconds: float) -> Array:
     """(m,) s: the steps of an act of that length."""
-    return np.arange(max(2, round(seconds / STEP_S))) * STEP_S
+    return np.asarray(np.arange(max(2, round(seconds / STEP_S))) * STEP_S)
 
 
 def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:

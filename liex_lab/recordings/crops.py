@@ -41,7 +41,7 @@ class Crops:
     distance: Array
     n_blobs: NDArray[np.int64]
 
-    def __getitem__(self, index: NDArray[np.bool_]) -> Crops:
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Crops:
         """Some crops out of a batch."""
         return Crops(*(getattr(self, field.name)[index] for field in fields(self)))
 

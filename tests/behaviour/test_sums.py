@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from itertools import pairwise
 from typing import Any
 
@@ -227,6 +228,16 @@ def test_activity_has_a_row_for_every_interval_of_an_animal_never_seen():
     table = activity(measure(frames, poses).kinematics, empty_table(BOUTS), ("walk",))
     assert (table["observed_s"] == 0).all()
     assert table["mean_speed_mm_s"].isna().all()
+
+
+@pytest.mark.slow
+def test_an_hour_is_measured_in_a_few_seconds():
+    frames, poses = tables_of(WalkingMouse(steady(3600.0), rear_s=(1000.0, 1500.0), speed_mm_s=90.0))
+    began = time.process_time()
+    behaviour = measure(frames, poses)
+    assert time.process_time() - began < 20.0
+    assert len(behaviour.kinematics) == 108_000
+    assert behaviour.activity["distance_mm"].sum() == pytest.approx(324_000, rel=1e-3)
 
 
 def test_the_tables_can_be_made_again_from_the_session_s_folder_alone(tmp_path):

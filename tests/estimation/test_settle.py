@@ -99,7 +99,9 @@ def test_where_the_animal_ends_past_its_chain(short_mm):
 def test_wrong_poses_settle_and_tell_the_size(settler):
     true = fish(60, 5)
     off, size = wrong(true, 6)
-    before, after, told = [], [], []
+    before: list[float] = []
+    after: list[float] = []
+    told: list[float] = []
     heights = maps(true)
     for i in range(len(size)):
         one = off[np.array([i])]

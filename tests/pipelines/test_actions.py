@@ -11,7 +11,6 @@ from liex_lab.pipelines.actions import (
     human_bouts,
     labelled_sessions,
     read_any_labels,
-    session_to_boris,
     suggest,
     train_actions,
 )
@@ -19,7 +18,8 @@ from liex_lab.pipelines.session_tracks import track_of, wall_of
 
 from liex_lab.actions.storage import bundled_action_models, find_action_model, load_action_model
 from liex_lab.errors import LiexError
-from liex_lab.exchange.boris_project import read_boris_project
+from liex_lab.exchange import export
+from liex_lab.exchange.boris_labels import read_boris_project
 from liex_lab.recordings import fish_acts, mouse_acts
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, write
@@ -54,7 +54,7 @@ def test_a_session_gives_back_the_track_it_was_made_from(session: Session, mouse
 
 
 def test_an_ethogram_goes_to_boris_and_comes_back_as_a_humans(session: Session, tmp_path: Path) -> None:
-    project = session_to_boris(session.path, tmp_path / "walk.boris")
+    project = export(session, "boris", tmp_path / "walk.boris")
     assert session.name in read_boris_project(project)["observations"]
     back = human_bouts(session.path, project)
     own = session.bouts

@@ -1,15 +1,13 @@
-"""BORIS projects, there and back: an ethogram that a person can correct in BORIS, and the corrections as labels.
+"""What people labelled or corrected in BORIS, as labels: from its projects and from its exports.
 
-A project is JSON; state events are pairs of rows, start and stop. What BORIS puts in and we do not know is kept.
+A project is JSON; state events are pairs of rows, start and stop. `liex export SESSION --to boris` writes one.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
-import string
-from collections.abc import Mapping, Sequence
-from datetime import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,35 +16,7 @@ import pandas as pd
 from liex_lab.actions.labels import HUMAN, checked
 from liex_lab.errors import LiexError
 
-_VERSION = "7.0"  # BORIS refuses projects that are newer than itself
-_COLOURS = (
-    "#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933", "#DDCC77",
-)  # fmt: skip
 _STATE = "State event"
-
-
-def write_boris_project(
-    path: str | Path, bouts: pd.DataFrame, vocabulary: Mapping[str, str], *, observation: str, duration_s: float,
-    fps: float, media: str = "", date: str = "", project: dict[str, Any] | None = None,
-) -> Path:  # fmt: skip
-    """Write bouts (action, start_s, stop_s, individual) as the observation of a project; returns its path.
-
-    media: the video that a person will look at; '' makes a live observation. project: one that was read before, whose
-    other observations and settings stay as they are.
-    """
-    document = project or _empty(observation)
-    words = [*vocabulary, *sorted(set(bouts["action"]) - set(vocabulary))]
-    subjects = sorted({str(name) for name in bouts["individual"]}) if "individual" in bouts else []
-    _declare(document["behaviors_conf"], "code", [_behaviour(w, vocabulary.get(w, ""), k) for k, w in enumerate(words)])
-    _declare(document["subjects_conf"], "name", [{"key": "", "name": s, "description": ""} for s in subjects])
-    document["observations"][observation] = _observation(bouts, media, date or _now(), duration_s, fps)
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(document, indent=1, ensure_ascii=False)
-    unfinished = target.with_name(f"{target.name}.part")
-    unfinished.write_bytes(gzip.compress(text.encode(), mtime=0) if target.suffix == ".gz" else text.encode())
-    unfinished.replace(target)
-    return target
 
 
 def read_boris_project(path: str | Path) -> dict[str, Any]:
@@ -131,53 +101,5 @@ def _pairs(
     return rows
 
 
-def _observation(bouts: pd.DataFrame, media: str, date: str, duration_s: float, fps: float) -> dict[str, Any]:
-    subjects = bouts["individual"] if "individual" in bouts else [""] * len(bouts)
-    events: list[list[Any]] = []
-    for action, start_s, stop_s, subject in zip(
-        bouts["action"], bouts["start_s"], bouts["stop_s"], subjects, strict=True
-    ):
-        for at in (start_s, stop_s):
-            row = [round(float(at), 3), str(subject), str(action), "", ""]
-            events.append([*row, round(float(at) * fps)] if media else row)
-    events.sort(key=lambda event: event[0])
-    shown = {"length": {media: duration_s}, "fps": {media: fps}, "hasVideo": {media: True}, "hasAudio": {media: False},
-             "offset": {"1": 0.0}}  # fmt: skip
-    return {
-        "file": {"1": [media]} if media else {}, "type": "MEDIA" if media else "LIVE", "date": date, "description": "",
-        "time offset": 0.0, "independent_variables": {}, "close_behaviors_between_videos": False,
-        "media_info": shown if media else {}, "events": events,
-    }  # fmt: skip
-
-
-def _empty(name: str) -> dict[str, Any]:
-    return {
-        "time_format": "hh:mm:ss", "project_date": _now(), "project_name": name, "project_description": "",
-        "project_format_version": _VERSION, "subjects_conf": {}, "behaviors_conf": {}, "observations": {},
-        "behavioral_categories": [], "behavioral_categories_config": {}, "independent_variables": {},
-        "coding_map": {}, "behaviors_coding_map": [], "converters": {},
-    }  # fmt: skip
-
-
-def _declare(conf: dict[str, Any], key: str, wanted: list[dict[str, Any]]) -> None:
-    """Add what is not there yet to one of the project's numbered lists."""
-    known = {str(entry.get(key)) for entry in _values(conf)}
-    for entry in wanted:
-        if entry[key] not in known:
-            conf[str(max((int(k) for k in conf if str(k).isdigit()), default=-1) + 1)] = entry
-
-
 def _values(conf: Any) -> list[dict[str, Any]]:
     return [entry for entry in conf.values() if isinstance(entry, dict)] if isinstance(conf, dict) else []
-
-
-def _behaviour(word: str, definition: str, number: int) -> dict[str, Any]:
-    keys = string.ascii_lowercase + string.digits
-    return {
-        "type": _STATE, "key": keys[number] if number < len(keys) else "", "code": word, "description": definition,
-        "color": _COLOURS[number % len(_COLOURS)], "category": "", "modifiers": {}, "excluded": "", "coding map": "",
-    }  # fmt: skip
-
-
-def _now() -> str:
-    return datetime.now().isoformat(timespec="seconds")
