@@ -151,15 +151,46 @@ def convert(
 
 @app.command()
 def train(
-    animal: Annotated[str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, or a skeleton's .toml file.")],
+    animal: Annotated[
+        str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml file; or: actions.")
+    ],
     variant: VariantName = "default",
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz (of actions: .skops).")
+    ] = None,
     workers: Annotated[int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")] = 0,
     n_images: Annotated[
         int | None, typer.Option("--images", min=512, help="Pictures to train on, for a quick look.")
     ] = None,
+    of: Annotated[str, typer.Option("--animal", help="Of `train actions`: whose actions, fish or mouse.")] = "mouse",
+    sessions: Annotated[
+        list[Path] | None, typer.Option("--session", help="Of `train actions`: a labelled session; repeatable.")
+    ] = None,
+    labels: Annotated[
+        list[Path] | None,
+        typer.Option("--labels", metavar="FILE", help="Of `train actions`: .csv, .parquet, or .boris; repeatable."),
+    ] = None,
+    pose_model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="Of `train actions`: the model that measures poses.")
+    ] = None,
 ) -> None:
-    """Make an animal's model from rendered pictures; the same again, byte for byte, whenever it is run."""
+    """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
+
+    `liex train actions` makes the model that names actions: from sessions that people labelled, or, without any, from
+    virtual animals that act.
+    """
+    if animal == "actions":
+        from liex_lab.pipelines.actions import train_actions
+
+        with progress_bar() as progress:
+            model, report = train_actions(
+                out or Path(f"{of}-actions.skops"), animal=of, sessions=sessions or (), labels=labels or (),
+                pose_model=pose_model, progress=progress,
+            )  # fmt: skip
+        if report:
+            _tell_numbers(report, None)
+        typer.echo(f"model: {model}")
+        return
     from liex_lab.pipelines.train import train_model
 
     with progress_bar() as progress:
@@ -250,6 +281,24 @@ def evaluate_tables(
         typer.echo(path)
 
 
+@evaluate.command("actions")
+def evaluate_actions(
+    animal: AnimalName = "fish",
+    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
+    pose_model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
+    ] = None,
+    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings."""
+    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, model=model, pose_model=pose_model, minutes=minutes, progress=progress)
+    _tell_numbers(result, json_file)
+
+
 @evaluate.command("tracking")
 def evaluate_tracking(
     animal: AnimalName = "mouse",
@@ -314,6 +363,22 @@ def evaluate_reference(
     from liex_lab.pipelines.evaluate import evaluate_reference as measure
 
     _tell_numbers(measure(session, reference), json_file)
+
+
+@app.command()
+def suggest(
+    session: SessionPath,
+    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
+    n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
+) -> None:
+    """List the stretches of a session most worth labelling next: where the recogniser is least sure."""
+    from liex_lab.pipelines.actions import suggest as job
+
+    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
+    for row in job(session, model=model, n=n).itertuples():
+        numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
+        table.add_row(*numbers[:2], str(row.guess), str(row.or_else), numbers[2])
+    Console().print(table)
 
 
 @app.command()

@@ -224,6 +224,16 @@ class Behaviour(_Table):
         return self
 
 
+class Actions(_Table):
+    """[actions]: who names what the animal does."""
+
+    model: str | None = Field(
+        None,
+        description="an action model by the animal's name, or the path of a .skops made by `liex train actions`; not "
+        "set: the animal's bundled one, where there is one; 'rules': the thresholds of [behaviour]",
+    )
+
+
 class Plan(_Table):
     """Everything a run depends on. Units are in the names; None is 'not set'."""
 
@@ -237,6 +247,7 @@ class Plan(_Table):
     estimation: Estimation = Estimation()
     tracking: Tracking = Tracking()
     session: SessionFacts = SessionFacts()
+    actions: Actions = Actions()
     behaviour: Behaviour = Behaviour()
 
     @staticmethod

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from liex_lab.actions.timeline import TimelineModel
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.behaviour.places import Surroundings
     from liex_lab.body.skeleton import Skeleton
@@ -206,3 +207,19 @@ def build_rules(plan: Plan) -> MouseRules:
     from liex_lab.behaviour.bouts import MouseRules
 
     return MouseRules(**plan.behaviour.model_dump())
+
+
+def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
+    """The recogniser of the plan: the named one, or the animal's bundled one; None where the rules name actions."""
+    from liex_lab.actions.storage import bundled_action_models, load_action_model
+
+    name = plan.actions.model
+    if name == "rules" or (name is None and skeleton.name not in bundled_action_models()):
+        return None
+    model = load_action_model(name or skeleton.name)
+    if model.skeleton != skeleton.name:
+        raise PlanError(
+            f"the action model '{name}' was made for the skeleton {model.skeleton}, but the plan says {skeleton.name}; "
+            "set actions.model to another one, or to 'rules'"
+        )
+    return model

@@ -7,12 +7,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_surroundings, build_tracker
+from liex_lab.pipelines.build import (
+    build_provenance,
+    build_recogniser,
+    build_recording,
+    build_rules,
+    build_surroundings,
+    build_tracker,
+)
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from liex_lab.actions.timeline import TimelineModel
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
@@ -49,6 +57,7 @@ def measure_session(
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
         tracker = build_tracker(opened, plan)
+        build_recogniser(plan, tracker.estimator.skeleton)  # a slip in its name is told before any work is done
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
@@ -74,5 +83,23 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
     from liex_lab.behaviour.summary import measure
 
     around = build_surroundings(writer.origin)
-    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps)
+    recogniser = build_recogniser(plan, writer.origin.skeleton)
+    named = {} if recogniser is None else name_actions(recogniser, writer)
+    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
     return writer.close(timings_s=timings, **behaviour.for_session())
+
+
+def name_actions(recogniser: TimelineModel, writer: SessionWriter) -> dict[str, Any]:
+    """The ethogram of a session's track by a recogniser, as `behaviour.measure` takes it; what the frame rate cannot
+    tell is noted in the session.
+    """
+    from liex_lab.actions.tables import bout_rows
+
+    frames = writer.frames
+    found = recogniser.recognise(writer.track, frames["wall_distance_mm"].to_numpy(float))
+    writer.note(
+        action_model={"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
+        unresolved_actions=found.unresolved,
+    )
+    actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
+    return {"bouts": bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", ""))), "actions": actions}
