@@ -36,7 +36,7 @@ def matrix(words: Sequence[str], probability: Array, chance: Array, significant:
                          f'</rect><text class="{"inside" if p > 0.45 else "tick"}" x="{x + cell / 2:.1f}" '
                          f'y="{y + cell / 2 + 4:.1f}" text-anchor="middle">{p:.0%}{mark}</text>')  # fmt: skip
     parts.append(f'<text class="tick" x="{left}" y="{top - 28}">followed by</text>')
-    return svg(left + size + 6, top + size + 6, parts)
+    return svg(max(left + size + 6, 400.0), top + size + 6, parts)  # few words are not blown up
 
 
 def around(

@@ -117,8 +117,8 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
     row = session.summary.iloc[0]
     rows = []
     for k, word in enumerate(words):
-        if f"{word}_count" in row:
-            values = [row[f"{word}_{what}"] for what, _ in _BUDGET]
+        if f"{word}_s" in row:  # sessions of an older version lack some of the others
+            values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
             texts = [f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
                      for value, (what, _) in zip(values, _BUDGET, strict=True)]  # fmt: skip
             rows.append((word, figures.action_colour(k), texts))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Session
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
+_ROUNDED_S = 5e-4  # times are typed with three decimals
 ORIGINAL = "as_tracked"  # the folder in which the tables stay that no human has touched
 
 
@@ -71,7 +72,7 @@ def flip_span(
 def _rows(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
     """The rows of a span given in seconds."""
     time_s = session.frames["time_s"].to_numpy()
-    first, last = (int(np.searchsorted(time_s, at - 1e-9)) for at in (start_s, stop_s))
+    first, last = (int(np.searchsorted(time_s, at - _ROUNDED_S)) for at in (start_s, stop_s))
     if not (start_s < stop_s and first < last):
         raise SessionError(
             f"a span to flip is from a time to a later one, in seconds since the first frame, and holds a frame; got "

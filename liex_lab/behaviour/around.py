@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 BEFORE_S, AFTER_S = 1.0, 2.0
 _STEPS = 61
-_FEWEST = 3  # bouts; of fewer no quartiles are told
+_FEWEST = 5  # bouts; of fewer no quartiles are told
 
 
 @dataclass(frozen=True)

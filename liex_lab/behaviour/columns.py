@@ -10,7 +10,7 @@ OWN = "this library's choice"
 LMT = "Live Mouse Tracker's rule"
 ZZ = "after ZebraZoom's list of bout parameters"
 _SD = "standard deviation of"
-_INDEPENDENT = "the joints' sd_mm as if independent from frame to frame: an upper bound, for errors last longer"
+_INDEPENDENT = "the joints' sd_mm, errors lasting 0.3 s; on a rendered recording they lasted longer"
 
 KINEMATICS: tuple[Column, ...] = columns(
     "kinematics",
@@ -25,8 +25,8 @@ KINEMATICS: tuple[Column, ...] = columns(
      "space for one that swims; never taken across a gap; faster than the plan's behaviour.impossible_above_mm_s it is "
      "an error and left empty", "|p(t + h) - p(t - h)| over the true time between the two frames, h the plan's "
      "behaviour.speed_half_window_s", LMT),
-    ("speed_sd_mm_s", "float64", "mm/s", f"{_SD} the speed, at most; on a rendered recording its true error was a "
-     "third of that", "hypot(sd(t + h), sd(t - h)) / time between them", _INDEPENDENT),
+    ("speed_sd_mm_s", "float64", "mm/s", f"{_SD} the speed; an animal at rest seems to move about as fast as this",
+     "sd(p(t + h) - p(t - h)) / time between them, where errors agree by exp(-time / 0.3 s)", _INDEPENDENT),
     ("vertical_speed_mm_s", "float64", "mm/s", "upward speed of the body centre", "as speed_mm_s, of z_mm"),
     ("acceleration_mm_s2", "float64", "mm/s²", "how fast the speed grows; negative when it slows down",
      "as speed_mm_s, of speed_mm_s"),

@@ -2,8 +2,7 @@
 
 Every derivative is taken over the frames' true times and never across a gap, and carries the standard deviation that
 follows from the joints' own. Errors of the joints of one frame are taken as one common error (the body is off as a
-whole), those of different frames and of the two ends of a line as independent. Errors last longer than a frame, so the
-standard deviations of speeds are upper bounds.
+whole), those of the two ends of a line as independent, and an error as lasting for `ERROR_LASTS_S`.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ Rows = NDArray[np.int64]
 
 HALF_WINDOW_S = 0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
+ERROR_LASTS_S = 0.3  # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
@@ -55,8 +55,10 @@ class Spans:
         return np.asarray(turn / self.span_s)
 
     def sd(self, sd: Array) -> Array:
-        """(n,) standard deviation of the rate of values with these (n,), independent from frame to frame."""
-        return np.asarray(np.hypot(sd[self.before], sd[self.after]) / self.span_s)
+        """(n,) standard deviation of the rate of values with these (n,); the nearer two frames, the more they agree."""
+        first, second = sd[self.before], sd[self.after]
+        shared = np.exp(-self.span_s / ERROR_LASTS_S)
+        return np.asarray(np.sqrt(first**2 + second**2 - 2.0 * shared * first * second) / self.span_s)
 
 
 def kinematics(

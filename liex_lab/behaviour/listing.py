@@ -11,7 +11,8 @@ from liex_lab.sessions.tables import TABLES, Column
 
 FIRST = (
     "frames.frame_index", "frames.time_s", "frames.gap_before", "frames.predicted_error_mm", "frames.residual_mm",
-    "frames.flag", "frames.centroid_x_mm", "frames.wall_distance_mm", "frames.zone", "poses.joint", "poses.x_mm",
+    "frames.flag", "frames.bridged", "frames.p_flip", "frames.centroid_x_mm", "frames.wall_distance_mm",
+    "frames.zone", "poses.joint", "poses.x_mm",
     "poses.z_mm", "poses.u_px", "poses.sd_mm", "kinematics.speed_mm_s", "kinematics.speed_sd_mm_s",
     "kinematics.acceleration_mm_s2", "kinematics.heading_rad", "kinematics.yaw_rate_rad_s",
     "kinematics.body_pitch_rad", "kinematics.length_mm", "kinematics.bend_rad", "kinematics.nose_height_mm",

@@ -64,6 +64,8 @@ def visits(frames: pd.DataFrame, kinematics: pd.DataFrame, zones: Sequence[str],
 
 def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
     """For each zone (n,) whether the centroid lies in it."""
+    if not zones:  # sessions of older versions have no such column
+        return []
     words = pd.Series(frames["zone"].astype(str))
     different = {text: set(text.split(SEPARATOR)) for text in words.unique()}
     return [words.map({text: zone in names for text, names in different.items()}).to_numpy(bool) for zone in zones]

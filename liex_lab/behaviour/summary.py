@@ -180,7 +180,7 @@ def _budget(bouts: pd.DataFrame, words: Sequence[str], observed_s: float, first_
 def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> dict[str, float]:
     """Seconds in each zone, and shares of the observed time."""
     observed_s, found = float(hold.sum()), {}
-    for zone, inside in zip(zones, inside_zones(frames, zones), strict=True) if zones else ():
+    for zone, inside in zip(zones, inside_zones(frames, zones), strict=True):
         found[f"zone_{zone}_s"] = float(hold[inside].sum())
         found[f"zone_{zone}_share"] = found[f"zone_{zone}_s"] / observed_s if observed_s > 0 else np.nan
     return found

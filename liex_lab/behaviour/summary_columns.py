@@ -28,8 +28,8 @@ _GENERAL = (
     ("mean_speed_mm_s", "float64", "mm/s", "mean speed over the time with a speed", "distance / time"),
     ("median_speed_mm_s", "float64", "mm/s", "median speed of the frames"),
     ("max_speed_mm_s", "float64", "mm/s", "fastest speed of a frame"),
-    ("speed_noise_mm_s", "float64", "mm/s", "the speed that errors of the pose alone could give at most; slower "
-     "than this, nobody can be sure that the animal moved", "median of speed_sd_mm_s", OWN),
+    ("speed_noise_mm_s", "float64", "mm/s", "the speed that errors of the pose alone may give; slower than this, "
+     "nobody can be sure that the animal moved", "median of speed_sd_mm_s", OWN),
     ("mean_abs_yaw_rate_rad_s", "float64", "rad/s", "how fast the animal turns, whichever way",
      "mean of |yaw_rate_rad_s|"),
     ("turn_bias", "float64", "", "1: it turns to its left only, -1: to its right only",

@@ -82,6 +82,7 @@ def tracking_sequence(
     rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
     base = world.motion(own_seed, int(rows[-1]) + 1, sensor=sensor, noise=kind.noise,
                         erosion_px=kind.erosion_px * sensor.stride, spine_mm=spine_mm)  # fmt: skip
+    assert isinstance(base, SyntheticSession)  # a rendered world's
     times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(step_ns)
     cast = _taken(base.cast, rows)
     joints, length = cast.pose.joints(base.skeleton), base.spine_mm

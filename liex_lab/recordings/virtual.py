@@ -14,7 +14,7 @@ from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.sensors import BY_NAME
 from liex_lab.recordings.sequences import SEQUENCES, tracking_sequence
-from liex_lab.recordings.synthetic import SyntheticSession
+from liex_lab.recordings.synthetic import TrueRecording
 from liex_lab.recordings.worlds import world_of
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
@@ -49,7 +49,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
     values = {key: _value(address, key, text, settings[key]) for key, text in stated.items()}
     world = world_of(skeleton)
-    session: SyntheticSession
+    session: TrueRecording
     if kind in _SEQUENCES:
         seed, n_frames = values.pop("seed", None), values.pop("frames", None)
         session = tracking_sequence(world, _SEQUENCES[kind], seed=seed, n_frames=n_frames, **values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Flip
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
@@ -62,10 +64,10 @@ def read_corrections(session: Session) -> list[Flip]:
     table = session.flips[session.flips["source"] == _HUMAN]
     return [
         Flip(
-            int(np.searchsorted(index, row.start_frame)), int(np.searchsorted(index, row.stop_frame)),
-            float(row.p_flip), bool(row.applied), _HUMAN, str(row.undone_at),
+            int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
+            float(row["p_flip"]), bool(row["applied"]), _HUMAN, str(row["undone_at"]),
         )
-        for row in table.itertuples()
+        for row in _rows_of(table)
     ]  # fmt: skip
 
 
@@ -88,8 +90,13 @@ def _camera_gaps(session: Session) -> list[Gap]:
     """What the camera did not deliver and stamps that were moved, out of the table."""
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
     found = []
-    for row in session.gaps[~session.gaps["reason"].isin(LOST)].itertuples():
-        at = int(times[np.searchsorted(index, row.start_frame)])
-        first = at - round(1e9 * (row.stop_s - row.start_s)) if row.n_frames_missing else at
-        found.append(Gap(row.start_frame, row.stop_frame, first, at, row.n_frames_missing, row.reason))
+    for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
+        at, missing = int(times[np.searchsorted(index, row["start_frame"])]), int(row["n_frames_missing"])
+        first = at - round(1e9 * (row["stop_s"] - row["start_s"])) if missing else at
+        found.append(Gap(int(row["start_frame"]), int(row["stop_frame"]), first, at, missing, str(row["reason"])))
     return found
+
+
+def _rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """A short table row by row."""
+    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]

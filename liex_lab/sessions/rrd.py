@@ -32,6 +32,7 @@ IMAGE = "arena/camera/image"
 OVERLAY = "arena/camera/image/overlay"
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
+UNCERTAINTY = "arena/uncertainty"
 FLOOR = "arena/floor"
 ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
 _BLOCK = 8192  # frames of small things sent in one go
@@ -42,6 +43,8 @@ MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xDDCC77)
 _FLAG_COLOURS = {"doubtful": 0xCCBB44, "not_found": 0xEE6677, "no_depth": 0xBBBBBB}
 _WALL, _WORST = 0x9AA0A6, 12
+_HOLDS_95 = 2.795  # standard deviations of a Gaussian in space
+_SPREAD = [255, 170, 60, 140]
 _BONE, _JOINT = [255, 255, 255, 255], [255, 80, 60, 255]
 
 
@@ -189,10 +192,13 @@ class ReplayWriter:
             self._stream.log(f"{entity}/joints", dot.from_fields(radii=thick, colors=_JOINT, show_labels=False),
                              static=True)  # fmt: skip
             self._stream.log(f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True)
+        look = rr.Ellipsoids3D.from_fields(colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003)
+        self._stream.log(UNCERTAINTY, look, static=True)
         for start in range(0, track.n_frames, _BLOCK):
             part = slice(start, start + _BLOCK)
             when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
+            self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
             self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
 
@@ -210,6 +216,13 @@ class ReplayWriter:
         n_dots, n_bones = np.where(seen, skeleton.n_joints, 0), np.where(seen, len(edges), 0)
         self._stream.send_columns(f"{entity}/joints", when, [*dots.partition(n_dots)])
         self._stream.send_columns(f"{entity}/bones", when, [*strips.partition(n_bones)])
+
+    def _send_spheres(self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]) -> None:
+        """Around each joint (k, J, 3) of the k frames `seen` a sphere that holds it with 95 %; sd_mm (k, J)."""
+        size = np.repeat(_HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 1), 3, axis=1) / MM_PER_UNIT
+        spheres = rr.Ellipsoids3D.columns(half_sizes=size, centers=joints_mm.reshape(-1, 3) / MM_PER_UNIT)
+        n_spheres = np.where(seen, joints_mm.shape[1], 0)
+        self._stream.send_columns(UNCERTAINTY, when, [*spheres.partition(n_spheres)])
 
     def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frame of the body's base; while the animal is lost it stays where it was seen last."""

@@ -75,7 +75,8 @@ class Curve:
         """A curve of frames in which nothing was measured."""
         nan = np.full((n, n_joints, 3, 3), np.nan)
         pose = Pose(SE3(nan[:, 0], nan[:, 0, 0]), nan[..., 0], nan[:, 0, 0, 0])
-        return Curve(pose, nan[..., 0], *nan[:, 0, 0].T.copy(), np.zeros(n, np.bool_))
+        none = nan[:, 0, 0, 0]
+        return Curve(pose, nan[..., 0], none, none, none, np.zeros(n, np.bool_))
 
 
 _ROWS = ("joints", "error_mm", "sd_middle_mm", "sd_turn", "used")

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from liex_lab.behaviour import Surroundings, measure, measure_bouts
-from liex_lab.behaviour.kinematics import kinematics
+from liex_lab.behaviour.kinematics import ERROR_LASTS_S, kinematics
 from liex_lab.behaviour.tail import turning_points
 from liex_lab.sessions.tables import BOUTS, to_pandas
 from tests.behaviour.swimming_fish import LENGTH_MM, SwimmingFish, uneven
@@ -45,18 +45,28 @@ def test_a_fish_on_a_circle_of_10_mm_at_2_rad_a_second_before_an_uneven_clock():
     assert bout["n_bends"] == 0
 
 
+def lasting(rng: np.random.Generator, n: int, k: int, step_s: float) -> np.ndarray:
+    """Errors (n, k) of standard deviation 1 that agree by exp(-time / ERROR_LASTS_S) from frame to frame."""
+    shared = np.exp(-step_s / ERROR_LASTS_S)
+    out = rng.normal(size=(n, k))
+    for row in range(1, n):
+        out[row] = shared * out[row - 1] + np.sqrt(1.0 - shared**2) * out[row]
+    return out
+
+
 def test_the_standard_deviations_are_those_of_simulated_errors():
     """Errors of 0.2 mm at each joint, common to a frame for its place, independent for its axis."""
-    times: np.ndarray = np.arange(4000) / 50.0
+    times: np.ndarray = np.arange(8000) / 50.0
     fish = SwimmingFish(times, radius_mm=200.0, turn_rad_s=0.2)
     rng = np.random.default_rng(0)
     frames, poses = fish.tables()
     shifted = poses.copy()
-    shifted[["x_mm", "y_mm", "z_mm"]] += np.repeat(rng.normal(0, fish.sd_mm, (4000, 3)), 21, axis=0)
+    common = fish.sd_mm * lasting(rng, 8000, 3, 0.02)
+    shifted[["x_mm", "y_mm", "z_mm"]] += np.repeat(common, 21, axis=0)
     moved = kinematics(frames, shifted)
     assert moved["vertical_speed_mm_s"].std() == pytest.approx(moved["speed_sd_mm_s"].median(), rel=0.05)
     each = poses.copy()
-    each[["x_mm", "y_mm", "z_mm"]] += rng.normal(0, fish.sd_mm, (84000, 3))
+    each[["x_mm", "y_mm", "z_mm"]] += fish.sd_mm * lasting(rng, 8000, 63, 0.02).reshape(-1, 3)
     moved, true = kinematics(frames, each), kinematics(frames, poses)
     off = np.angle(np.exp(1j * (moved["heading_rad"] - true["heading_rad"])))
     assert off.std() == pytest.approx(moved["heading_sd_rad"].median(), rel=0.05)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tarfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
@@ -14,14 +15,17 @@ from liex_lab.dashboards import figures
 from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 from liex_lab.dashboards.report import methods, render, write_report
 
+from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.around import around_onsets
 from liex_lab.body import Skeleton
+from liex_lab.exchange import export
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
 from liex_lab.sessions import Session, tables
 from liex_lab.sessions.rrd import PALETTE
 from liex_lab.water import Water
+from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(4.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
@@ -118,7 +122,7 @@ def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatc
 
 def test_noise_that_hides_a_pause_is_warned_of(tmp_path):
     assert not any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE)))
-    track = replace(MOUSE, sd_mm=4.0)
+    track = replace(MOUSE, sd_mm=8.0)
     assert any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track)))
 
 
@@ -131,14 +135,14 @@ def test_the_matrix_and_the_zones_are_on_the_page(tmp_path):
 
 
 def test_a_measure_around_an_onset_is_what_the_frames_say():
-    """A speed that steps from 10 to 90 mm/s at each of four onsets."""
-    time = np.arange(0, 40, 1 / 30)
+    """A speed that steps from 10 to 90 mm/s at each of five onsets."""
+    time = np.arange(0, 50, 1 / 30)
     speed = np.where((time % 10) >= 5.0, 90.0, 10.0)
     moved = pd.DataFrame({"time_s": time, "speed_mm_s": speed})
-    bouts = pd.DataFrame({"action": ["run"] * 4 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 1.0]})
+    bouts = pd.DataFrame({"action": ["run"] * 5 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 45.0, 1.0]})
     found = around_onsets(moved, bouts, "run", "speed_mm_s")
     assert found is not None
-    assert found.n == 4
+    assert found.n == 5
     np.testing.assert_allclose(found.median[found.time_s < -0.05], 10.0)
     np.testing.assert_allclose(found.median[found.time_s > 0.05], 90.0)
     assert around_onsets(moved, bouts, "walk", "speed_mm_s") is None
@@ -172,6 +176,17 @@ def test_walls_zones_and_what_was_undone_are_shown(tmp_path):
     for said in ("round, radius 250 mm; zones: nest", "kannala_brandt 0.125", "450 mm below the lens", "<title>nest"):
         assert said in page, said
     assert "ideal camera in air" in " ".join(methods(session))
+
+
+@pytest.mark.parametrize("archive", sorted((REPOSITORY / "tests" / "golden").glob("*.tar.gz")), ids=lambda a: a.stem)
+def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp_path, archive):
+    with tarfile.open(archive) as packed:
+        packed.extractall(tmp_path, filter="data")
+    (found,) = tmp_path.rglob("session.json")
+    assert "How good it is" in render(Session.open(found.parent))
+    assert len(measure_session(Session.open(found.parent)).summary) == 1
+    for target in ("csv", "boris", "dlc", "movement", "sleap"):
+        assert export(Session.open(found.parent), target, tmp_path).exists()
 
 
 def test_a_session_without_behaviour_has_a_report_too(tmp_path):

@@ -147,6 +147,7 @@ def test_online_every_frame_gets_one_row_and_a_lag_makes_it_better(truth, measur
     for lag in (0, 6):
         online = OnlineTracker(SUBJECT, lag)
         parts = [online.add(seen[k : k + 10]) for k in range(0, len(seen), 10)]
+        assert parts[0] is not None
         assert parts[0].n_frames == 10 - lag
         rows = [part for part in (*parts, online.close()) if part is not None]
         times = np.concatenate([part.times_ns for part in rows])

@@ -41,6 +41,9 @@ def test_an_animal_that_keeps_still_is_not_lost(estimator, toy):
 def test_the_same_seed_gives_the_same_track_and_another_one_does_not(estimator, toy):
     depths = np.repeat(toy.depths[:1], 3, axis=0)
     first, second, other = (follow(estimator, depths, seed)[-1] for seed in (1, 1, 2))
+    assert first is not None
+    assert second is not None
+    assert other is not None
     np.testing.assert_array_equal(first, second)
     assert not np.array_equal(first, other)
 
