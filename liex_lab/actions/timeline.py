@@ -192,7 +192,10 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
             animals.append(np.full(len(row), number[one.animal]))
             recordings.append(np.full(len(row), k))
         runs.append(_runs(one.words, one.track.times_ns, place))
-    return Examples(*(np.concatenate(some) for some in (features, codes, speeds, animals, recordings)), runs)
+    return Examples(
+        np.concatenate(features), np.concatenate(codes), np.concatenate(speeds), np.concatenate(animals),
+        np.concatenate(recordings), runs,
+    )  # fmt: skip
 
 
 def _runs(words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str, int]) -> list[tuple[int, float]]:
