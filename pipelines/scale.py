@@ -125,7 +125,8 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
         "sessions": [{"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
                      for path in recordings for k in range(2)],
     }  # fmt: skip
-    wall, each = {}, []
+    wall: dict[int, float] = {}
+    each: list[float] = []
     for workers in (1, 2):
         study = Study.from_table({**table, "results": f"derivatives/w{workers}"}, folder / "study.toml")
         began = time.perf_counter()

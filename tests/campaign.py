@@ -201,10 +201,9 @@ def fuzz(minutes: float) -> dict[str, Any]:
         copy = Path(shutil.copytree(whole, Path(scratch) / "b.liex"))
         while time.monotonic() < until:
             for law in laws:
-                settings(law, max_examples=2000, deadline=None)()  # type: ignore[operator]
+                settings(max_examples=2000, deadline=None)(law)()
                 found["examples"] += 2000
-            json_law = settings(sessions.test_any_value_anywhere_in_session_json, max_examples=300)
-            json_law(whole, copy)  # type: ignore[operator]
+            settings(max_examples=300)(sessions.test_any_value_anywhere_in_session_json)(whole, copy)
             found["examples"] += 300
     return found
 

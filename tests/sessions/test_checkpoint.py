@@ -43,7 +43,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def disturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
     """A session whose process was killed again and again, and how far it was each time."""
     place = tmp_path_factory.mktemp("killed") / "circle.liex"
-    rng, reached = np.random.default_rng(8), []
+    rng = np.random.default_rng(8)
+    reached: list[int] = []
     for _ in range(N_KILLS):
         process = start(place, pause_s=0.1)
         part, before = place.with_name("circle.liex.part"), reached[-1] if reached else 0
@@ -206,11 +207,12 @@ def test_columns_grow_and_are_cut_back(tmp_path: Path) -> None:
 def test_checkpoints_are_taken_by_a_clock_that_never_jumps(tmp_path: Path) -> None:
     now = [5.0]
     held = Checkpoint(tmp_path / "x.part", {}, lambda: now[0])
-    assert not held.due
+    due = [held.due]
     now[0] += checkpoint.EVERY_S
-    assert held.due
+    due.append(held.due)
     held.save(0, 1.0, {})
-    assert not held.due
+    due.append(held.due)
+    assert due == [False, True, False]
     held.leave(keep=False)
     assert not (tmp_path / "x.part").exists()
 
