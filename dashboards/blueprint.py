@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+_NAMES = {"speed_mm_s": "speed", "nose_height_mm": "nose above the floor", "bend_rad": "bend of the body",
+          "tail_beat_hz": "tail beat"}  # fmt: skip
+
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
     """A Rerun blueprint from the content of session.json; handed to `Session.create` as `blueprint`."""
@@ -29,10 +32,13 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         origin="arena/camera/image", contents=["$origin/**"], name="depth with the fitted skeleton"
     )
     lanes = rrb.StateTimelineView(origin="ethogram", name="actions (predicted) and frames to distrust (tracking)")
+    swims = session["animal"]["joints"][0] == "head"
+    shown = ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
     curves = rrb.Horizontal(
-        rrb.TimeSeriesView(origin="kinematics/speed_mm_s", name="speed"),
-        rrb.TimeSeriesView(origin="kinematics/nose_height_mm", name="nose above the floor"),
+        *(rrb.TimeSeriesView(origin=f"kinematics/{name}", name=_NAMES[name]) for name in shown),
         rrb.TimeSeriesView(origin="error/predicted", name="predicted error"),
+        rrb.TextLogView(origin="log", name="what to look at: click to jump there"),
+        column_shares=[*(2.0 for _ in shown), 2.0, 1.6],
     )
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(scene, picture), lanes, curves, row_shares=[5, 1.6, 2]),

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 WIDTH, LEFT, RIGHT = 920, 64, 22  # shared by all figures over time, so that their axes stand below each other
+ARENA = "the arena"  # the outline that needs no name
+_MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
 ACTION_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933")
 _VIRIDIS = np.array(
@@ -66,13 +68,13 @@ def curve(
     low = min(low, 0.0) if from_zero else low
     spread = max(high - low, 1e-9, 0.02 * abs(high))
     scale = Scale(low, low + spread * 1.06, bottom, top)
-    parts = [_y_axis(scale, unit, 4), _x_axis(time, bottom, top, last)]
+    parts = [y_axis(scale, unit, 4), x_axis(time, bottom, top, last)]
     for start, stop in shaded:
         x0, x1 = float(time(start)), float(time(stop))
         parts.append(f'<rect class="shade" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 0.5):.1f}" '
                      f'height="{bottom - top}"/>')  # fmt: skip
     parts += [f'<path class="curve" stroke="{colour}" d="{d}"/>' for d in _paths(time(time_s), scale(values))]
-    return _svg(WIDTH, height, parts)
+    return svg(WIDTH, height, parts)
 
 
 def lanes(
@@ -81,17 +83,29 @@ def lanes(
     """One row per word of the ethogram, its bouts as bars (start, stop, word) in s; times without a pose hatched."""
     row, top = 18.0, 6.0
     bottom = top + row * max(len(words), 1)
-    parts = [_x_axis(time, bottom, top, False)]
+    parts = [x_axis(time, bottom, top, False)]
     for start, stop in lost:
         parts.append(_bar(time, start, stop, top, bottom - top, "url(#hatch)", "no pose"))
     for k, word in enumerate(words):
         y = top + k * row
         parts.append(f'<text class="label" x="{LEFT - 8}" y="{y + row / 2 + 4:.1f}" text-anchor="end">'
                      f"{escape(word.replace('_', ' '))}</text>")  # fmt: skip
-        for start, stop, action in spans:
-            if action == word:
-                parts.append(_bar(time, start, stop, y + 2, row - 4, action_colour(k), f"{word} {stop - start:.2f} s"))
-    return _svg(WIDTH, bottom + 8, [_HATCH, *parts])
+        own = [(start, stop) for start, stop, action in spans if action == word]
+        for start, stop in _merged(own, time):
+            parts.append(_bar(time, start, stop, y + 2, row - 4, action_colour(k), f"{word} {stop - start:.2f} s"))
+    return svg(WIDTH, bottom + 8, [_HATCH, *parts])
+
+
+def _merged(spans: Sequence[tuple[float, float]], time: Scale) -> list[tuple[float, float]]:
+    """Spans in order, those joined that would be nearer than a hair on the paper: an hour has thousands."""
+    least = 0.25 * (time.high - time.low) / (time.stop - time.start)
+    out: list[tuple[float, float]] = []
+    for start, stop in spans:
+        if out and start - out[-1][1] < least and stop - out[-1][0] < 40 * least:
+            out[-1] = (out[-1][0], stop)
+        else:
+            out.append((start, stop))
+    return out
 
 
 def trajectory(
@@ -103,7 +117,7 @@ def trajectory(
     """
     known = np.isfinite(x_mm) & np.isfinite(y_mm)
     if not known.any():
-        return _svg(size, 40, ['<text class="label" x="10" y="24">no position is known</text>'])
+        return svg(size, 40, ['<text class="label" x="10" y="24">no position is known</text>'])
     margin, plot = 52.0, size - 64.0
     shown = [np.column_stack([x_mm[known], y_mm[known]]), *(corners for _, corners in outlines if len(corners))]
     low, high = np.min([p.min(axis=0) for p in shown], axis=0), np.max([p.max(axis=0) for p in shown], axis=0)
@@ -115,7 +129,7 @@ def trajectory(
     for name, corners in outlines:
         places = " ".join(f"{float(across(x)):.1f},{float(up(y)):.1f}" for x, y in corners)
         parts.append(f'<polygon class="outline" points="{places}"><title>{escape(name)}</title></polygon>')
-    keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), 4000)).astype(int))
+    keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), _MAX_PLACES)).astype(int))
     x, y, t = across(x_mm)[keep], up(y_mm)[keep], time_s[keep]
     span = max(float(t[-1] - t[0]), 1e-9)
     for piece in np.array_split(np.arange(len(keep)), min(64, max(1, len(keep) // 2))):
@@ -128,20 +142,25 @@ def trajectory(
         parts.append(f'<circle class="mark" fill="{colour}" cx="{px:.1f}" cy="{py:.1f}" r="5">'
                      f"<title>{word}</title></circle>")  # fmt: skip
         parts.append(_label_beside(px, py - 6.0, word, size - 52.0, 8.0))
-    return _svg(size, size, parts)
+    for name, corners in outlines:  # last, so that the way does not hide them
+        if name != ARENA and len(corners):
+            place = float(across(corners[:, 0].mean())), float(up(corners[:, 1].max())) + 13.0
+            parts.append(f'<text class="label halo" x="{place[0]:.1f}" y="{place[1]:.1f}" text-anchor="middle">'
+                         f"{escape(name)}</text>")  # fmt: skip
+    return svg(size, size, parts)
 
 
 def histogram(values: Array, unit: str, colour: str, width: int = 420, height: int = 200) -> str:
     """How often values occur, over the range that holds 99 % of them; a line marks the median."""
     known = values[np.isfinite(values)]
     if len(known) == 0:
-        return _svg(width, 40, ['<text class="label" x="10" y="24">no value is known</text>'])
+        return svg(width, 40, ['<text class="label" x="10" y="24">no value is known</text>'])
     bottom = height - 34.0
     top_value = max(float(np.quantile(known, 0.99)), 1e-6)
     counts, edges = np.histogram(np.minimum(known, top_value), bins=30, range=(0.0, top_value))
     across = Scale(0.0, top_value, 52.0, width - 12.0)
     up = Scale(0.0, max(float(counts.max()), 1.0) * 1.08, bottom, 8.0)
-    parts = [_y_axis(up, "frames", 3, 52.0, width - 12.0), _x_ticks(across, bottom, unit, 5)]
+    parts = [y_axis(up, "frames", 3, 52.0, width - 12.0), x_ticks(across, bottom, unit, 5)]
     for count, a, b in zip(counts, edges[:-1], edges[1:], strict=True):
         x0, x1, y = float(across(a)), float(across(b)), float(up(float(count)))
         parts.append(f'<rect fill="{colour}" x="{x0 + 0.5:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 1, 0.5):.1f}" '
@@ -149,7 +168,7 @@ def histogram(values: Array, unit: str, colour: str, width: int = 420, height: i
     at = float(across(float(np.median(known))))
     parts.append(f'<line class="median" x1="{at:.1f}" x2="{at:.1f}" y1="8" y2="{bottom}"/>')
     parts.append(_label_beside(at, 18.0, f"median {float(np.median(known)):.2f} {unit}", width - 120.0, 5.0))
-    return _svg(width, height, parts)
+    return svg(width, height, parts)
 
 
 def budget(shares: Sequence[tuple[str, float, str]]) -> str:
@@ -160,7 +179,7 @@ def budget(shares: Sequence[tuple[str, float, str]]) -> str:
             parts.append(f'<rect fill="{colour}" x="{at * WIDTH:.1f}" y="0" width="{share * WIDTH:.1f}" height="26">'
                          f"<title>{escape(word)} {share:.1%}</title></rect>")  # fmt: skip
         at += share
-    return _svg(WIDTH, 26, parts)
+    return svg(WIDTH, 26, parts)
 
 
 def picture(
@@ -182,7 +201,7 @@ def picture(
         fill = "#fff" if k < len(points) - 1 else "#EE6677"
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.2f}" fill="{fill}" stroke="#222" '
                      f'stroke-width="{0.25 * r:.2f}"/>')  # fmt: skip
-    return _svg(w, h, parts)
+    return svg(w, h, parts)
 
 
 def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
@@ -226,7 +245,8 @@ _HATCH = (
 )
 
 
-def _svg(width: float, height: float, parts: Sequence[str]) -> str:
+def svg(width: float, height: float, parts: Sequence[str]) -> str:
+    """A figure of this size, which scales with the page."""
     return f'<svg viewBox="0 0 {width:g} {height:g}" role="img">{"".join(parts)}</svg>'
 
 
@@ -243,7 +263,8 @@ def _bar(time: Scale, start: float, stop: float, y: float, height: float, fill: 
             f"<title>{escape(title)}</title></rect>")  # fmt: skip
 
 
-def _y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WIDTH - RIGHT) -> str:
+def y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WIDTH - RIGHT) -> str:
+    """Ticks and lines of the upward axis, with its unit."""
     marks = []
     for tick in scale.ticks(about):
         y = float(scale(tick))
@@ -255,7 +276,7 @@ def _y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = W
     return "".join(marks) + label
 
 
-def _x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
+def x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
     """Times below the last of several figures; thin lines in the others."""
     unit, size = ("min", 60.0) if time.high > 180 else ("s", 1.0)
     shown = Scale(time.low / size, time.high / size, time.start, time.stop)
@@ -269,7 +290,8 @@ def _x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
     return "".join(marks)
 
 
-def _x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
+def x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
+    """Ticks below a figure, with their unit."""
     marks = [f'<line class="axis" x1="{scale.start}" x2="{scale.stop}" y1="{bottom}" y2="{bottom}"/>']
     marks += [
         f'<text class="tick" x="{float(scale(tick)):.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>'
@@ -285,7 +307,7 @@ def _frame(across: Scale, up: Scale) -> str:
     bottom, top = up.start, up.stop
     box = (f'<rect class="box" x="{across.start}" y="{top}" width="{across.stop - across.start}" '
            f'height="{bottom - top}"/>')  # fmt: skip
-    return box + _y_axis(up, "mm", 5, across.start, across.stop) + _x_ticks(across, bottom, "mm", 5)
+    return box + y_axis(up, "mm", 5, across.start, across.stop) + x_ticks(across, bottom, "mm", 5)
 
 
 def _paths(x: Array, y: Array) -> list[str]:

@@ -10,7 +10,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from liex_lab.dashboards.report import TEMPLATES, charts, pictures
+from liex_lab.dashboards.charts import charts, curves, pictures
+from liex_lab.dashboards.report import TEMPLATES
 
 from liex_lab.sessions import Session
 
@@ -19,7 +20,7 @@ _STYLE = f"""
 :root {{ color-scheme: light; }}
 main {{ width: {WIDTH}px; padding: 18px 22px; }}
 .strip {{ grid-template-columns: repeat(4, 1fr); }}
-.title {{ margin-top: 8px; }}
+.title {{ margin: 8px 0 0; font-size: 13px; font-weight: 600; }}
 .pair div svg .tick, .pair div svg .label {{ font-size: 15px; }}
 svg image {{ image-rendering: pixelated; }}
 .pair {{ display: grid; grid-template-columns: 310px 1fr; gap: 22px; margin-top: 8px; }}
@@ -34,9 +35,9 @@ def page(session: Session) -> str:
     strip = "".join(
         f"<figure>{svg}<figcaption>{caption}</figcaption></figure>" for svg, caption in pictures(session)
     )
-    titled = {"lanes": "Actions", "speed": "Speed of the body centre", "nose": "Height of the nose",
-              "error": "Joint error to be expected"}  # fmt: skip
-    lines = "".join(f'<p class="title">{title}</p><figure>{drawn[name]}</figure>' for name, title in titled.items())
+    titled = [("Actions", drawn["lanes"]), *((title, svg) for title, _, svg in curves(session)),
+              ("Joint error to be expected", drawn["error"])]  # fmt: skip
+    lines = "".join(f'<p class="title">{title}</p><figure>{svg}</figure>' for title, svg in titled)
     way = f'<figure><p class="title">Way over the floor</p>{drawn["way"]}</figure>'
     css = (style[1] if style else "") + _STYLE
     body = f'<div class="strip">{strip}</div><div class="pair">{way}<div>{lines}</div></div>'

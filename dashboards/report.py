@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from liex_lab.dashboards import figures
-from numpy.typing import NDArray
+from liex_lab.dashboards.charts import around_actions, charts, curves, has, pictures
+from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 
 from liex_lab.sessions import Session
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
-
 TEMPLATES = Path(__file__).parent / "templates"
-_SPEED, _HEIGHT, _ERROR = "#4477AA", "#228833", "#EE6677"
 _TABLES = {
     "frames": "frames.parquet", "poses": "poses.parquet", "rotations": "rotations.parquet",
     "kinematics": "kinematics.parquet", "bouts": "bouts.parquet", "gaps": "gaps.parquet", "flips": "flips.parquet",
-    "sessions": "sessions.parquet", "summary": "summary.csv",
+    "sessions": "sessions.parquet", "summary": "summary.csv", "transitions": "transitions.parquet",
+    "activity": "activity.parquet", "zones": "zones.parquet",
 }  # fmt: skip
 
 
@@ -47,11 +43,18 @@ def render(session: Session) -> str:
         animal=session.metadata["animal"]["name"],
         headline=headline(session),
         cards=cards(session),
-        problems=session.metadata["problems"],
+        subject=", ".join(f"{name.replace('_', ' ')} {value}" for name, value in session.metadata["subject"].items()),
+        warnings=warnings(session),
+        account=frame_account(session),
+        flips=flip_rows(session),
         pictures=pictures(session),
         charts=charts(session, words),
+        curves=curves(session),
+        around=around_actions(session, words),
         actions=[(word, figures.action_colour(k), session.metadata["actions"][word]) for k, word in enumerate(words)],
-        summary=summary_rows(session),
+        summary=summary_rows(session, words),
+        budget=budget_rows(session, words),
+        zones=zone_rows(session),
         facts=facts(session),
         gaps=gap_rows(session),
         methods=methods(session),
@@ -73,97 +76,65 @@ def headline(session: Session) -> str:
 def cards(session: Session) -> list[tuple[str, str, str]]:
     """The few numbers to see first: (value, unit, what)."""
     frames = session.metadata["frames"]
-    shown = [(f"{frames['n_observed'] / frames['n_frames']:.1%}", "", "of the frames with a pose")]
+    good = [(f"{frames['n_observed'] / frames['n_frames']:.1%}", "", "of the frames with a pose")]
     error = session.frames["predicted_error_mm"].median()
     if np.isfinite(error):
-        shown.append((f"{error:.1f}", "mm", "predicted joint error, median"))
-    if (session.path / "summary.csv").is_file():
-        row = session.summary.iloc[0]
-        shown = [
-            (f"{row['distance_m']:.2f}", "m", "distance"),
-            (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed"),
-            (f"{int(row['rear_count'])}", "", f"rears, {row['rear_s']:.1f} s in all"),
-            *shown,
-        ]
-    return shown
+        good.append((f"{error:.1f}", "mm", "predicted joint error, median"))
+    if not has(session, "summary.csv"):
+        return good
+    row = session.summary.iloc[0]
+    shown = [(f"{row['distance_m']:.2f}", "m", "distance"), (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed")]
+    if "rear_count" in row and "tail_beat_hz" not in row:
+        shown.append((f"{int(row['rear_count'])}", "", f"rears, {row['rear_s']:.1f} s in all"))
+    elif np.isfinite(row.get("tail_beat_hz", np.nan)):
+        shown.append((f"{row['tail_beat_hz']:.1f}", "Hz", "tail beat, median"))
+    return [*shown, *good]
 
 
-def pictures(session: Session) -> list[tuple[str, str]]:
-    """The kept depth pictures with the skeleton over them: (SVG, caption)."""
-    import cv2
-
-    made = []
-    kept = session.metadata.get("thumbnails", [])
-    frames = session.frames.set_index("frame_index")
-    poses = session.table("poses", ["frame_index", "u_px", "v_px"], [entry["frame_index"] for entry in kept])
-    bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
-    for entry in kept:
-        depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
-        if depth is None:
-            continue
-        index = entry["frame_index"]
-        uv = poses.loc[poses["frame_index"] == index, ["u_px", "v_px"]].to_numpy(float)
-        reach_mm = 0.9 * float(frames["spine_mm"].median())  # an animal on its feet is about half its length high
-        drawn = figures.picture(np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm)
-        made.append((drawn, f"frame {index}, {frames.loc[index, 'time_s']:.2f} s"))
-    return made
-
-
-def charts(session: Session, words: list[str]) -> dict[str, str]:
-    """All figures, by name; empty where the session has no numbers for one."""
-    frames, bouts = session.frames, session.bouts
-    time_s = frames["time_s"].to_numpy(float)
-    time = figures.time_scale(session.metadata["frames"]["duration_s"])
-    spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
-    empty = session.gaps[session.gaps["n_frames_missing"] > 0]  # the others are stamps that were moved
-    lost = list(zip(empty["start_s"], empty["stop_s"], strict=True))
-    error = frames["predicted_error_mm"].to_numpy(float)
-    drawn = dict.fromkeys(("lanes", "way", "speed", "nose", "error", "errors", "budget"), "")
-    if words or lost:
-        drawn["lanes"] = figures.lanes(spans, words, lost, time)
-    if (session.path / "kinematics.parquet").is_file():
-        moved = session.kinematics
-        rears = [(start, stop) for start, stop, action in spans if action == "rear"]
-        speed, nose = (_across_gaps(moved[name], frames) for name in ("speed_mm_s", "nose_height_mm"))
-        drawn["way"] = figures.trajectory(
-            *(_across_gaps(moved[name], frames) for name in ("x_mm", "y_mm")), time_s, outlines(session)
-        )
-        drawn["speed"] = figures.curve(time_s, speed, time, "mm/s", _SPEED)
-        drawn["nose"] = figures.curve(time_s, nose, time, "mm", _HEIGHT, shaded=rears)
-    drawn["error"] = figures.curve(time_s, _across_gaps(frames["predicted_error_mm"], frames), time, "mm", _ERROR,
-                                   last=True)  # fmt: skip
-    drawn["errors"] = figures.histogram(error, "mm", _ERROR)
-    if (session.path / "summary.csv").is_file():
-        row = session.summary.iloc[0]
-        shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
-                  if f"{word}_share" in row]  # fmt: skip
-        drawn["budget"] = figures.budget(shares)
-    return drawn
-
-
-def outlines(session: Session) -> list[tuple[str, Array]]:
-    """The arena's walls and the zones, by name: corners (n, 2) mm."""
-    walls = session.arena.outline_mm()
-    known = [("the arena", walls)] if len(walls) else []
-    return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
-
-
-def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:
-    """Values (n,) with the first one after a gap of the camera taken out, so that no line is drawn across it."""
-    return np.asarray(values.where(frames["gap_before"] == 0), float)
-
-
-def summary_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The summary as (column, value, unit, meaning)."""
-    if not (session.path / "summary.csv").is_file():
+def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
+    """The summary as (column, value, unit, meaning), but for the columns of the actions and zones."""
+    if not has(session, "summary.csv"):
         return []
     described = session.columns[session.columns["table"] == "summary"].set_index("name")
     row = session.summary.iloc[0]
+    elsewhere = {"session_id", "individual", *(f"{word}_{what}" for word in words for what, _ in _BUDGET)}
+    elsewhere |= {f"zone_{zone.name}_{what}" for zone in session.zones for what in ("s", "share")}
     return [
         (name, f"{row[name]:.1%}" if name.endswith("_share") else _number(row[name]),
          "" if name.endswith("_share") else str(described.loc[name, "unit"]), str(described.loc[name, "meaning"]))
-        for name in session.summary.columns if name not in ("session_id", "individual")
+        for name in session.summary.columns if name not in elsewhere
     ]  # fmt: skip
+
+
+_BUDGET = (("count", "bouts"), ("s", "time, s"), ("share", "share"), ("mean_s", "mean, s"),
+           ("per_min", "per minute"), ("latency_s", "first after, s"))  # fmt: skip
+
+
+def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
+    """A row per action: name, colour, and the numbers that `_BUDGET` names."""
+    if not has(session, "summary.csv"):
+        return []
+    row = session.summary.iloc[0]
+    rows = []
+    for k, word in enumerate(words):
+        if f"{word}_s" in row:  # sessions of an older version lack some of the others
+            values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
+            texts = [f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
+                     for value, (what, _) in zip(values, _BUDGET, strict=True)]  # fmt: skip
+            rows.append((word, figures.action_colour(k), texts))
+    return rows
+
+
+def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
+    """A row per zone: name; time, share, visits, first after, mean visit, distance."""
+    if not has(session, "zones.parquet"):
+        return []
+    table = session.table("zones")
+    numbers = table[["time_s", "n_visits", "latency_s", "mean_visit_s", "distance_mm"]].to_numpy(float)
+    return [
+        (str(name), [_number(row[0]), f"{share:.1%}", f"{row[1]:.0f}", *(_number(value) for value in row[2:])])
+        for name, share, row in zip(table["zone"], table["share"], numbers, strict=True)
+    ]
 
 
 def facts(session: Session) -> list[tuple[str, str]]:
@@ -261,7 +232,7 @@ def _behaviour_methods(session: Session) -> list[str]:
 
 def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
     """The columns of every table that the session holds: (file, columns)."""
-    columns = session.columns.fillna("")
+    columns = session.columns.astype(object).where(session.columns.notna(), "")
     return [
         (file, columns[columns["table"] == table].to_dict("records"))
         for table, file in _TABLES.items() if (session.path / file).is_file()
@@ -278,5 +249,5 @@ def _number(value: Any) -> str:
 
 
 def _clock(seconds: float) -> str:
-    minutes, rest = divmod(seconds, 60)
+    minutes, rest = divmod(round(seconds, 1) if seconds < 60 else round(seconds), 60)
     return f"{rest:.1f} s" if minutes < 1 else f"{minutes:.0f} min {rest:.0f} s"

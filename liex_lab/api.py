@@ -5,14 +5,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
+from liex_lab.progress import Board, Progress, progress_board, silent
+from liex_lab.study import Study
 
 if TYPE_CHECKING:
+    from liex_lab.pipelines.study_state import Standing
+    from liex_lab.pipelines.verify import Finding
     from liex_lab.recordings.recording import Recording
 
 DEMO = "mouse_walk.mcap"
@@ -23,12 +27,15 @@ def run_session(
     plan: Plan | None = None,
     out: str | Path = ".",
     *,
+    folder: Path | None = None,
     overwrite: bool = False,
+    notes: Mapping[str, Any] | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording and write the session folder `out/<recording's name>.liex`; returns it.
 
-    recording: a path, or a recording that is open already; plan: None takes the mouse's. Raises a LiexError that says
+    recording: a path, or a recording that is open already; plan: None takes the mouse's; folder: the session folder
+    itself, where it should have another name; notes: what session.json is to hold besides. Raises a LiexError that says
     what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
     from liex_lab.dashboards.blueprint import replay_blueprint
@@ -37,8 +44,44 @@ def run_session(
 
     plan = plan or Plan.load("mouse")
     return measure_session(
-        recording, plan, out, overwrite=overwrite, blueprint=replay_blueprint, report=write_report, progress=progress
+        recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
+        report=write_report, progress=progress,
+    )  # fmt: skip
+
+
+def flip_session(
+    session: str | Path, start_s: float, stop_s: float, *, undo: bool = False, progress: Progress = silent
+) -> Path:
+    """Exchange head and tail in a span of a session, or take that back; everything in the folder follows.
+
+    start_s, stop_s: seconds since the first frame, stop_s exclusive. The tables as they were tracked stay beside.
+    """
+    from liex_lab.dashboards.blueprint import replay_blueprint
+    from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.flip import flip_span
+
+    return flip_span(
+        session, start_s, stop_s, undo=undo, blueprint=replay_blueprint, report=write_report, progress=progress
     )
+
+
+def follow_live(
+    source: str, plan: Plan, *, replay: bool = False, to: str = "viewer", patience_s: float = 3.0,
+    progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured latencies."""
+    from liex_lab.pipelines.live import follow_live as job
+    from liex_lab.pipelines.live import open_live
+    from liex_lab.sessions.live import LiveView
+
+    arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
+    numbers, _ = job(
+        arriving, plan, progress=progress,
+        viewer=lambda tracker, arriving: LiveView(
+            arriving.name, arriving.camera, tracker.subject.T_arena_camera, tracker.subject.skeleton, to
+        ),
+    )  # fmt: skip
+    return numbers
 
 
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
@@ -46,6 +89,67 @@ def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     from liex_lab.catalog import find_sample
 
     return run_session(find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress)
+
+
+def run_study(
+    study: str | Path,
+    *,
+    workers: int = 0,
+    scheduler: str | None = None,
+    slurm: str | Path | None = None,
+    retry: bool = False,
+    again: bool = False,
+    only: Sequence[str] = (),
+    dry_run: bool = False,
+    board: Callable[[int], AbstractContextManager[Board]] = progress_board,
+) -> list[Standing]:
+    """Measure what is to be done of a study; returns where every session stands then.
+
+    workers: processes on this machine, 0 one for every two cores; scheduler: the address of a Dask scheduler; slurm: a
+    file that says how to ask Slurm; retry: try failed sessions again; again: all sessions; only: ids of sessions;
+    dry_run: only look. A session that fails leaves failed.json and stops no other.
+    """
+    from liex_lab.pipelines.study import run_study as job
+
+    return job(Study.load(study), run_session, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry,
+               again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
+
+
+def verify_session(
+    session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
+) -> list[Finding]:
+    """Whether a session is what it was when it was written; with its recording, whether that gives the same again."""
+    from liex_lab.pipelines.verify import verify_session as job
+
+    return job(session, run_session, None if recording is None else str(recording), progress)
+
+
+def run_scale(
+    n_frames: int = 900, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
+) -> dict[str, Any]:
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
+    from liex_lab.pipelines.scale import evaluate_scale
+
+    return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
+
+
+def evaluate_tracking(
+    animal: str = "mouse",
+    sequence: str = "hard",
+    *,
+    model: str | Path | None = None,
+    n_frames: int | None = None,
+    figure: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error over time."""
+    from functools import partial
+
+    from liex_lab.dashboards.tracking_figure import draw_tracking
+    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+
+    draw = None if figure is None else partial(draw_tracking, path=figure)
+    return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
 
 
 def run_tables(

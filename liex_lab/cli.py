@@ -17,6 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
+from liex_lab.cli_results import compare, export
+from liex_lab.cli_study import cohort, scale, verify
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -32,6 +34,11 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
+app.command()(cohort)
+app.command()(verify)
+evaluate.command("scale")(scale)
+app.command()(compare)
+app.command()(export)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
@@ -144,15 +151,46 @@ def convert(
 
 @app.command()
 def train(
-    animal: Annotated[str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, or a skeleton's .toml file.")],
+    animal: Annotated[
+        str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml file; or: actions.")
+    ],
     variant: VariantName = "default",
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz (of actions: .skops).")
+    ] = None,
     workers: Annotated[int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")] = 0,
     n_images: Annotated[
         int | None, typer.Option("--images", min=512, help="Pictures to train on, for a quick look.")
     ] = None,
+    of: Annotated[str, typer.Option("--animal", help="Of `train actions`: whose actions, fish or mouse.")] = "mouse",
+    sessions: Annotated[
+        list[Path] | None, typer.Option("--session", help="Of `train actions`: a labelled session; repeatable.")
+    ] = None,
+    labels: Annotated[
+        list[Path] | None,
+        typer.Option("--labels", metavar="FILE", help="Of `train actions`: .csv, .parquet, or .boris; repeatable."),
+    ] = None,
+    pose_model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="Of `train actions`: the model that measures poses.")
+    ] = None,
 ) -> None:
-    """Make an animal's model from rendered pictures; the same again, byte for byte, whenever it is run."""
+    """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
+
+    `liex train actions` makes the model that names actions: from sessions that people labelled, or, without any, from
+    virtual animals that act.
+    """
+    if animal == "actions":
+        from liex_lab.pipelines.actions import train_actions
+
+        with progress_bar() as progress:
+            model, report = train_actions(
+                out or Path(f"{of}-actions.skops"), animal=of, sessions=sessions or (), labels=labels or (),
+                pose_model=pose_model, progress=progress,
+            )  # fmt: skip
+        if report:
+            _tell_numbers(report, None)
+        typer.echo(f"model: {model}")
+        return
     from liex_lab.pipelines.train import train_model
 
     with progress_bar() as progress:
@@ -243,6 +281,57 @@ def evaluate_tables(
         typer.echo(path)
 
 
+@evaluate.command("actions")
+def evaluate_actions(
+    animal: AnimalName = "fish",
+    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
+    pose_model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
+    ] = None,
+    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings."""
+    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, model=model, pose_model=pose_model, minutes=minutes, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@evaluate.command("tracking")
+def evaluate_tracking(
+    animal: AnimalName = "mouse",
+    sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
+    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
+    n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
+    from liex_lab.api import evaluate_tracking as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@evaluate.command("statistics")
+def evaluate_statistics(
+    n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
+    effect: Annotated[
+        float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
+    ] = 1.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How often the comparison of groups is wrong on studies without an effect, and how often it finds one."""
+    from liex_lab.pipelines.evaluate_statistics import evaluate_statistics as measure
+
+    with progress_bar() as progress:
+        result = measure(n_studies, effect, progress=progress)
+    _tell_numbers(result, json_file)
+
+
 @evaluate.command("nyu")
 def evaluate_nyu(
     reference: Annotated[
@@ -277,6 +366,58 @@ def evaluate_reference(
 
 
 @app.command()
+def suggest(
+    session: SessionPath,
+    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
+    n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
+) -> None:
+    """List the stretches of a session most worth labelling next: where the recogniser is least sure."""
+    from liex_lab.pipelines.actions import suggest as job
+
+    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
+    for row in job(session, model=model, n=n).itertuples():
+        numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
+        table.add_row(*numbers[:2], str(row.guess), str(row.or_else), numbers[2])
+    Console().print(table)
+
+
+@app.command()
+def live(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")],
+    plan: PlanName = "mouse",
+    settings: Settings = None,
+    replay: Annotated[bool, typer.Option("--replay", help="Send a whole recording at its own pace.")] = False,
+    to: Annotated[str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")] = "viewer",
+    patience_s: Annotated[float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")] = 3.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.api import follow_live
+
+    with progress_bar() as progress:
+        result = follow_live(source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@app.command()
+def flip(
+    session: SessionPath,
+    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
+    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
+    undo: Annotated[bool, typer.Option("--undo", help="Take back corrections within this span.")] = False,
+) -> None:
+    """Say that head and tail are exchanged in a span of a session; tables, replay and report follow."""
+    from liex_lab.api import flip_session
+
+    with progress_bar() as progress:
+        done = flip_session(session, start_s, stop_s, undo=undo, progress=progress)
+    _tell_session(done)
+
+
+@app.command()
 def show(
     session: SessionPath,
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser instead of a window.")] = False,
@@ -290,7 +431,7 @@ def show(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
-    command = [sys.executable, "-m", "rerun", str(replay), *(["--web-viewer"] if web else [])]
+    command = [sys.executable, "-m", "rerun", str(replay), "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
 
 

@@ -23,6 +23,10 @@ class SessionError(LiexError):
     """A session folder that is missing, unfinished or not ours."""
 
 
+class StudyError(LiexError):
+    """A study file, or something in it, that cannot be used."""
+
+
 class EstimationError(LiexError):
     """A recording in which the animal cannot be measured."""
 

@@ -19,6 +19,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 _HERE = Path(__file__).resolve().parent
+_NOT_PLANS = {"slurm"}  # it says where sessions are measured, not how
 _HEADER = """\
 # A plan of liex_lab: everything a run depends on. Copy this file, change the copy, and name it:
 #     liex run RECORDING --plan my-plan.toml
@@ -150,12 +151,28 @@ class Estimation(_Table):
     )
 
 
+class Tracking(_Table):
+    """[tracking]: from the frames' poses to a curve."""
+
+    bridge_s: NotNegative = Field(
+        0.5, description="a stretch without a measurement that is no longer than this is bridged and flagged so"
+    )
+
+
 class SessionFacts(_Table):
     """[session]: facts about the animal and the day, copied into every table."""
 
+    name: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+@-]{0,199}$",
+        description="the session's id in every table, and the name of its folder; not set: the recording's name",
+    )
     individual: str = Field("animal", description="name of the animal within this session")
     subject_id: str | None = Field(None, description="the animal's identity across the whole study")
     group: str | None = Field(None, description="experimental group of the animal")
+    cage: str | None = Field(None, description="home cage or tank of the animal")
+    sex: str | None = Field(None, description="sex of the animal")
+    batch: str | None = Field(None, description="batch of the experiment")
     session_start_time: str | None = Field(
         None, description="ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording says"
     )
@@ -207,6 +224,16 @@ class Behaviour(_Table):
         return self
 
 
+class Actions(_Table):
+    """[actions]: who names what the animal does."""
+
+    model: str | None = Field(
+        None,
+        description="an action model by the animal's name, or the path of a .skops made by `liex train actions`; not "
+        "set: the animal's bundled one, where there is one; 'rules': the thresholds of [behaviour]",
+    )
+
+
 class Plan(_Table):
     """Everything a run depends on. Units are in the names; None is 'not set'."""
 
@@ -218,7 +245,9 @@ class Plan(_Table):
     arena: ArenaFacts = ArenaFacts()
     foreground: Foreground = Foreground()
     estimation: Estimation = Estimation()
+    tracking: Tracking = Tracking()
     session: SessionFacts = SessionFacts()
+    actions: Actions = Actions()
     behaviour: Behaviour = Behaviour()
 
     @staticmethod
@@ -242,7 +271,7 @@ class Plan(_Table):
         """The plan in a TOML text; `origin` names the file in errors."""
         try:
             table = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise PlanError(
                 f"{origin} should be a TOML file, but: {error}; compare it with `liex info --plan`"
             ) from None
@@ -298,7 +327,7 @@ def plans_folder() -> Path:
 
 def known_plans() -> list[str]:
     """The names of the bundled plans."""
-    return sorted(path.stem for path in plans_folder().glob("*.toml"))
+    return sorted(path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS)
 
 
 def _read(path: Path) -> str:
@@ -324,7 +353,7 @@ def _value(dotted: str, text: str) -> Any:
     """The value that a person typed after --set: as TOML, or as the plain word it is."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
     annotation = _settings().get(dotted)
     takes_text = str in (get_args(annotation) or (annotation,))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -45,3 +46,79 @@ def progress_bar() -> Iterator[Progress]:
             display.update(task, completed=done, total=total, description=what)
 
         yield report
+
+
+class Board:
+    """How far many jobs are that run at once: a bar for each that runs, one for all, and a line for each that ended."""
+
+    def __init__(self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        """say: takes the lines; clock: seconds that only go on, whatever the computer's clock is set to."""
+        self._n, self._say, self._clock = n_jobs, say, clock
+        self._began = clock()
+        self._running: dict[str, float] = {}  # job -> share of it that is done
+        self.n_ended = self.n_failed = 0
+
+    def told(self, name: str, done: int, total: int | None, what: str) -> None:
+        """A job is so far: pieces done, pieces in all, what is being done."""
+        self._running[name] = min(done / total, 1.0) if total else self._running.get(name, 0.0)
+
+    def ended(self, name: str, sentence: str, failed: bool) -> None:
+        """A job is over."""
+        self._running.pop(name, None)
+        self.n_ended, self.n_failed = self.n_ended + 1, self.n_failed + failed
+        left = self.left_s
+        wait = f", about {_span(left)} left" if left is not None and self.n_ended < self._n else ""
+        self._say(f"{self.n_ended} of {self._n}: {name} {sentence}{wait}")
+
+    @property
+    def share(self) -> float:
+        """How much of the whole is done, 0 to 1."""
+        return min((self.n_ended + sum(self._running.values())) / self._n, 1.0) if self._n else 1.0
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until all are done if it goes on like this; None where nothing is known yet."""
+        share, spent = self.share, self._clock() - self._began
+        return spent * (1.0 - share) / share if share > 0 else None
+
+    @property
+    def lines(self) -> list[tuple[str, float]]:
+        """The jobs that run, and how much of each is done."""
+        return sorted(self._running.items())
+
+
+def _span(seconds: float) -> str:
+    """A time as people say it."""
+    minutes = seconds / 60
+    if minutes < 1.5:
+        return f"{seconds:.0f} s"
+    if minutes < 90:
+        return f"{minutes:.0f} min"
+    return f"{minutes / 60:.1f} h" if minutes < 2880 else f"{minutes / 1440:.1f} days"
+
+
+@contextmanager
+def progress_board(n_jobs: int) -> Iterator[Board]:
+    """A board on standard error; bars only where that is a terminal, the lines always."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    board = Board(n_jobs, lambda line: console.print(Text(line), highlight=False, soft_wrap=True))
+
+    def draw() -> Table:
+        grid = Table.grid(padding=(0, 2))
+        for name, share in [*board.lines, ("all", board.share)]:
+            filled = round(30 * share)
+            grid.add_row(Text(name), Text("█" * filled + "·" * (30 - filled)), Text(f"{100 * share:.0f} %"))
+        left = board.left_s
+        grid.add_row(Text("" if left is None else f"about {_span(left)} left"))
+        return grid
+
+    if not console.is_terminal:
+        yield board
+        return
+    with Live(get_renderable=draw, console=console, refresh_per_second=4, transient=True):
+        yield board

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from liex_lab.actions.timeline import TimelineModel
     from liex_lab.behaviour.bouts import MouseRules
+    from liex_lab.behaviour.places import Surroundings
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
@@ -131,7 +133,8 @@ def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
     build_zones(plan)  # a slip in their file is told before any work is done
     estimator = build_estimator(plan)
     scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
-    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, plan.estimation.doubtful_above_mm)
+    limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
+    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)
 
 
 def build_scene(
@@ -191,8 +194,32 @@ def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
     return read_zones(plan.arena.zones) if plan.arena.zones else ()
 
 
+def build_surroundings(provenance: Provenance) -> Surroundings:
+    """What measures of behaviour have to know of arena, zones and water."""
+    from liex_lab.behaviour.places import Surroundings, surface_height_mm
+
+    surface = surface_height_mm(provenance.floor_distance_mm, provenance.optics)
+    return Surroundings(provenance.arena, [zone.name for zone in provenance.zones], surface)
+
+
 def build_rules(plan: Plan) -> MouseRules:
     """The thresholds of the behaviours."""
     from liex_lab.behaviour.bouts import MouseRules
 
     return MouseRules(**plan.behaviour.model_dump())
+
+
+def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
+    """The recogniser of the plan: the named one, or the animal's bundled one; None where the rules name actions."""
+    from liex_lab.actions.storage import bundled_action_models, load_action_model
+
+    name = plan.actions.model
+    if name == "rules" or (name is None and skeleton.name not in bundled_action_models()):
+        return None
+    model = load_action_model(name or skeleton.name)
+    if model.skeleton != skeleton.name:
+        raise PlanError(
+            f"the action model '{name}' was made for the skeleton {model.skeleton}, but the plan says {skeleton.name}; "
+            "set actions.model to another one, or to 'rules'"
+        )
+    return model

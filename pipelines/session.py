@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from liex_lab.pipelines.build import build_provenance, build_recording, build_rules, build_tracker
+from liex_lab.pipelines.build import (
+    build_provenance,
+    build_recogniser,
+    build_recording,
+    build_rules,
+    build_surroundings,
+    build_tracker,
+)
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from liex_lab.actions.timeline import TimelineModel
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
 CHUNK = 32  # frames in memory at a time
 
@@ -23,36 +33,73 @@ def measure_session(
     plan: Plan,
     out: str | Path,
     *,
+    folder: Path | None = None,
     overwrite: bool = False,
+    notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`.
+    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
 
-    blueprint and report make the views that lie in the folder; see `Session.create`.
+    notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
+    lie in the folder, see `Session.create`.
     """
-    from liex_lab.behaviour.summary import measure
     from liex_lab.sessions import Session
-    from liex_lab.sessions.writer import check_place
+    from liex_lab.sessions.checkpoint import check_free, hash_once
+    from liex_lab.sessions.place import check_place, part_folder
+    from liex_lab.tracking.observations import Observations
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
-        folder = Path(out) / f"{opened.name}.liex"
+        folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
         check_place(folder, overwrite)
+        check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
         tracker = build_tracker(opened, plan)
+        build_recogniser(plan, tracker.estimator.skeleton)  # a slip in its name is told before any work is done
+        hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
-            for frames in opened.chunks(CHUNK):
+            writer.go_on(lambda row: opened.frame(row).depth)
+            for frames in opened.chunks(CHUNK, writer.n_frames):
                 began = time.perf_counter()
-                track = tracker.follow(frames)
+                seen = tracker.observe(frames)
                 timings["track"] += time.perf_counter() - began
-                writer.add(frames, track)
+                writer.add(frames, seen=seen)
                 progress(frames[-1].index + 1, len(opened), "measuring poses")
-            writer.note(problems=opened.problems)
-            zones = [zone.name for zone in provenance.zones]
-            behaviour = measure(writer.frames, writer.poses, build_rules(plan), zones)
-            session = writer.close(timings_s=timings, **behaviour.for_session())
+            began = time.perf_counter()
+            whole = writer.seen(Observations)
+            writer.take(tracker.track(whole), whole, tracker.subject)
+            timings["track"] += time.perf_counter() - began
+            writer.note(problems=opened.problems, **dict(notes or {}))
+            session = conclude(writer, plan, timings)
     return session.path
+
+
+def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
+    """Measure the behaviour of a session whose track is known, and put the session in its place."""
+    from liex_lab.behaviour.summary import measure
+
+    around = build_surroundings(writer.origin)
+    recogniser = build_recogniser(plan, writer.origin.skeleton)
+    named = {} if recogniser is None else name_actions(recogniser, writer)
+    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
+    return writer.close(timings_s=timings, **behaviour.for_session())
+
+
+def name_actions(recogniser: TimelineModel, writer: SessionWriter) -> dict[str, Any]:
+    """The ethogram of a session's track by a recogniser, as `behaviour.measure` takes it; what the frame rate cannot
+    tell is noted in the session.
+    """
+    from liex_lab.actions.tables import bout_rows
+
+    frames = writer.frames
+    found = recogniser.recognise(writer.track, frames["wall_distance_mm"].to_numpy(float))
+    writer.note(
+        action_model={"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
+        unresolved_actions=found.unresolved,
+    )
+    actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
+    return {"bouts": bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", ""))), "actions": actions}

@@ -119,7 +119,7 @@ def train_model(
 
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
     """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and the calibration."""
-    from liex_lab.estimation.calibration import calibrate, with_corrector
+    from liex_lab.estimation.calibration import calibrate, with_corrector, with_settler
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
     from liex_lab.recordings.worlds import world_of
@@ -141,10 +141,11 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         "images": world_of(skeleton).sources,
     }  # fmt: skip
     model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
-    if method.corrector is not None and recipe.n_correction:
+    if recipe.n_correction and (method.corrector is not None or method.settle):
         progress(steps - 1, steps, "learning the last correction")
         unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_correction, silent)
-        model = with_corrector(model, unseen, np.random.default_rng([recipe.seed, _CORRECTION]))
+        own = np.random.default_rng([recipe.seed, _CORRECTION])
+        model = with_settler(with_corrector(model, unseen, own), unseen, own)
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
         first = recipe.n_images + recipe.n_correction

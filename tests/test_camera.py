@@ -134,3 +134,13 @@ def test_coefficients_of_zero_are_no_distortion(model: str, k: list[float]) -> N
 def test_a_camera_of_any_lens_survives_its_own_table(lens: Distortion | None) -> None:
     camera = replace(PRIMESENSE, distortion=lens)
     assert Camera.from_dict(json.loads(json.dumps(camera.to_dict())) | {"floor_distance_mm": 700.0}) == camera
+
+
+@given(camera=cameras, stride=st.integers(1, 4), x=st.floats(-90, 90), y=st.floats(-90, 90), z=st.floats(150, 900))
+def test_a_camera_of_every_other_pixel_sees_the_same_in_fewer_pixels(
+    camera: Camera, stride: int, x: float, y: float, z: float
+) -> None:
+    coarse = camera.every(stride)
+    np.testing.assert_allclose(stride * coarse.project([x, y, z]), camera.project([x, y, z]), atol=1e-9)
+    assert coarse.width == len(range(0, camera.width, stride))
+    assert coarse.height == len(range(0, camera.height, stride))

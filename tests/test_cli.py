@@ -21,8 +21,8 @@ from liex_lab import api, cli
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
-VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "show", "info"]
-MEASURES = ["pose", "speed", "sizes", "tables", "reference"]
+VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "flip", "show", "info"]
+MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking"]
 
 
 def liex(

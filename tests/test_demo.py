@@ -12,8 +12,8 @@ from liex_lab.pipelines.sample import LEFT_OUT, N_FRAMES, virtual_mouse
 import liex_lab
 from liex_lab import catalog
 from liex_lab.api import run_session
-from liex_lab.behaviour.columns import ACTIONS
 from liex_lab.errors import LiexError
+from liex_lab.recordings.mouse_acts import ACTIONS
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import FILES
 from tests.recordings.writers import depth_frames, write_mcap
@@ -68,10 +68,12 @@ def test_the_tables_say_what_the_animal_did(session: Session) -> None:
     row = session.summary.iloc[0]
     steps = np.linalg.norm(np.diff(mouse.joints_arena[:, :-1, :2].mean(axis=1), axis=0), axis=-1)
     assert row["distance_m"] == pytest.approx(steps.sum() / 1000, rel=0.15)
-    assert row["rear_count"] == 1
-    assert 0.4 < row["rear_s"] < 1.6
-    assert row["walk_s"] > 3.0
+    assert row["rear_supported_count"] + row["rear_unsupported_count"] == 1
+    assert 0.4 < row["rear_supported_s"] + row["rear_unsupported_s"] < 1.8
+    assert row["walk_s"] > 1.5
     assert set(session.bouts["action"]) <= set(ACTIONS)
+    assert set(session.bouts["source"]) == {"model"}
+    assert set(session.metadata["actions"]) == set(ACTIONS)
 
 
 def test_a_session_can_be_made_again_from_its_own_plan(session: Session, tmp_path: Path) -> None:

@@ -12,12 +12,11 @@ from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import cli
-from liex_lab.behaviour.columns import COLUMNS
+from liex_lab.behaviour.listing import FIRST, all_columns, first_columns
 from liex_lab.body import Skeleton
 from liex_lab.plan import Plan
 from liex_lab.recordings.zones import read_zones
 from liex_lab.sessions.session import FILES
-from liex_lab.sessions.tables import TABLES
 from tests.conftest import REPOSITORY
 
 TEXT = (REPOSITORY / "README.md").read_text(encoding="utf-8")
@@ -39,20 +38,17 @@ def test_every_file_and_every_link_is_there() -> None:
     assert (REPOSITORY / "dashboards" / "assets" / "demo.png").stat().st_size <= 150_000
 
 
-def test_every_column_is_one_with_its_unit() -> None:
-    described = {(c.table, c.name): c.unit for c in [*COLUMNS, *(c for rows in TABLES.values() for c in rows)]}
-    rows = re.findall(r"^\| ([a-z]+) \| (`[^|]*`) \|([^|]*)\|", section("What comes out"), re.MULTILINE)
-    assert len(rows) > 12
-    for table, names, units in rows:
-        known = [described["frames" if table == "all" else table, name] for name in re.findall(r"`(\w+)`", names)]
-        told = [unit.strip() for unit in units.split(",")]
-        assert {unit for unit in known if unit} == {unit for unit in told if unit}, names
+def test_the_list_of_columns_is_the_columns_own() -> None:
+    listed = TEXT.split("<!-- columns: python -m liex_lab.behaviour.listing -->\n")[1].split("<!-- end of columns")[0]
+    assert listed == first_columns()
+    assert set(FIRST) <= set(all_columns())
 
 
 def test_every_verb_and_every_setting_exists() -> None:
     verbs = re.findall(r"^\| `(\w+)", section("The verbs"), re.MULTILINE)[1:]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
-    assert sorted(verbs) == ["convert", "demo", "doctor", "evaluate", "info", "run", "show", "train"]
+    known = "cohort compare convert demo doctor evaluate export flip info live run show suggest train verify"
+    assert sorted(verbs) == sorted(known.split())
     assert all(verb in told for verb in verbs)
     plan = tomllib.loads(re.sub(r"^# (\w+) =$", r"\1 = 0", Plan.load("mouse").to_toml(), flags=re.MULTILINE))
     for table, key in re.findall(r"`(\w+)\.(\w+)(?:=[^`]*)?`", section("The plan").split("**Size.**")[0]):

@@ -1,8 +1,20 @@
-"""What the animal did: measures per frame, bouts and a summary. Pandas in, pandas out."""
+"""What the animal did: measures per frame, bouts, places and sums, and groups compared. Pandas in, pandas out."""
 
-from liex_lab.behaviour.bouts import MouseRules, find_bouts
-from liex_lab.behaviour.columns import ACTIONS, COLUMNS
+from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.kinematics import kinematics
-from liex_lab.behaviour.summary import Behaviour, measure, summarise
+from liex_lab.behaviour.measures import measure_bouts
+from liex_lab.behaviour.places import Surroundings
+from liex_lab.behaviour.summary import Behaviour, measure, measure_session, summarise
 
-__all__ = ["ACTIONS", "COLUMNS", "Behaviour", "MouseRules", "find_bouts", "kinematics", "measure", "summarise"]
+__all__ = [
+    "ACTIONS",
+    "Behaviour",
+    "MouseRules",
+    "Surroundings",
+    "find_bouts",
+    "kinematics",
+    "measure",
+    "measure_bouts",
+    "measure_session",
+    "summarise",
+]

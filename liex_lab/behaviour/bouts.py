@@ -14,10 +14,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.columns import ACTIONS, BOUT_MEASURES
-from liex_lab.behaviour.kinematics import segments, smallest_turn
+from liex_lab.behaviour.kinematics import segments
+from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.sessions.rows import frame_count, stop_times, stretches
 from liex_lab.sessions.tables import BOUTS, to_pandas
+
+ACTIONS = ("rear", "run", "walk", "pause")  # where two claim a frame, the first has it
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -59,9 +61,7 @@ class MouseRules:
         }
 
 
-def find_bouts(
-    frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None
-) -> pd.DataFrame:
+def find_bouts(frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None) -> pd.DataFrame:
     """The table `bouts` of one animal from its tables `frames` and `kinematics`."""
     rules = rules or MouseRules()
     time_s = kinematics["time_s"].to_numpy(float)
@@ -81,7 +81,8 @@ def raw_labels(
     kinematics: pd.DataFrame, spine_mm: float, number: NDArray[np.int64], rules: MouseRules
 ) -> dict[str, Mask]:
     """(n,) per action: the frames that satisfy its rule, with hysteresis inside each unbroken stretch."""
-    slope, speed = (kinematics[name].to_numpy(float) for name in ("nose_over_rump_mm", "speed_mm_s"))
+    speed = kinematics["speed_mm_s"].to_numpy(float)
+    slope = kinematics["nose_over_rump_mm"].to_numpy(float) if "nose_over_rump_mm" in kinematics else speed * np.nan
     rear_mm = rules.rear_mm(spine_mm)
     low, high = 1.0 - rules.speed_hysteresis, 1.0 + rules.speed_hysteresis
     moving = hysteresis(speed, rules.pause_below_mm_s * high, rules.pause_below_mm_s * low, number)
@@ -136,36 +137,16 @@ def _table(
     code = {action: k for k, action in enumerate(ACTIONS)}
     runs = np.array([code.get(word, -1) for word in label], np.int64)
     pieces = [
-        (start, stop)
-        for start, stop, key in stretches(np.where(runs >= 0, runs + len(code) * number, -1))
-        if key >= 0
+        (start, stop) for start, stop, key in stretches(np.where(runs >= 0, runs + len(code) * number, -1)) if key >= 0
     ]
     rows = [(str(label[a]), time_s[a], stop_s[b - 1], count[a], count[b]) for a, b in pieces]
     action, start_s, end_s, start_frame, stop_frame = zip(*rows, strict=True) if rows else ([], [], [], [], [])
-    measures = [measure_bout(kinematics.iloc[a:b], stop_s[a:b]) for a, b in pieces]
-    columns = {name: [m[name] for m in measures] for name in (c.name for c in BOUT_MEASURES)}
-    return to_pandas([*BOUTS, *BOUT_MEASURES], {
+    named = to_pandas(BOUTS, {
         "session_id": [kinematics["session_id"].iloc[0]] * len(rows),
         "individual": [kinematics["individual"].iloc[0]] * len(rows),
         "action": list(action), "start_s": list(start_s), "stop_s": list(end_s),
         "duration_s": list(np.subtract(end_s, start_s)), "start_frame": list(start_frame),
         "stop_frame": list(stop_frame), "score": [float(raw[str(label[a])][a:b].mean()) for a, b in pieces],
-        "source": ["rule"] * len(rows), "model_hash": [""] * len(rows), **columns,
+        "source": ["rule"] * len(rows), "model_hash": [""] * len(rows),
     })  # fmt: skip
-
-
-def measure_bout(rows: pd.DataFrame, stop_s: Array) -> dict[str, float]:
-    """The measures of one bout from its rows of `kinematics`."""
-    speed, step = rows["speed_mm_s"].to_numpy(float), rows["step_mm"].to_numpy(float)
-    known = np.isfinite(speed)
-    time = float((stop_s - rows["time_s"].to_numpy(float))[known].sum())
-    heading = rows["heading_rad"].to_numpy(float)
-    heading = heading[np.isfinite(heading)]
-    nose = rows["nose_height_mm"].to_numpy(float)
-    return {
-        "path_mm": float(np.nansum(step)),
-        "mean_speed_mm_s": float(np.nansum(step)) / time if time > 0 else np.nan,
-        "peak_speed_mm_s": float(speed[known].max()) if known.any() else np.nan,
-        "net_turn_rad": float(smallest_turn(np.diff(heading)).sum()) if len(heading) else np.nan,
-        "peak_nose_height_mm": float(np.nanmax(nose)) if np.isfinite(nose).any() else np.nan,
-    }
+    return measure_bouts(named, kinematics)

@@ -1,42 +1,64 @@
-"""What a body does from frame to frame: speed, heading, turning, heights. Pandas in, pandas out."""
+"""What a body does from frame to frame: speed, heading, turning, heights, curvature. Pandas in, pandas out.
+
+Every derivative is taken over the frames' true times and never across a gap, and carries the standard deviation that
+follows from the joints' own. Errors of the joints of one frame are taken as one common error (the body is off as a
+whole), those of the two ends of a line as independent, and an error as lasting for `ERROR_LASTS_S`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.columns import KINEMATICS
-from liex_lab.sessions.rows import gap_follows, stop_times
+from liex_lab.behaviour.body import Body
+from liex_lab.behaviour.columns import kinematics_columns
+from liex_lab.behaviour.posture import Posture
+from liex_lab.behaviour.tail import tail_beat
+from liex_lab.sessions.rows import gap_follows, median_step, stop_times
 from liex_lab.sessions.tables import to_pandas
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
 
 HALF_WINDOW_S = 0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
-_STEEP_RAD = np.radians(75.0)  # beyond it the line from rump to neck has no reliable direction on the floor
+ERROR_LASTS_S = 0.3  # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
+STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
 @dataclass(frozen=True)
-class BodyPoints:
-    """Which joints play which part: the tail's base, the front of the trunk, the nose, and those of the back."""
+class Spans:
+    """Which frames (n,) a derivative at each frame is taken between, and the time from one to the other, s."""
 
-    rump: str
-    neck: str
-    nose: str
-    back: tuple[str, ...]
+    before: Rows
+    after: Rows
+    span_s: Array
 
     @staticmethod
-    def of(joints: list[str]) -> BodyPoints:
-        """The parts by name, or along the chain: first joint, last but one, last; a chain may begin at the head."""
-        if {"rump", "neck", "nose"} <= set(joints):
-            back = tuple(name for name in joints if name not in ("rump", "nose"))
-            return BodyPoints("rump", "neck", "nose", back)
-        if joints[0] == "head":
-            joints = joints[::-1]
-        return BodyPoints(joints[0], joints[max(len(joints) - 2, 0)], joints[-1], tuple(joints[1:-1]) or (joints[0],))
+    def of(time_s: Array, observed: NDArray[np.bool_], half_window_s: float) -> Spans:
+        """The neighbours about `half_window_s` away; a frame that stands alone has an empty span."""
+        before, after = neighbours(time_s, observed, half_window_s)
+        return Spans(before, after, np.where(after > before, time_s[after] - time_s[before], np.nan))
+
+    def rate(self, values: Array) -> Array:
+        """Change per second of values (n,) or (n, k)."""
+        span = self.span_s if values.ndim == 1 else self.span_s[:, None]
+        return np.asarray((values[self.after] - values[self.before]) / span)
+
+    def turning(self, angle: Array) -> Array:
+        """(n,) rad/s, adding the smallest turns from `before` over the frame itself to `after`."""
+        turn = smallest_turn(angle - angle[self.before]) + smallest_turn(angle[self.after] - angle)
+        return np.asarray(turn / self.span_s)
+
+    def sd(self, sd: Array) -> Array:
+        """(n,) standard deviation of the rate of values with these (n,); the nearer two frames, the more they agree."""
+        first, second = sd[self.before], sd[self.after]
+        shared = np.exp(-self.span_s / ERROR_LASTS_S)
+        return np.asarray(np.sqrt(first**2 + second**2 - 2.0 * shared * first * second) / self.span_s)
 
 
 def kinematics(
@@ -44,52 +66,95 @@ def kinematics(
     poses: pd.DataFrame,
     half_window_s: float = HALF_WINDOW_S,
     impossible_above_mm_s: float = IMPOSSIBLE_MM_S,
+    surface_z_mm: float | None = None,
 ) -> pd.DataFrame:
-    """The table `kinematics` from the tables `frames` and `poses` of one animal: one row per recorded frame."""
-    joints, xyz = joint_positions(frames, poses)
-    points = BodyPoints.of(joints)
-    at = {name: xyz[:, k] for k, name in enumerate(joints)}
-    trunk = [name for name in joints if name != points.nose] or joints
-    centre = np.mean([at[name] for name in trunk], axis=0)
+    """The table `kinematics` from the tables `frames` and `poses` of one animal: one row per recorded frame.
+
+    surface_z_mm: height of the water's surface above the floor, for an animal that swims.
+    """
+    joints, xyz, sd = joint_positions(frames, poses)
+    body = Body.of(joints)
+    posture = Posture.of(body, xyz, sd)
     time_s = frames["time_s"].to_numpy(float)
-    observed = np.isfinite(centre[:, 0])
-    before, after = neighbours(time_s, observed, half_window_s)
-    span = np.where(after > before, time_s[after] - time_s[before], np.nan)
-    velocity = (centre[after] - centre[before]) / span[:, None]
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    observed = np.isfinite(posture.centre[:, 0])
+    spans = Spans.of(time_s, observed, half_window_s)
+    block: dict[str, Any] = {name: frames[name].to_numpy() for name in ("frame_index", "time_s", "dt_s")}
+    block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
+    block |= _moving(posture, spans, stop_times(time_s) - time_s, impossible_above_mm_s)
+    block |= {
+        "length_mm": posture.length_mm, "straightness": posture.straightness, "bend_rad": posture.bend_rad,
+    }  # fmt: skip
+    if body.swims:
+        block |= _swimming(posture, time_s, segments(time_s, observed), surface_z_mm)
+    else:
+        block |= _walking(body, xyz, sd)
+    return to_pandas(kinematics_columns(body.swims), block)
+
+
+def _moving(posture: Posture, spans: Spans, hold_s: Array, impossible_above_mm_s: float) -> dict[str, Array]:
+    """Place, speed and turning of the body as a whole; hold_s (n,): how long each frame counts."""
+    centre, sd = posture.centre, posture.centre_sd
+    velocity = spans.rate(centre)
+    over = velocity if posture.body.swims else velocity[:, :2]
+    speed = np.linalg.norm(over, axis=1)
     speed = np.where(speed > impossible_above_mm_s, np.nan, speed)
-    along = at[points.neck] - at[points.rump]
-    pitch = np.arctan2(along[:, 2], np.hypot(along[:, 0], along[:, 1]))
-    heading = np.where(np.abs(pitch) < _STEEP_RAD, np.arctan2(along[:, 1], along[:, 0]), np.nan)
-    columns = {name: frames[name].to_numpy() for name in ("frame_index", "time_s", "dt_s")}
-    return to_pandas(KINEMATICS, {
-        "session_id": frames["session_id"].iloc[0], "individual": frames["individual"].iloc[0], **columns,
-        "x_mm": centre[:, 0], "y_mm": centre[:, 1], "z_mm": centre[:, 2],
-        "speed_mm_s": speed, "vertical_speed_mm_s": velocity[:, 2],
-        "step_mm": speed * (stop_times(time_s) - time_s),
-        "heading_rad": heading, "yaw_rate_rad_s": turning_speed(heading, before, after, span),
-        "nose_height_mm": at[points.nose][:, 2],
-        "back_height_mm": np.max([at[name][:, 2] for name in points.back], axis=0),
-        "body_pitch_rad": pitch, "nose_over_rump_mm": at[points.nose][:, 2] - at[points.rump][:, 2],
-    })  # fmt: skip
+    speed_sd = spans.sd(sd)
+    flat = np.abs(posture.pitch_rad) < STEEP_RAD
+    heading = np.where(flat, posture.heading_rad, np.nan)
+    heading_sd = np.where(flat, posture.heading_sd_rad, np.nan)
+    return {
+        "x_mm": centre[:, 0], "y_mm": centre[:, 1], "z_mm": centre[:, 2], "position_sd_mm": sd,
+        "speed_mm_s": speed, "speed_sd_mm_s": speed_sd, "vertical_speed_mm_s": velocity[:, 2],
+        "acceleration_mm_s2": spans.rate(speed), "acceleration_sd_mm_s2": spans.sd(speed_sd),
+        "step_mm": speed * hold_s,
+        "heading_rad": heading, "heading_sd_rad": heading_sd,
+        "yaw_rate_rad_s": spans.turning(heading), "yaw_rate_sd_rad_s": spans.sd(heading_sd),
+        "body_pitch_rad": posture.pitch_rad, "body_pitch_sd_rad": posture.pitch_sd_rad,
+    }  # fmt: skip
 
 
-def joint_positions(frames: pd.DataFrame, poses: pd.DataFrame) -> tuple[list[str], Array]:
-    """Joint names, and positions (n, J, 3) mm in the arena, NaN where unknown."""
-    joints = [str(name) for name in pd.unique(poses["joint"])]
-    xyz = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(len(frames), len(joints), 3)
-    return joints, xyz
+def _walking(body: Body, xyz: Array, sd: Array) -> dict[str, Array]:
+    """Heights of an animal that stands on the floor."""
+    nose, rump = xyz[:, body.front], xyz[:, body.rear]
+    return {
+        "nose_height_mm": nose[:, 2], "nose_height_sd_mm": sd[:, body.front],
+        "back_height_mm": xyz[:, list(body.back), 2].max(axis=1),
+        "nose_over_rump_mm": nose[:, 2] - rump[:, 2],
+        "reach_mm": np.hypot(*(nose - rump)[:, :2].T),
+    }  # fmt: skip
 
 
-def segments(time_s: Array, observed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _swimming(posture: Posture, time_s: Array, number: Rows, surface_z_mm: float | None) -> dict[str, Array]:
+    """Curvature along the body, the tail's beat, and the depth below the surface."""
+    beat = tail_beat(posture, time_s, number, median_step(time_s))
+    surface = np.nan if surface_z_mm is None else surface_z_mm
+    front, middle, rear = posture.thirds_rad()
+    return {
+        "bend_front_rad": front, "bend_middle_rad": middle, "bend_rear_rad": rear,
+        "tail_angle_rad": posture.tail_angle_rad, "tail_mm": posture.tail_mm,
+        "tail_extreme_rad": beat.extreme_rad, "tail_beat_hz": beat.frequency_hz,
+        "tail_beat_mm": beat.amplitude_mm, "below_surface_mm": surface - posture.centre[:, 2],
+    }  # fmt: skip
+
+
+def joint_positions(frames: pd.DataFrame, poses: pd.DataFrame) -> tuple[list[str], Array, Array]:
+    """Joint names, positions (n, J, 3) mm in the arena and their sd (n, J) mm along an axis; NaN where unknown."""
+    column = poses["joint"]
+    names = column.cat.categories if isinstance(column.dtype, pd.CategoricalDtype) else pd.unique(column)
+    joints = [str(name) for name in names]
+    shape = (len(frames), len(joints))
+    xyz = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(*shape, 3)
+    sd = poses["sd_mm"].to_numpy(float).reshape(shape) if "sd_mm" in poses else np.full(shape, np.nan)
+    return joints, xyz, sd
+
+
+def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
     """(n,) the number of the unbroken stretch each frame belongs to: no missing frame, no lost animal inside."""
     broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[: len(time_s)]
     return np.asarray(np.cumsum(broken) - 1)
 
 
-def neighbours(
-    time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def neighbours(time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S) -> tuple[Rows, Rows]:
     """(n,) rows to difference between: about `half_window_s` before and after, never outside the frame's own stretch.
 
     At the ends of a stretch the difference is one-sided; a stretch of one frame has none (before == after).
@@ -105,11 +170,6 @@ def neighbours(
     after = np.clip(np.maximum(after, np.minimum(rows + 1, n - 1)), first, last)
     lost = ~observed
     return np.where(lost, rows, before), np.where(lost, rows, after)
-
-
-def turning_speed(heading: Array, before: NDArray[np.int64], after: NDArray[np.int64], span: Array) -> Array:
-    """(n,) rad/s between the neighbours, adding the smallest turns from `before` over the frame itself to `after`."""
-    return (smallest_turn(heading - heading[before]) + smallest_turn(heading[after] - heading)) / span
 
 
 def smallest_turn(angle: Array) -> Array:

@@ -1,92 +1,192 @@
-"""One row per animal: how far, how fast, how often; shares are of the time in which the animal was observed."""
+"""Everything this room says about one animal, and the row that a biologist reads first.
+
+Shares are of the time in which the animal was observed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.bouts import MouseRules, find_bouts
-from liex_lab.behaviour.columns import ACTIONS, COLUMNS, SUMMARY, zone_columns
+from liex_lab.behaviour.activity import activity
+from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.kinematics import kinematics
-from liex_lab.recordings.zones import SEPARATOR
+from liex_lab.behaviour.measures import measure_bouts
+from liex_lab.behaviour.places import (
+    Surroundings,
+    depth_measures,
+    inside_zones,
+    place_measures,
+    surface_height_mm,
+    visits,
+)
+from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
+from liex_lab.behaviour.transitions import transitions
 from liex_lab.sessions.rows import stop_times
-from liex_lab.sessions.tables import to_pandas
+from liex_lab.sessions.tables import GAPS, empty_table, to_pandas
+
+if TYPE_CHECKING:
+    from liex_lab.sessions import Session
+
+Array = NDArray[np.float64]
+
+TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """The three behaviour tables of one animal."""
+    """The behaviour tables of one animal."""
 
     kinematics: pd.DataFrame
     bouts: pd.DataFrame
     summary: pd.DataFrame
+    transitions: pd.DataFrame
+    activity: pd.DataFrame
+    zones: pd.DataFrame
     rules: MouseRules
-    zones: Sequence[str] = ()
+    vocabulary: Vocabulary
+    actions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """Every table by its name."""
+        return {name: getattr(self, name) for name in TABLES}
 
     def for_session(self) -> dict[str, Any]:
         """The arguments that hand all of it to a session: `writer.close(**behaviour.for_session())`."""
         return {
-            "kinematics": self.kinematics, "bouts": self.bouts, "summary": self.summary,
-            "columns": (*COLUMNS, *zone_columns(self.zones)),
-            "actions": self.rules.definitions(), "record": {"rules": asdict(self.rules)},
+            "results": self.tables, "columns": self.vocabulary.columns, "actions": self.actions,
+            "record": {"rules": asdict(self.rules)},
         }  # fmt: skip
 
 
 def measure(
-    frames: pd.DataFrame, poses: pd.DataFrame, rules: MouseRules | None = None, zones: Sequence[str] = ()
+    frames: pd.DataFrame,
+    poses: pd.DataFrame,
+    rules: MouseRules | None = None,
+    around: Surroundings | None = None,
+    gaps: pd.DataFrame | None = None,
+    *,
+    bouts: pd.DataFrame | None = None,
+    actions: Mapping[str, str] | None = None,
 ) -> Behaviour:
-    """Everything this room knows to say about one animal, from its tables `frames` and `poses`; zones: their names."""
-    rules = rules or MouseRules()
-    moved = kinematics(frames, poses, rules.speed_half_window_s, rules.impossible_above_mm_s)
-    bouts = find_bouts(frames, moved, rules)
-    return Behaviour(moved, bouts, summarise(frames, moved, bouts, zones), rules, zones)
+    """The behaviour tables of one animal from its tables `frames` and `poses`, and `gaps` where there are any.
+
+    bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`), with its vocabulary `actions`, word ->
+    definition; None takes the rules'. around: arena, zones and water.
+    """
+    rules, around = rules or MouseRules(), around or Surroundings()
+    moved = kinematics(frames, poses, rules.speed_half_window_s, rules.impossible_above_mm_s, around.surface_z_mm)
+    named = find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved)
+    actions = dict(rules.definitions() if actions is None else actions)
+    actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
+    words = Vocabulary(tuple(actions), tuple(around.zones), "tail_angle_rad" in moved)
+    gaps = empty_table(GAPS) if gaps is None else gaps
+    return Behaviour(
+        moved, named, summarise(frames, moved, named, words, around),
+        transitions(named, words.words, gaps, rules.merge_pauses_s), activity(moved, named, words.words),
+        visits(frames, moved, words.zones, rules), rules, words, actions,
+    )  # fmt: skip
+
+
+def measure_session(session: Session, rules: MouseRules | None = None) -> Behaviour:
+    """The behaviour tables of a session made anew from its folder alone, with its own ethogram and thresholds."""
+    about = session.metadata
+    known = about.get("rules") or {}
+    stated = {name: known[name] for name in MouseRules.__dataclass_fields__ if name in known}
+    surface = surface_height_mm(about["camera"]["floor_distance_mm"], about["camera"].get("optics", {}))
+    around = Surroundings(session.arena, [zone.name for zone in session.zones], surface)
+    poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
+    return measure(session.frames, poses, rules or MouseRules(**stated), around, session.gaps,
+                   bouts=session.bouts, actions=about.get("actions", {}))  # fmt: skip
 
 
 def summarise(
-    frames: pd.DataFrame, kinematics: pd.DataFrame, bouts: pd.DataFrame, zones: Sequence[str] = ()
+    frames: pd.DataFrame,
+    kinematics: pd.DataFrame,
+    bouts: pd.DataFrame,
+    words: Vocabulary | None = None,
+    around: Surroundings | None = None,
 ) -> pd.DataFrame:
     """The table `summary`: one row from the tables `frames`, `kinematics` and `bouts` of one animal."""
+    words, around = words or Vocabulary(ACTIONS), around or Surroundings()
     time_s = kinematics["time_s"].to_numpy(float)
-    hold = stop_times(time_s) - time_s
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
-    speed, step = (kinematics[name].to_numpy(float) for name in ("speed_mm_s", "step_mm"))
-    known = np.isfinite(speed)
-    observed_s, moving_s = float(hold[observed].sum()), float(hold[known].sum())
-    distance = float(np.nansum(step))
-    spent = bouts.groupby("action")["duration_s"].sum()
-    seconds = {action: float(spent.get(action, 0.0)) for action in ACTIONS}
-    unlabelled = max(0.0, observed_s - sum(seconds.values()))
-    if unlabelled < 1e-9:  # rounding of sums of seconds
-        unlabelled = 0.0
-    budget = {**seconds, "unlabelled": unlabelled}
-    return to_pandas([*SUMMARY, *zone_columns(zones)], {
+    hold = np.where(observed, stop_times(time_s) - time_s, 0.0)
+    first = float(time_s[observed][0]) if observed.any() else np.nan
+    block: dict[str, Any] = {
         "session_id": str(frames["session_id"].iloc[0]), "individual": str(frames["individual"].iloc[0]),
         "n_frames": len(frames), "n_lost": int((~observed).sum()),
         "n_doubtful": int((frames["flag"] == "doubtful").sum()),
-        "duration_s": float(stop_times(time_s)[-1]), "observed_s": observed_s,
-        "spine_mm": float(np.nanmedian(frames["spine_mm"])) if observed.any() else np.nan,
+        "duration_s": float(stop_times(time_s)[-1]), "observed_s": float(hold.sum()),
+        "spine_mm": _median(frames["spine_mm"]) if "spine_mm" in frames else np.nan,
+        **_motion(kinematics, hold), **place_measures(frames, hold, around.arena),
+        **_budget(bouts, words.words, float(hold.sum()), first),
+        **_time_in_zones(frames, words.zones, hold),
+    }  # fmt: skip
+    if words.swims:
+        block |= depth_measures(kinematics, hold, around.surface_z_mm)
+        block |= {name: _median(kinematics[name]) for name in ("tail_beat_hz", "tail_beat_mm")}
+    else:
+        moving = bouts["action"].isin(["walk", "run"])
+        block["distance_moving_m"] = float(bouts.loc[moving, "path_mm"].sum()) / 1000.0
+    return to_pandas(summary_columns(words.words, words.zones, words.swims), block)
+
+
+def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
+    """How far, how fast, how it turned."""
+    speed, step = (kinematics[name].to_numpy(float) for name in ("speed_mm_s", "step_mm"))
+    known = np.isfinite(speed)
+    distance, timed = float(np.nansum(step)), float(hold[known].sum())
+    turning = kinematics["yaw_rate_rad_s"].to_numpy(float)
+    turns = np.isfinite(turning)
+    turned, either = float((turning * hold)[turns].sum()), float((np.abs(turning) * hold)[turns].sum())
+    turn_s = float(hold[turns].sum())
+    return {
         "distance_m": distance / 1000.0,
-        "distance_moving_m": float(bouts.loc[bouts["action"].isin(["walk", "run"]), "path_mm"].sum()) / 1000.0,
-        "mean_speed_mm_s": distance / moving_s if moving_s > 0 else np.nan,
-        "median_speed_mm_s": float(np.median(speed[known])) if known.any() else np.nan,
+        "mean_speed_mm_s": distance / timed if timed > 0 else np.nan,
+        "median_speed_mm_s": _median(kinematics["speed_mm_s"]),
         "max_speed_mm_s": float(speed[known].max()) if known.any() else np.nan,
-        "rear_count": int((bouts["action"] == "rear").sum()),
-        **{f"{word}_s": value for word, value in budget.items()},
-        **{f"{word}_share": value / observed_s if observed_s > 0 else np.nan for word, value in budget.items()},
-        **_time_in_zones(frames, zones, np.where(observed, hold, 0.0)),
-    })  # fmt: skip
+        "speed_noise_mm_s": _median(kinematics["speed_sd_mm_s"]),
+        "mean_abs_yaw_rate_rad_s": either / turn_s if turn_s > 0 else np.nan,
+        "turn_bias": turned / either if either > 0 else np.nan,
+    }
 
 
-def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: NDArray[np.float64]) -> dict[str, float]:
-    """Seconds in each zone, and shares of the observed time; hold (n,) s is how long each frame counts."""
+def _budget(bouts: pd.DataFrame, words: Sequence[str], observed_s: float, first_s: float) -> dict[str, float]:
+    """Time, number and latency of each action, and the time that has no name."""
+    found: dict[str, float] = {}
+    for word in words:
+        own = bouts[bouts["action"] == word]
+        n, seconds = len(own), float(own["duration_s"].sum())
+        found |= {
+            f"{word}_count": n, f"{word}_s": seconds,
+            f"{word}_share": seconds / observed_s if observed_s > 0 else np.nan,
+            f"{word}_mean_s": seconds / n if n else np.nan,
+            f"{word}_per_min": 60.0 * n / observed_s if observed_s > 0 else np.nan,
+            f"{word}_latency_s": float(own["start_s"].min()) - first_s if n else np.nan,
+        }  # fmt: skip
+    rest = max(0.0, observed_s - sum(found[f"{word}_s"] for word in words))
+    found["unlabelled_s"] = rest if rest > 1e-9 else 0.0  # rounding of sums of seconds
+    found["unlabelled_share"] = found["unlabelled_s"] / observed_s if observed_s > 0 else np.nan
+    return found
+
+
+def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> dict[str, float]:
+    """Seconds in each zone, and shares of the observed time."""
     observed_s, found = float(hold.sum()), {}
-    for zone in zones:
-        inside = np.array([zone in str(names).split(SEPARATOR) for names in frames["zone"]], np.bool_)
+    for zone, inside in zip(zones, inside_zones(frames, zones), strict=True):
         found[f"zone_{zone}_s"] = float(hold[inside].sum())
         found[f"zone_{zone}_share"] = found[f"zone_{zone}_s"] / observed_s if observed_s > 0 else np.nan
     return found
+
+
+def _median(values: pd.Series[Any]) -> float:
+    known = values.to_numpy(float)
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else np.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,12 @@ class Pose:
     def moved(self, T_new_old: SE3) -> Pose:
         """The same posture in another frame."""
         return Pose(T_new_old @ self.root, self.angles, self.scale)
+
+    @staticmethod
+    def join(parts: Sequence[Pose]) -> Pose:
+        """The poses of several batches (n), one after the other."""
+        root = SE3(*(np.concatenate([getattr(p.root, name) for p in parts]) for name in ("rotation", "translation")))
+        return Pose(root, np.concatenate([p.angles for p in parts]), np.concatenate([p.scale for p in parts]))
 
     @staticmethod
     def from_joints(skeleton: Skeleton, joints: ArrayLike, up: ArrayLike) -> Pose:

@@ -36,10 +36,11 @@ class View:
     """How an animal is looked at: the [view] table of its TOML.
 
     frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
-    behind_mm (at home size) behind its mean depth, for one that swims or is held up. smooth_mm: readings this near to
-    one another, at home size, are averaged. area: the smallest and the largest area seen from above, of the squared
-    length. min_height_mm: what stands out from the background by less is not the animal. foreground: 'background', it
-    stands out from a scene that is otherwise still, or 'nearest', nothing is nearer to the camera.
+    behind_mm behind its mean depth, for one that swims (the same for all sizes, or the height map would tell the size
+    for which it was cut) or is held up (at home size). smooth_mm: readings this near to one another, at home size, are
+    averaged. area: the smallest and the largest area seen from above, of the squared length. min_height_mm: what stands
+    out from the background by less is not the animal. foreground: 'background', it stands out from a still scene,
+    or 'nearest', nothing is nearer to the camera.
     """
 
     frame: str = VIEWS[0]
@@ -115,7 +116,7 @@ class Skeleton:
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise LiexError(f"the skeleton {path} is not a TOML file: {error}") from None
         return Skeleton.from_table(_with_mesh(table, path), str(path))
 

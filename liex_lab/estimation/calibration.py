@@ -10,11 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.correction import moves_to, pose_samples
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
+from liex_lab.estimation.settle import Settler
 from liex_lab.estimation.training import TrainingSet, quantised
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
@@ -23,7 +25,8 @@ from liex_lab.recordings.foreground import Crops
 Array = NDArray[np.float64]
 
 _CAP_MM = 25.0  # at the reference length; a lost pose must not decide what an ordinary score means
-_SIZE_SD = 0.05  # how far off (log) the size of a session is, once it has been estimated over many frames
+# how far off (log) the size of a session is once it has been estimated over many frames, where poses settle, and before
+_SIZE_SD, _SETTLED_SIZE_SD, _GUESS_SD = 0.05, 0.02, 0.08
 _DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
 _GROUP = 50  # images share a size guess, as the frames of a recording do
 _EXPECTATION = GrowthPlan(
@@ -59,13 +62,15 @@ class _Group:
     chosen: Chosen
 
 
-def _choices(model: Model, data: TrainingSet, rng: np.random.Generator) -> Iterator[_Group]:
-    """Let a model choose. Images of animals are taken in order of size, and each group of them shares one guess."""
+def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd: float = _SIZE_SD) -> Iterator[_Group]:
+    """Let a model choose. Images of animals are taken in order of size, and each group of them shares one guess, off by
+    size_sd (log).
+    """
     animals = np.flatnonzero(data.animal)
     order = animals[np.argsort(data.size[animals], kind="stable")]
     estimator = PoseEstimator(model)
     for rows in np.array_split(order, max(1, len(order) // _GROUP)):
-        size = float(np.median(data.size[rows]) * np.exp(_SIZE_SD * rng.standard_normal()))
+        size = float(np.median(data.size[rows]) * np.exp(size_sd * rng.standard_normal()))
         size = size if model.method.session_size else 1.0
         looks = data.images.looks[rows]
         images = ImageSet(data.images.heights[rows], looks, data.images.moments[rows])
@@ -81,7 +86,7 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
     """The choices of a model for the animals among the images, and how far off they are."""
     skeleton = model.skeleton
     scores_of, spreads, joint_errors, clues = [], [], [], []
-    for group in _choices(model, data, rng):
+    for group in _choices(model, data, rng, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD):
         picked, images = group.chosen, group.images
         off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1)
         scores_of.append(picked.score)
@@ -122,6 +127,19 @@ def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) ->
     return replace(
         model, corrector=quantised(boost_forest(Samples.join(parts), labels, plan, _CORRECTION_SHRINKAGE, rng))
     )
+
+
+def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
+    """The model with how its choices settle, where the method has them settle, from images that no tree has seen."""
+    if not model.method.settle:
+        return model
+    groups = list(_choices(model, data, rng, _GUESS_SD))
+    rows = np.concatenate([group.rows for group in groups])
+    sizes = np.concatenate([np.full(len(group.rows), group.size) for group in groups])
+    pose = Pose.join([group.chosen.pose for group in groups])
+    images = ImageSet(data.images.heights[rows], data.images.looks[rows], data.images.moments[rows])
+    settler = Settler.fit(model.skeleton, pose, images, sizes, data.truth.positions[rows], data.size[rows])
+    return replace(model, settler=settler.table)
 
 
 def _rows(samples: Samples, index: NDArray[np.int64]) -> Samples:

@@ -22,6 +22,7 @@ from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.refine import Refiner
 from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
+from liex_lab.estimation.settle import SURE_SHARE, Settler
 from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
@@ -43,6 +44,52 @@ class Estimates:
     chosen: Chosen
     found: NDArray[np.bool_]
     crops: Crops
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """A thing in each of n frames and its candidates: looks (n, 17); rotations (n, K, J, 3, 3), positions (n, K, J, 3)
+    mm, scores (n, K), infinite where there is no such candidate.
+    """
+
+    crops: Crops
+    looks: Array
+    rotations: Array
+    positions: Array
+    scores: Array
+
+    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> _Sight:
+        return _Sight(self.crops[index], self.looks[index], self.rotations[index], self.positions[index],
+                      self.scores[index])  # fmt: skip
+
+    def put(self, rows: NDArray[np.int64], other: _Sight) -> None:
+        """Take these rows (m,) from another one of m frames."""
+        self.crops.put(rows, other.crops)
+        for name in ("looks", "rotations", "positions", "scores"):
+            getattr(self, name)[rows] = getattr(other, name)
+
+    def nothing(self) -> _Sight:
+        """As many frames in which no such thing is."""
+        nothing = self[np.arange(len(self.looks))]
+        nothing.crops.n_px[:] = 0
+        nothing.scores[:] = np.inf
+        return nothing
+
+    def opposite(self, usable: NDArray[np.bool_], tip: int) -> _Sight:
+        """The same with only the candidates that point away from where the one with the lowest score does, in frames
+        `usable`, from base to `tip`; the best of them takes the others' places, so that their number stays.
+        """
+        rows = np.arange(len(self.scores))
+        best = np.where(usable[:, None], self.scores, 0.0).argmin(axis=1)
+        along = self.positions[:, :, tip] - self.positions[:, :, 0]
+        away = np.einsum("nkd,nd->nk", along, along[rows, best]) < 0
+        scores = np.where(away & usable[:, None], self.scores, np.inf)
+        taken = np.where(away, np.arange(scores.shape[1]), scores.argmin(axis=1)[:, None])
+        some = away.any(axis=1) & usable
+        return _Sight(
+            self.crops, self.looks, self.rotations[rows[:, None], taken], self.positions[rows[:, None], taken],
+            np.where(some[:, None], np.take_along_axis(scores, taken, axis=1), np.inf),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,34 +180,64 @@ class PoseEstimator:
 
     def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
-        method = self.model.method
-        size = size if method.session_size else 1.0
-        crops = scene.extract(depths, size, parallel, method.camera_view)
-        looks = scene.looks(crops, method.camera_view)
-        rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
-        unsure = np.flatnonzero(crops.n_blobs > 1)
+        size = size if self.model.method.session_size else 1.0
+        return self._estimates(self._look(depths, scene, size, parallel)[0], scene, size, parallel)
+
+    def hypotheses(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+    ) -> tuple[Estimates, ...]:
+        """What else the frames (n, H, W) mm may show, each like `estimate`'s answer, which comes first: the best pose
+        that points the other way, and the same two of the second thing of about the animal's size. Rows without such
+        are not found.
+        """
+        size = size if self.model.method.session_size else 1.0
+        found: list[Estimates] = []
+        for sight in self._look(depths, scene, size, parallel):
+            best = self._estimates(sight, scene, size, parallel)
+            found += [best, self._estimates(sight.opposite(best.found, self.skeleton.tip), scene, size, parallel)]
+        return tuple(found)
+
+    def _look(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
+    ) -> tuple[_Sight, _Sight]:
+        """What was taken for the animal, with its candidates, and the next best thing; see `estimate`."""
+        first = self._sight(depths, scene, size, parallel, 0)
+        second = first.nothing()
+        unsure = np.flatnonzero(first.crops.n_blobs > 1)
         if len(unsure):
-            other = scene.extract(depths[unsure], size, parallel, method.camera_view, rank=1)
-            other_looks = scene.looks(other, method.camera_view)
-            found = self.candidates(other, other_looks, size, parallel)
-            first, second = scores[unsure].min(axis=1), found[3].min(axis=1)
-            better = self._is_animal(depths[unsure], scene, size, first, second)
+            other = self._sight(depths[unsure], scene, size, parallel, 1)
+            best, next_best = first.scores[unsure].min(axis=1), other.scores.min(axis=1)
+            better = self._is_animal(depths[unsure], scene, size, best, next_best)
+            second.put(unsure, other)
             rows = unsure[better]
-            crops.put(rows, other[better])
-            looks[rows], rotations[rows], positions[rows], scores[rows] = (
-                values[better] for values in (other_looks, found[0], found[1], found[3])
-            )
-        usable = crops.found
-        images = ImageSet(crops.heights[usable], looks[usable], crops.moments[usable])
-        picked = self.pick(images, size, rotations[usable], positions[usable], scores[usable], parallel)
-        picked = with_expected_error(picked, self.model, crops.moments[usable], looks[usable], size)
+            kept = first[rows]
+            first.put(rows, other[better])
+            second.put(rows, kept)
+        return first, second
+
+    def _sight(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool, rank: int) -> _Sight:
+        """The thing of that rank in each frame, and its candidates."""
+        camera_view = self.model.method.camera_view
+        crops = scene.extract(depths, size, parallel, camera_view, rank=rank)
+        looks = scene.looks(crops, camera_view)
+        rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
+        return _Sight(crops, looks, rotations, positions, scores)
+
+    def _estimates(self, sight: _Sight, scene: Foreground, size: float, parallel: bool) -> Estimates:
+        """The chosen poses of what was seen, in the camera frame."""
+        crops = sight.crops
+        usable = crops.found & np.isfinite(sight.scores).any(axis=1)
+        seen = sight[np.flatnonzero(usable)]
+        images = ImageSet(seen.crops.heights, seen.looks, seen.crops.moments)
+        picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
+        picked = with_expected_error(picked, self.model, images.moments, images.looks, size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        return Estimates(replace(whole, pose=whole.pose.moved(view_of(looks).inverse())), usable, crops)
+        return Estimates(replace(whole, pose=whole.pose.moved(view_of(sight.looks).inverse())), usable, crops)
 
     def pick(
         self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
     ) -> Chosen:
-        """One pose for each of n height maps out of its candidates, after the last correction.
+        """One pose for each of n height maps out of its candidates, after the last correction, and settled.
 
         Where the method takes poses into the picture, it is of the mean and the best ones the one that then fits best.
         """
@@ -170,8 +247,12 @@ class PoseEstimator:
             if method.refine_steps and len(scores):
                 poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
                 pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
-                picked = replace(picked, pose=pose, fit=fit)
-            return corrected(picked, self.model, images, size)
+                picked = replace(picked, pose=pose, fit=fit, told_scale=pose.scale)
+            picked = corrected(picked, self.model, images, size)
+            if self.model.settler is None or not len(scores):
+                return picked
+            settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, images, size)
+        return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
 
     def _is_animal(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array
@@ -199,11 +280,12 @@ class PoseEstimator:
         uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
             estimates = uncorrected.estimate(sample, scene, guess)
-            scale, score = estimates.chosen.pose.scale, estimates.chosen.score
+            scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
             seen = np.flatnonzero(estimates.found)
             if not len(seen):
                 raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
-            trusted = seen[np.argsort(score[seen])[: max(8, len(seen) * 2 // 3)]]
+            n_trusted = len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+            trusted = seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]
             guess = float(np.median(scale[trusted]))
         return guess
 
@@ -246,4 +328,5 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
         pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
         rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
         rows(picked.fit, picked.fit.shape[1]),
+        rows(picked.told_scale), rows(picked.told_trust),
     )  # fmt: skip

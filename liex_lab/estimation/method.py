@@ -47,6 +47,7 @@ class Method:
     scale_lever_mm: float = 50.0
     survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
     pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
+    settle: bool = False  # the chosen pose of an animal that is one chain settles under its back, see `settle`
     base_reach_mm: float = 0.0  # offsets reach this far from the base joint; 0: as far as from the others
     corrector: GrowthPlan | None = None  # of the last correction, of the chosen pose; None: it stays as chosen
     home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotation vector by which starts are turned out of the home pose
@@ -86,7 +87,7 @@ class Method:
 
 _UNSET: dict[str, Any] = {
     "home_turn": (0.0, 0.0, 0.0), "proposals": None, "proposal_reach_mm": 0.0, "base_rounds": 0, "refine_steps": 0,
-    "refined": 0, "explains": False,
+    "refined": 0, "explains": False, "settle": False,
 }  # fmt: skip
 _FULL_TURN = 10.0  # rad: no filter
 
@@ -129,8 +130,10 @@ _HAND: dict[str, Any] = {
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("fish", "default"): {
-        "rounds": 3, "training_candidates": 5, "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
-        "reach_mm": 12.5, "keep_off_mm": 4.0, "top_tau": 0.25, "top_radius_mm": 4.5, "base_lever_mm": 10.0,
+        "rounds": 2, "training_candidates": 6, "n_candidates": 12, "survivors": 6,
+        "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
+        "reach_mm": 12.5, "base_reach_mm": 30.0, "keep_off_mm": 4.0, "top_tau": 0.8, "top_radius_mm": 4.5,
+        "base_lever_mm": 10.0, "regress_scale": False, "corrector": None, "settle": True,
     },
     ("fish", "paper"): {
         "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),

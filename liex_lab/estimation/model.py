@@ -55,7 +55,8 @@ class Model:
     """Everything an estimator needs.
 
     expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
-    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more.
+    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more; settler:
+    the table of `settle.Settler`, where the method settles.
     """
 
     cascade: Cascade
@@ -66,6 +67,7 @@ class Model:
     card: dict[str, Any] = field(default_factory=dict)
     pruner: Forest | None = None
     corrector: Forest | None = None
+    settler: NDArray[np.float64] | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -98,6 +100,8 @@ class Model:
         forests += [getattr(self, name) for name in extra]
         for k, forest in enumerate(forests):
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
+        if self.settler is not None:
+            arrays["settler"] = self.settler
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
             for name, values in arrays.items():
@@ -119,6 +123,7 @@ class Model:
                     raise ModelError(f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab")
                 names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
                 forests = [_join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names]
+                settler = archive["settler"] if "settler" in archive.files else None
             method = Method.from_dict(head["method"])
             values = head["calibration"]
             for name in ("quantiles", "joint_share"):
@@ -142,7 +147,7 @@ class Model:
         assert metric is not None
         expectation, pruner, corrector, proposals = others
         cascade = Cascade(skeleton, method, each, proposals)
-        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector)
+        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector, settler)
 
     def digest(self) -> str:
         """SHA-256 of the model file."""

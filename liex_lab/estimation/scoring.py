@@ -31,7 +31,8 @@ class Chosen:
     error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home size behind it; doubts (n, 4) mm at
     home size: best score, the best score of a candidate that points the other way, the spread of the good scores, and
     how far the candidates of all scores lie from the chosen pose; fit (n, F): how well the pose explains the picture,
-    where that is asked, see `_explain`.
+    where that is asked, see `_explain`; told_scale (n,): the animal's size over home size as this frame alone tells it,
+    and told_trust (n,), the higher the better.
     """
 
     pose: Pose
@@ -43,6 +44,8 @@ class Chosen:
     spread: Array
     doubts: Array
     fit: Array
+    told_scale: Array
+    told_trust: Array
 
 
 def choose(
@@ -79,7 +82,8 @@ def choose(
     sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
-    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, np.zeros((len(score), 0)))
+    fit = np.zeros((len(score), 0))
+    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, fit, pose.scale, -mean_score)
 
 
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:

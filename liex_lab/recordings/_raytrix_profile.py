@@ -118,7 +118,7 @@ def read_profile(path: Path) -> Profile:
     """The profile that a raytrix.toml names or states in full."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(f"{path} should be a TOML file, but it does not parse ({error}); correct it") from None
     shipped = shipped_profiles()
     name = table.pop("profile", None)

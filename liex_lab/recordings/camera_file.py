@@ -67,7 +67,7 @@ class CameraFile:
             return CameraFile(path)
         try:
             document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise RecordingError(f"{path} should be a TOML file, but it does not parse ({error}); correct it") from None
         table = {key: value for key, value in document.items() if not isinstance(value, dict)}
         for name in ("camera", "recording"):

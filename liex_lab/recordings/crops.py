@@ -41,7 +41,7 @@ class Crops:
     distance: Array
     n_blobs: NDArray[np.int64]
 
-    def __getitem__(self, index: NDArray[np.bool_]) -> Crops:
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Crops:
         """Some crops out of a batch."""
         return Crops(*(getattr(self, field.name)[index] for field in fields(self)))
 
@@ -154,7 +154,7 @@ class Windows:
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
         kernels.extract_windows(
             self.depth, self.background, margin, area_mm2, rank, self.view.smooth_mm * size,
-            intrinsics, plane, rotation, (self.view.behind_mm if camera_view else 0.0) * size, crops.heights,
+            intrinsics, plane, rotation, np.full(n, self.view.behind_mm if camera_view else 0.0), crops.heights,
             crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
         )  # fmt: skip
         looks = np.concatenate(

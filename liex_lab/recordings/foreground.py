@@ -243,7 +243,7 @@ class Scene:
             kernels.extract_all(
                 depths, self.limit, self.on_floor, self.area_mm2, rank, self.view.smooth_mm * size,
                 np.array([grid.fx, grid.fy, grid.cx, grid.cy]), self._grid_floor.inverse_depth,
-                self.view_rotation(camera_view), self.view.behind_mm * size if camera_view else 0.0,
+                self.view_rotation(camera_view), self.view.behind_mm if camera_view else 0.0,
                 crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
             )  # fmt: skip
         if self.stride > 1:  # told in pixels of the picture

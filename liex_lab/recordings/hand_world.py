@@ -78,9 +78,9 @@ class HandSession(TrueRecording):
             np.float32
         )
 
-    def chunks(self, n_frames: int) -> Iterator[list[DepthFrame]]:
-        """All frames in lists of `n_frames`, each list made on all threads."""
-        for start in range(0, len(self), n_frames):
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
             yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]

@@ -134,11 +134,11 @@ class Recording:
     def __iter__(self) -> Iterator[DepthFrame]:
         return (self.frame(i) for i in range(len(self)))
 
-    def chunks(self, n_frames: int) -> Iterator[list[DepthFrame]]:
-        """All frames in lists of `n_frames` (the last may be shorter); only one list needs to be in memory."""
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, the last may be shorter; one list is in memory."""
         if n_frames < 1:
             raise ValueError(f"a chunk has at least one frame, got {n_frames}")
-        for start in range(0, len(self), n_frames):
+        for start in range(first, len(self), n_frames):
             yield [self.frame(i) for i in range(start, min(start + n_frames, len(self)))]
 
     def __getitem__(self, part: slice) -> Recording:
@@ -183,6 +183,17 @@ class Recording:
         if self._digest is None:
             self._digest = file_digest(self._sources, progress) if self._sources else self._content_digest()
         return self._digest
+
+    @property
+    def stamp(self) -> list[list[str | int]]:
+        """Name, size and time of each of the input's files, to see cheaply whether it changed; empty without files."""
+        whole = self._whole or self
+        found = [(path.name, path.stat()) for path in whole._sources]
+        return sorted([name, stat.st_size, stat.st_mtime_ns] for name, stat in found)
+
+    def take_digest(self, digest: str) -> None:
+        """Believe that this is the input's hash, for it was read before and its files have not changed since."""
+        (self._whole or self)._digest = digest
 
     def _content_digest(self) -> str:
         whole = hashlib.sha256(self.times_ns.astype("<i8").tobytes())

@@ -6,7 +6,7 @@ Frames are made when asked for, from a seed, in any order. `test_split` holds th
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ class Cast:
 
     pose (n), arena frame; girth (n,); shape: one animal; bends (n, TAIL_RINGS) rad: its tail. things (n, V, 3) mm:
     other objects, shown where `shown` (n,). parameters (n, N_PARAMETERS) of the sensor, seeds (n,) of its noise.
+    thing_faces (F, 3): of the other objects' meshes.
     """
 
     skeleton: Skeleton
@@ -56,6 +57,7 @@ class Cast:
     shown: NDArray[np.bool_]
     parameters: Array
     seeds: NDArray[np.uint64]
+    thing_faces: NDArray[np.int32] = field(default_factory=lambda: THING_FACES)
 
 
 class TrueRecording(Recording):
@@ -108,7 +110,7 @@ class SyntheticSession(TrueRecording):
         out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
         T_camera_arena = self.T_arena_camera.inverse()
         _stage.frames_parallel(
-            self.stage.still, vertices, self.surface.faces, cast.things[part], THING_FACES, cast.shown[part],
+            self.stage.still, vertices, self.surface.faces, cast.things[part], cast.thing_faces, cast.shown[part],
             np.ascontiguousarray(T_camera_arena.rotation), T_camera_arena.translation,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), cast.parameters[part], cast.seeds[part],
             NORMAL, out,
@@ -116,9 +118,9 @@ class SyntheticSession(TrueRecording):
         unit = float(cast.parameters[0, UNIT])
         return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
 
-    def chunks(self, n_frames: int) -> Iterator[list[DepthFrame]]:
-        """All frames in lists of `n_frames`, each list made on all threads."""
-        for start in range(0, len(self), n_frames):
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
             yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]

@@ -13,10 +13,13 @@ from liex_lab.errors import RecordingError
 from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.sensors import BY_NAME
+from liex_lab.recordings.sequences import SEQUENCES, tracking_sequence
+from liex_lab.recordings.synthetic import TrueRecording
 from liex_lab.recordings.worlds import world_of
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
-_KINDS: Final = (*_ANIMALS, "move")
+_SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES)
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
 _MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
@@ -27,16 +30,15 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     """The virtual recording of an address, as in synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
 
     walk: a mouse, swim: a fish, gesture: a hand, move: the animal of a skeleton's TOML, animal=snake.toml. Each setting
-    may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn from the seed. camera: taken for
-    the one that the pictures were made with, to see what a wrong one does.
+    may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn from the seed. track-easy and
+    track-hard: the test sequences of `recordings.sequences`, of a mouse or of animal=fish, with a seed or more frames
+    others of their kind. camera: taken for the one that the pictures were made with, to see what a wrong one does.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
     if kind not in _KINDS:
-        raise RecordingError(
-            f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in {_EXAMPLE}"
-        )
+        raise RecordingError(f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in {_EXAMPLE}")
     stated = dict(parse_qsl(query, keep_blank_values=True))
-    animal = stated.pop("animal", "") if kind == "move" else _ANIMALS[kind]
+    animal = _ANIMALS[kind] if kind in _ANIMALS else stated.pop("animal", "mouse" if kind in _SEQUENCES else "")
     if not animal:
         raise RecordingError(f"{address} lacks the animal that moves, as in synthetic:move?animal=snake.toml&seed=3")
     skeleton = Skeleton.load(animal)
@@ -46,8 +48,14 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
             raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
     values = {key: _value(address, key, text, settings[key]) for key, text in stated.items()}
-    seed, n_frames = values.pop("seed", 0), values.pop("frames", 300)
-    session = world_of(skeleton).motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
+    world = world_of(skeleton)
+    session: TrueRecording
+    if kind in _SEQUENCES:
+        seed, n_frames = values.pop("seed", None), values.pop("frames", None)
+        session = tracking_sequence(world, _SEQUENCES[kind], seed=seed, n_frames=n_frames, **values)
+    else:
+        seed, n_frames = values.pop("seed", 0), values.pop("frames", 300)
+        session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
     if camera is not None:
         session.camera = fitting(camera, session.width, session.height, "the camera that was stated")
     return session
@@ -58,7 +66,7 @@ _Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]
 
 def _settings(kind: str, home_mm: float) -> dict[str, _Setting]:
     """Of each setting: how to read it, what holds for it, what to say otherwise."""
-    low, high = ((30.0, 150.0) if kind == "walk" else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES))
+    low, high = (30.0, 150.0) if kind == "walk" else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES)
     settings: dict[str, _Setting] = {
         "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
         "frames": (int, lambda n: 1 <= n <= _MOST_FRAMES, f"a whole number from 1 to {_MOST_FRAMES}"),

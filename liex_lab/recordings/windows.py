@@ -226,7 +226,7 @@ def _draw_block(
     vertices = surface.vertices(pose, looks.shape, girth, habits.bends(rng, n), parallel)
     trunk = vertices[:, : surface.n_trunk_vertices]
     T_camera_arena = looks.T_arena_camera.inverse()
-    origin = _window_origin(trunk, T_camera_arena, looks.intrinsics, window_px)
+    origin = window_origin(trunk, T_camera_arena, looks.intrinsics, window_px)
     thing, has_thing = _draw_neighbours(rng, trunk, looks.size * skeleton.length, scale, habits.floats)
     walls, seeds = _draw_walls(rng, trunk, habits.setting), rng.integers(1, 2**63, n).astype(np.uint64)
     depth = np.empty((n, window_px, window_px), np.uint16)
@@ -261,7 +261,7 @@ def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) 
     pose.root.translation[:, :2] += spot - middle[:, :2]
 
 
-def _window_origin(trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int) -> NDArray[np.int64]:
+def window_origin(trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int) -> NDArray[np.int64]:
     """Where (n, 2) a window must start for the trunk (n, V, 3) to lie in its middle."""
     p = np.einsum("nij,nvj->nvi", T_camera_arena.rotation, trunk) + T_camera_arena.translation[:, None]
     uv = p[..., :2] / p[..., 2:] * intrinsics[:, None, :2] + intrinsics[:, None, 2:]

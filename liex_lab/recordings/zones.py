@@ -129,7 +129,7 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
         table = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise PlanError(f"there is no file {file} with zones; check the spelling of arena.zones") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError, RecursionError) as error:
         raise PlanError(f"{file} should be a TOML file with zones, but it is not ({error}); correct it") from None
     entries = table.get("zones")
     if not isinstance(entries, list) or not entries or set(table) != {"zones"}:

@@ -6,6 +6,7 @@ Depth streams in as it comes; everything small is written at the end from the sa
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,8 @@ class McapWriter:
             compression=MCAPCompression.Zstd, compression_level=level, chunk_size=chunk_size, compression_threads=0,
             profile="liex_lab",
         )  # fmt: skip
-        self._writer = foxglove.open_mcap(path, context=self._context, writer_options=options)
+        self._file = _WatchedFile(path)
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)  # type: ignore[call-overload]
         self._depth = channels.RawImageChannel("/camera/depth", context=self._context)
         self._calibration = channels.CameraCalibrationChannel("/camera/calibration", context=self._context)
         self._transforms = channels.FrameTransformsChannel("/tf", context=self._context)
@@ -80,13 +82,14 @@ class McapWriter:
                 step=2 * width, data=image.astype("<u2", copy=False).tobytes(),
             )  # fmt: skip
             self._depth.log(message, log_time=int(time_ns))
+        self._file.check()
 
     def finish(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]) -> None:
         """Skeleton, transforms, actions and notes of the whole track; closes the file."""
         track = rows.track
-        quaternions = so3.quaternion(np.where(track.observed[:, None, None], track.root_rotation, np.eye(3)))
+        quaternions = so3.quaternion(np.where(track.posed[:, None, None], track.root_rotation, np.eye(3)))
         for i, time_ns in enumerate(track.times_ns.tolist()):
-            seen = bool(track.observed[i])
+            seen = bool(track.posed[i])
             joints_m = track.joints_mm[i] / 1000.0
             self._scene.log(self._scene_update(time_ns, joints_m, seen), log_time=time_ns)
             self._poses.log(_joint_poses(time_ns, joints_m, seen), log_time=time_ns)
@@ -99,9 +102,18 @@ class McapWriter:
             self._log_notes(int(track.times_ns[0]), problems)
         self.abandon()
 
+    def flushed(self) -> int:
+        """Hand everything to the system; returns the file's bytes. Raises what the system said against it."""
+        self._writer.flush()
+        self._file.flush()
+        self._file.check()
+        return self._file.size
+
     def abandon(self) -> None:
-        """Close the file, whole or not."""
+        """Close the file, whole or not. Raises what the system said against writing it."""
         self._writer.close()
+        self._file.close()
+        self._file.check()
 
     def _log_camera(self, time_ns: int) -> None:
         """Calibration and the camera's place, about once a second, so that a viewer may start anywhere."""
@@ -173,6 +185,51 @@ class McapWriter:
                 timestamp=_stamp(time_ns), level=messages.LogLevel.Warning, message=problem, name="liex_lab"
             )
             self._log.log(note, log_time=time_ns)
+
+
+class _WatchedFile:
+    """A file for Foxglove's writer, which goes on without a word when the disk is full: this one remembers."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb")
+        self._error: Exception | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        return os.fstat(self._file.fileno()).st_size
+
+    def write(self, data: bytes) -> int:
+        """As a file does."""
+        try:
+            return self._file.write(data)
+        except Exception as error:
+            self._error = self._error or error
+            raise
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """As a file does."""
+        return self._file.seek(offset, whence)
+
+    def flush(self) -> None:
+        """As a file does."""
+        try:
+            self._file.flush()
+        except Exception as error:
+            self._error = self._error or error
+            raise
+
+    def close(self) -> None:
+        """As a file does, but what goes wrong is told by `check`."""
+        try:
+            self._file.close()
+        except OSError as error:
+            self._error = self._error or error
+
+    def check(self) -> None:
+        """Raise what went wrong so far."""
+        if self._error is not None:
+            raise self._error
 
 
 def _joint_poses(time_ns: int, joints_m: Array, seen: bool) -> messages.PosesInFrame:

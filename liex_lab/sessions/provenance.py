@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from liex_lab.recordings.times import Gap
     from liex_lab.recordings.zones import Zone
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _PACKAGES = (
     "liex_lab", "numpy", "scipy", "numba", "scikit-learn", "pandas", "pyarrow", "opencv-python-headless", "rerun-sdk",
     "mcap", "foxglove-sdk",
@@ -70,9 +70,10 @@ class Provenance:
     def of(recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any) -> Provenance:
         """The facts of a recording, the floor it was taken above and the plan; `more` are further fields."""
         told, stated = recording.metadata, plan.session
-        subject = {"subject_id": stated.subject_id or told.get("subject_id"), "group": stated.group}
+        subject = {"subject_id": stated.subject_id or told.get("subject_id"), "group": stated.group,
+                   "cage": stated.cage, "sex": stated.sex, "batch": stated.batch}  # fmt: skip
         known: dict[str, Any] = {
-            "name": recording.name, "skeleton": skeleton, "camera": recording.camera,
+            "name": stated.name or recording.name, "skeleton": skeleton, "camera": recording.camera,
             "T_arena_camera": floor.T_arena_camera, "floor_distance_mm": floor.distance_mm,
             "input_sha256": recording.digest(), "plan_toml": plan.to_toml(), "format": recording.format,
             "profile": dict(told.get("profile", {})), "individual": stated.individual, "n_frames": len(recording),

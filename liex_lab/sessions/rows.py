@@ -12,16 +12,19 @@ from numpy.typing import NDArray
 from liex_lab.geometry import so3
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
-from liex_lab.sessions.tables import ROWS_PER_GROUP, Block, Words
-from liex_lab.tracking.track import Track
+from liex_lab.sessions.tables import FRAMES, ROWS_PER_GROUP, Block, Words, to_pandas
+from liex_lab.tracking.track import Flip, Track
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from liex_lab.recordings.times import Gap
 
 Array = NDArray[np.float64]
 
 GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.times)
 _Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
+LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -60,7 +63,7 @@ class Rows:
             "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
             "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
             "spine_mm": track.spine_mm, "scale": track.scale,
-            "flag": track.flag,
+            "p_flip": track.p_flip, "bridged": track.bridged, "flag": track.flag,
         }  # fmt: skip
 
     def poses(self) -> Iterator[Block]:
@@ -112,7 +115,7 @@ class Rows:
         time = self.time_s
         count = frame_count(self.frame_index)
         found = self._camera_gaps()
-        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", "no_depth", "tracker_lost"))
+        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", *LOST))
         stops = stop_times(time)
         for start, stop, reason in stretches(lost):
             if reason:
@@ -123,6 +126,22 @@ class Rows:
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
         kinds = (float, float, np.int64, np.int64, np.int64, str)
         return {**self._who, **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)}}
+
+    def flips(self, flips: Sequence[Flip]) -> Block:
+        """The table `flips`, in order of time."""
+        time, count = self.time_s, frame_count(self.frame_index)
+        stops = stop_times(time)
+        return {
+            **self._who,
+            "start_s": np.array([time[flip.start] for flip in flips]),
+            "stop_s": np.array([stops[flip.stop - 1] for flip in flips]),
+            "start_frame": np.array([count[flip.start] for flip in flips], np.int64),
+            "stop_frame": np.array([count[flip.stop] for flip in flips], np.int64),
+            "p_flip": np.array([flip.p_flip for flip in flips], float),
+            "applied": np.array([flip.applied for flip in flips], bool),
+            "source": np.array([flip.source for flip in flips], str),
+            "undone_at": np.array([flip.undone_at for flip in flips], str),
+        }
 
     def _camera_gaps(self) -> list[_Found]:
         """Where the recording's time is not a steady camera's, as rows of the table `gaps`."""
@@ -209,3 +228,11 @@ def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
         return []
     starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
     return [(int(a), int(b), labels[a]) for a, b in zip(starts, np.append(starts[1:], len(labels)), strict=True)]
+
+
+def rows_only(rows: Rows) -> pd.DataFrame:
+    """A kinematics table without any measure."""
+    return to_pandas(FRAMES[:5], {k: v for k, v in rows.frames().items() if k in _ROW_NAMES})
+
+
+_ROW_NAMES = {column.name for column in FRAMES[:5]}

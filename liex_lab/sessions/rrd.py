@@ -14,8 +14,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.rvl import rvl_message
+from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rows import Rows, frame_count, stop_times, stretches
 
@@ -30,6 +32,8 @@ IMAGE = "arena/camera/image"
 OVERLAY = "arena/camera/image/overlay"
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
+UNCERTAINTY = "arena/uncertainty"
+FLOOR = "arena/floor"
 ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
 _BLOCK = 8192  # frames of small things sent in one go
 RAW_UP_TO = 300  # frames; beyond it depth is stored as RVL, which is half the size
@@ -38,6 +42,9 @@ MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 # Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
 PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xDDCC77)
 _FLAG_COLOURS = {"doubtful": 0xCCBB44, "not_found": 0xEE6677, "no_depth": 0xBBBBBB}
+_WALL, _WORST = 0x9AA0A6, 12
+_HOLDS_95 = 2.795  # standard deviations of a Gaussian in space
+_SPREAD = [255, 170, 60, 140]
 _BONE, _JOINT = [255, 255, 255, 255], [255, 80, 60, 255]
 
 
@@ -50,10 +57,15 @@ class ReplayWriter:
         self._first_ns: int | None = None
         self._stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
         self._stream.set_log_time_enabled(False)
+        self._path, self._n_sent, self._checked, self._n_found = path, 0, 0, 0
         self._stream.save(path)
         if blueprint is not None:
             self._stream.send_blueprint(blueprint)
         self._log_scene()
+
+    def go_on(self, first_ns: int) -> None:
+        """The file continues another one, whose first frame was at `first_ns`."""
+        self._first_ns = first_ns
 
     def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
         """Depth (H, W) uint16 mm of consecutive frames."""
@@ -71,6 +83,7 @@ class ReplayWriter:
                 images = np.stack(depth[part])
                 columns = rr.DepthImage.columns(buffer=images.view(np.uint8).reshape(len(images), -1))
             self._stream.send_columns(DEPTH, _timeline(index[part], elapsed[part]), [*columns])
+            self._n_sent += 1
         self._stream.flush()
 
     def finish(
@@ -84,6 +97,8 @@ class ReplayWriter:
         for name, label, colour in (
             ("speed_mm_s", "speed (mm/s)", 0x4477AA),
             ("nose_height_mm", "nose height (mm)", 0x228833),
+            ("bend_rad", "bend (rad)", 0xAA3377),
+            ("tail_beat_hz", "tail beat (Hz)", 0x66CCEE),
         ):
             if name in kinematics:
                 scalars.append((f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float)))
@@ -91,13 +106,29 @@ class ReplayWriter:
             self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True)
             self._stream.send_columns(entity, _timeline(index, elapsed), [*rr.Scalars.columns(scalars=values)])
         self._log_lanes(rows, bouts, words)
+        self._log_worst(rows, index, elapsed)
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(
             "session", rr.AnyValues(session_id=self._origin.name, animal=self._origin.skeleton.name,
                                     input_sha256=self._origin.input_sha256)
         )  # fmt: skip
+        self.flushed()
         self.abandon()
+
+    def flushed(self) -> int:
+        """Hand everything to the system; returns the file's bytes. Raises SessionError where something is missing.
+
+        Rerun does not tell when the disk is full, so the messages on disk are counted.
+        """
+        self._stream.flush()
+        size = self._path.stat().st_size
+        with self._path.open("rb") as file:
+            for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
+                self._checked, self._n_found = at + length, self._n_found + 1
+        if self._n_found < self._n_sent:
+            raise SessionError("the replay was not written whole; make room on the disk and run it again")
+        return size
 
     def abandon(self) -> None:
         """Close the file, whole or not."""
@@ -116,6 +147,23 @@ class ReplayWriter:
             image_plane_distance=0.05,
         )
         self._stream.log(IMAGE, lens, static=True)
+        for name, outline, colour in self._outlines():
+            ring = np.column_stack([outline, np.zeros(len(outline))])[[*range(len(outline)), 0]]
+            look: dict[str, Any] = {"colors": _rgba([colour]), "labels": [name] if name else None}
+            where = f"zones/{rr.escape_entity_path_part(name)}" if name else "walls"
+            on_floor = rr.LineStrips3D([ring / MM_PER_UNIT], radii=0.001, **look)
+            self._stream.log(f"{FLOOR}/{where}", on_floor, static=True)
+            seen = camera.project(T_arena_camera.inverse() @ ring) + 0.5
+            if np.isfinite(seen).all():
+                in_picture = rr.LineStrips2D([seen], radii=rr.Radius.ui_points(1.0), **look)
+                self._stream.log(f"{OVERLAY}/{where}", in_picture, static=True)
+
+    def _outlines(self) -> list[tuple[str, Array, int]]:
+        """The walls, whose name is empty, and the zones on the floor: name, corners (n, 2) mm, colour."""
+        walls = self._origin.arena.outline_mm()
+        zones = zip(self._origin.zones, cycle(PALETTE), strict=False)
+        drawn = [(zone.name, zone.outline_mm(), colour) for zone, colour in zones]
+        return ([("", walls, _WALL)] if len(walls) else []) + drawn
 
     def _log_depth_kind(self, first: NDArray[np.uint16]) -> None:
         """What holds for every depth image: unit, colours, layout."""
@@ -144,10 +192,13 @@ class ReplayWriter:
             self._stream.log(f"{entity}/joints", dot.from_fields(radii=thick, colors=_JOINT, show_labels=False),
                              static=True)  # fmt: skip
             self._stream.log(f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True)
+        look = rr.Ellipsoids3D.from_fields(colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003)
+        self._stream.log(UNCERTAINTY, look, static=True)
         for start in range(0, track.n_frames, _BLOCK):
             part = slice(start, start + _BLOCK)
-            when, seen = _timeline(index[part], elapsed[part]), track.observed[part]
+            when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
+            self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
             self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
 
@@ -166,16 +217,34 @@ class ReplayWriter:
         self._stream.send_columns(f"{entity}/joints", when, [*dots.partition(n_dots)])
         self._stream.send_columns(f"{entity}/bones", when, [*strips.partition(n_bones)])
 
+    def _send_spheres(self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]) -> None:
+        """Around each joint (k, J, 3) of the k frames `seen` a sphere that holds it with 95 %; sd_mm (k, J)."""
+        size = np.repeat(_HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 1), 3, axis=1) / MM_PER_UNIT
+        spheres = rr.Ellipsoids3D.columns(half_sizes=size, centers=joints_mm.reshape(-1, 3) / MM_PER_UNIT)
+        n_spheres = np.where(seen, joints_mm.shape[1], 0)
+        self._stream.send_columns(UNCERTAINTY, when, [*spheres.partition(n_spheres)])
+
     def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frame of the body's base; while the animal is lost it stays where it was seen last."""
         track = rows.track
-        seen = track.observed
+        seen = track.posed
         if not seen.any():
             return
         self._stream.log(ROOT, rr.TransformAxes3D(0.02), static=True)
         xyzw = np.roll(so3.quaternion(track.root_rotation[seen]), -1, axis=-1)
         columns = rr.Transform3D.columns(translation=track.root_mm[seen] / 1000.0, quaternion=xyzw)
         self._stream.send_columns(ROOT, _timeline(index[seen], elapsed[seen]), [*columns])
+
+    def _log_worst(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+        """The frames with the largest predicted error, as notes to jump to."""
+        error = np.nan_to_num(rows.track.predicted_error_mm)
+        worst = np.sort(np.argsort(-error, kind="stable")[:_WORST])
+        worst = worst[error[worst] > 0]
+        if len(worst) == 0:
+            return
+        notes = [f"frame {index[k]}: joint error to be expected {error[k]:.1f} mm" for k in worst]
+        columns = rr.TextLog.columns(text=notes, level=["INFO"] * len(notes))
+        self._stream.send_columns("log/worst", _timeline(index[worst], elapsed[worst]), [*columns])
 
     def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """The lane of the actions, and the lane of frames to distrust."""

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liex_lab.camera import Camera
-from liex_lab.errors import SessionError
+from liex_lab.errors import LiexError, SessionError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
 from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
+from liex_lab.sessions.tables import as_it_was
+from liex_lab.sessions.thumbnails import FOLDER
 from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
 if TYPE_CHECKING:
@@ -22,10 +26,12 @@ if TYPE_CHECKING:
 
 FILES = (
     "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
-    "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "columns.json", "session.rrd",
-    "session.mcap",
+    "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "transitions.parquet",
+    "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap", "observations.npz",
 )  # fmt: skip
-_OPTIONAL = {"kinematics.parquet", "summary.csv"}
+_OPTIONAL = {
+    "kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet", "observations.npz",
+}  # fmt: skip
 
 
 class Session:
@@ -60,7 +66,8 @@ class Session:
         try:
             metadata = json.loads(document.read_text(encoding="utf-8"))
             found = int(metadata["schema_version"])
-        except (ValueError, KeyError, TypeError):
+            _keep_inside(metadata)
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             raise SessionError(
                 f"{document} is damaged and cannot be read; run `liex run` on the recording again"
             ) from None
@@ -122,44 +129,49 @@ class Session:
         path = self.path / "summary.csv"
         if not path.is_file():
             raise SessionError(f"the session {self.path} has no summary.csv; it was written without behaviour measures")
-        return pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
+        with _read_from(path):
+            table = pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
+            return table.map(as_it_was)
 
     @cached_property
     def columns(self) -> pd.DataFrame:
         """The column dictionary: one row per column of every table."""
         import pandas as pd
 
-        entries = json.loads((self.path / "columns.json").read_text(encoding="utf-8"))
-        return pd.DataFrame(entries)
+        with _read_from(self.path / "columns.json") as path:
+            return pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
 
     @cached_property
     def camera(self) -> Camera:
         """The depth camera, an ideal one in air; `metadata["camera"]["optics"]` says what was undone for that."""
-        return Camera.from_dict(self.metadata["camera"])
+        with _read_from(self.path / "session.json"):
+            return Camera.from_dict(self.metadata["camera"])
 
     @cached_property
     def T_arena_camera(self) -> SE3:
         """Carries points of the camera frame into the arena frame."""
-        return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
+        with _read_from(self.path / "session.json"):
+            return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
 
     @cached_property
     def arena(self) -> Arena:
         """The shape of the floor; open where it is not known."""
-        return Arena.from_dict(self.metadata.get("arena", {"kind": "open"}))
+        with _read_from(self.path / "session.json"):
+            return Arena.from_dict(self.metadata.get("arena", {"kind": "open"}))
 
     @cached_property
     def zones(self) -> list[Zone]:
         """The zones that were drawn."""
-        return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
+        with _read_from(self.path / "session.json"):
+            return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
     @property
     def plan(self) -> str:
         """The plan as resolved, TOML text."""
-        return (self.path / "plan.toml").read_text(encoding="utf-8")
+        with _read_from(self.path / "plan.toml") as path:
+            return path.read_text(encoding="utf-8")
 
-    def table(
-        self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
-    ) -> pd.DataFrame:
+    def table(self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None) -> pd.DataFrame:
         """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
         import pandas as pd
 
@@ -168,4 +180,30 @@ class Session:
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
         rows = None if frame_index is None else [("frame_index", "in", frame_index)]
-        return pd.read_parquet(path, columns=columns, filters=rows)
+        with _read_from(path):
+            return pd.read_parquet(path, columns=columns, filters=rows)
+
+
+@contextmanager
+def _read_from(path: Path) -> Iterator[Path]:
+    """Within the block, whatever goes wrong is a damaged file's fault."""
+    try:
+        yield path
+    except LiexError:
+        raise
+    except Exception as error:
+        what = str(error).partition("\n")[0][:200]
+        raise SessionError(
+            f"{path} is damaged and cannot be read ({type(error).__name__}: {what}); run `liex run` on the recording "
+            "again"
+        ) from None
+
+
+def _keep_inside(metadata: dict[str, Any]) -> None:
+    """Sections that others rely on have the right kind; the pictures that it names are in the session's own folder."""
+    for name, kind in {"session_id": str, "camera": dict, "animal": dict}.items():
+        if name in metadata and not isinstance(metadata[name], kind):
+            raise TypeError(name)
+    kept = metadata.get("thumbnails", [])
+    if any(PurePosixPath(entry["file"]).parts[:-1] != (FOLDER,) for entry in kept):
+        raise ValueError("a picture outside of the session")

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+_BEGINS_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 ROWS_PER_GROUP = 250_000  # a block of the widest table then takes some 30 MB
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
@@ -72,9 +73,9 @@ FRAMES = columns(
     ("time_ns", "int64", "ns", "time stamp of the frame as recorded", "", "the recording's clock"),
     ("gap_before", "int64", "", "frames that the camera did not deliver just before this one", "", "recording"),
     ("predicted_error_mm", "float64", "mm", "joint error to be expected in this frame, mean over the joints", "",
-     "learned metric of the model"),
-    ("residual_mm", "float64", "mm", "distance between the fitted body's surface and the depth seen, within the animal",
-     "median of |rendered - observed|", "fit"),
+     "learned metric of the model, and the smoother"),
+    ("residual_mm", "float64", "mm", "distance between the body's surface and the depth seen, within the animal, with "
+     "the pose that the frame says by itself", "median of |rendered - observed|", "fit"),
     ("n_foreground_px", "int64", "px", "pixels taken for the animal", "", "foreground"),
     *((f"centroid_{a}_mm", "float64", "mm", f"centre of the animal's outline as seen from above; {_AXES}",
        "mean over its pixels, weighted by the area they cover", "foreground") for a in "xy"),
@@ -88,8 +89,12 @@ FRAMES = columns(
     ("spine_mm", "float64", "mm", "length of the fitted chain of joints, all bones added up",
      "scale x length of the skeleton at home", "fit"),
     ("scale", "float64", "", "size of the animal relative to the skeleton's file", "", "fit"),
-    ("flag", "string", "", "empty when the pose is trusted, else doubtful, not_found or no_depth; the last two have "
-     "no pose", "", "tracker"),
+    ("p_flip", "float64", "", "probability that head and tail are exchanged in this pose", "two states over the whole "
+     "recording: what each frame says of either, and how fast animals turn", "tracker"),
+    ("bridged", "bool", "", "nothing was measured; the pose is what lies between two measured ones that are no farther "
+     "apart than tracking.bridge_s of the plan; measures of behaviour leave it out", "", "tracker"),
+    ("flag", "string", "", "empty when the pose is trusted; doubtful: its predicted error is large; not_found or "
+     "no_depth: nothing was measured, and there is no pose where it is not bridged", "", "tracker"),
 )  # fmt: skip
 
 POSES = columns(
@@ -105,12 +110,12 @@ POSES = columns(
     ("score", "float64", "", "probability that the joint lies within 10 % of the spine's length of the truth",
      "chi distribution with 3 degrees of freedom at 0.1 spine_mm / sd_mm", "sd_mm"),
     ("sd_mm", "float64", "mm", "standard deviation of the joint along one axis", "sqrt(trace of covariance / 3)",
-     "estimator"),
+     "posterior of the smoother"),
 )  # fmt: skip
 
 _TURN = "rotation vector relative to the parent joint; row 'root': the body's base relative to the arena"
 _SHIFT = "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
-_SPREAD = "estimator"
+_SPREAD = "posterior of the smoother"
 ROTATIONS = columns(
     "rotations", *_WHO, *_WHEN,
     ("joint", "string", "", "name of the joint; 'root' is the rigid transform of the body's base, T_arena_root"),
@@ -147,7 +152,8 @@ GAPS = columns(
 
 FLIPS = columns(
     "flips", *_WHO, *_SPAN,
-    ("p_flip", "float64", "", "probability that head and tail were exchanged"),
+    ("p_flip", "float64", "", "probability that head and tail were exchanged: where applied, in what the single frames "
+     "said, else in the tables", "mean over the span", "tracker"),
     ("applied", "bool", "", "whether the exchange was undone in the tables"),
     ("source", "string", "", "who found it: model or human"),
     ("undone_at", "string", "", "when a human took the correction back, ISO 8601; empty otherwise"),
@@ -260,6 +266,16 @@ class Words:
 
     def __len__(self) -> int:
         return len(self.codes)
+
+
+def harmless(value: Any) -> Any:
+    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe before it."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
+
+
+def as_it_was(value: Any) -> Any:
+    """What `harmless` was given."""
+    return value[1:] if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA else value
 
 
 def to_pandas(schema: Sequence[Column], block: Block) -> pd.DataFrame:

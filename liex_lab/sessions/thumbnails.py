@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,22 @@ class Keepsakes:
         """The depth of the next frame, (H, W) uint16 mm."""
         if self._seen % self._every == 0:
             self._kept[self._seen] = depth
-            if len(self._kept) > _KEPT:
-                self._every *= 2
-                self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
+            self._thin_out()
         self._seen += 1
+
+    def _thin_out(self) -> None:
+        if len(self._kept) > _KEPT:
+            self._every *= 2
+            self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
+
+    def again(self, n_frames: int, read: Callable[[int], NDArray[np.uint16]]) -> None:
+        """As if the first `n_frames` had been added; `read` gives the depth of one of them by its row."""
+        for row in range(n_frames):
+            if row % self._every == 0:
+                self._kept[row] = np.empty(0, np.uint16)
+                self._thin_out()
+        self._kept = {row: read(row) for row in self._kept}
+        self._seen = n_frames
 
     def save(self, folder: Path, rows: Rows, camera: Camera) -> list[dict[str, Any]]:
         """Write up to four 16-bit PNG pictures, mm, 0 unread, and say where in the frame each was cut."""

@@ -1,16 +1,17 @@
-"""Writing a session: a temporary folder beside the final place, renamed when whole, gone when anything fails."""
+"""Writing a session: a folder beside the final place, renamed when whole; interrupted, the work goes on there."""
 
 from __future__ import annotations
 
 import json
 import os
+import platform
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +19,26 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
+from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
+from liex_lab.sessions.checkpoint import LOGS, Checkpoint
+from liex_lab.sessions.evidence import write_evidence
+from liex_lab.sessions.place import check_place, file_facts, part_folder
 from liex_lab.sessions.provenance import Provenance, package_version
-from liex_lab.sessions.rows import Rows, median_step, stop_times
+from liex_lab.sessions.rows import Rows, median_step, rows_only, stop_times
 from liex_lab.sessions.tables import Column
 from liex_lab.sessions.thumbnails import Keepsakes
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Flip, Track, Tracked
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
+    from liex_lab.tracking.curve import Subject
+    from liex_lab.tracking.observations import Observations
+
+_INDEX, _TIMES = "frame_index", "frame_time_ns"
+Kept = TypeVar("Kept")
 
 BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json as known so far -> a Rerun blueprint
 ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in it
@@ -38,8 +47,9 @@ ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in
 class SessionWriter:
     """Takes depth and track part by part; `close` writes the tables and puts the session in its place.
 
-    Depth goes straight to session.rrd and session.mcap, so memory does not grow with it; of the track one row per
-    frame is held. Use it in a `with` block: an exception leaves nothing behind and goes on.
+    Depth goes straight to session.rrd and session.mcap, so memory does not grow with it. Use it in a `with` block: an
+    exception goes on, and leaves nothing behind but a folder NAME.part where there is a checkpoint in it. A writer of
+    the same session then begins with `n_frames` frames that need not be given again.
     """
 
     def __init__(
@@ -56,19 +66,22 @@ class SessionWriter:
         self._overwrite, self._report = overwrite, report
         self._document = origin.document()
         self._started, self._seconds = time.perf_counter(), 0.0
-        self._index: list[int] = []
-        self._times_ns: list[int] = []
-        self._held = TrackBuffer(origin.skeleton, origin.n_frames or 1024)
+        self._held = TrackBuffer(origin.skeleton, 0)
+        self._flips: Sequence[Flip] = ()
         self._keepsakes = Keepsakes()
         self._done = False
-        self._folder = path.with_name(f"{path.name}.part-{os.getpid()}")
-        self._folder.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(self._folder, ignore_errors=True)
-        self._folder.mkdir()
+        self._folder = part_folder(path)
+        self._checkpoint = Checkpoint(self._folder, {"n_frames": origin.n_frames, **self._document})
+        before = self._checkpoint.seen.read()
+        self._index: list[int] = before.get(_INDEX, np.zeros(0, np.int64)).tolist()
+        self._times_ns: list[int] = before.get(_TIMES, np.zeros(0, np.int64)).tolist()
+        self._logging: list[Future[None]] = []
+        self._loggers = ThreadPoolExecutor(len(LOGS))
         try:
             self._open_logs(blueprint)
         except BaseException:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            self._loggers.shutdown()
+            self._checkpoint.leave(keep=True)
             raise
 
     def _open_logs(self, blueprint: BlueprintMaker | None) -> None:
@@ -76,8 +89,11 @@ class SessionWriter:
         from liex_lab.sessions.rrd import ReplayWriter
 
         made = blueprint(self._document) if blueprint else None
-        self._replay = ReplayWriter(self._folder / "session.rrd", self.origin, made)
-        self._mcap = McapWriter(self._folder / "session.mcap", self.origin)
+        replay, messages = (self._checkpoint.part(log, self._checkpoint.n_parts - 1) for log in LOGS)
+        self._replay = ReplayWriter(replay, self.origin, made)
+        self._mcap = McapWriter(messages, self.origin)
+        if self._times_ns:
+            self._replay.go_on(self._times_ns[0])
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -87,12 +103,26 @@ class SessionWriter:
     ) -> None:
         if self._done:
             return
-        self._abandon()
+        self._abandon(keep=error is not None)
         if error is None:
             raise SessionError("a session left without close() is not kept; call close() at the end of the block")
 
-    def add(self, frames: Sequence[DepthFrame], track_part: Track | None = None) -> None:
-        """Consecutive frames and, unless `close` gets the whole track, their part of it."""
+    @property
+    def n_frames(self) -> int:
+        """Frames that are in the session already; more than none where an interrupted one goes on."""
+        return len(self._index)
+
+    def go_on(self, depth: Callable[[int], NDArray[np.float32]]) -> None:
+        """Look once more at the few frames of the report, where some are in already; depth: of a row, (H, W) mm."""
+        from liex_lab.recordings.rvl import to_millimetres
+
+        self._keepsakes.again(self.n_frames, lambda row: to_millimetres(depth(row)))
+
+    def add(self, frames: Sequence[DepthFrame], track_part: Track | None = None, seen: Columnar | None = None) -> None:
+        """Consecutive frames and, unless `close` gets the whole track, their part of it.
+
+        seen: what was seen in them, kept on disk until the session is whole: the work can go on from there, see `seen`.
+        """
         from liex_lab.recordings.rvl import to_millimetres
 
         if not frames:
@@ -102,16 +132,43 @@ class SessionWriter:
         if track_part is not None:
             _check_times(np.array(times, np.int64), track_part)
             self._held.append(track_part)
+        index = [int(frame.index) for frame in frames]
         for start in range(0, len(frames), 16):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [to_millimetres(frame.depth) for frame in frames[part]]
-            self._replay.add([frame.index for frame in frames[part]], times[part], depth)
-            self._mcap.add(times[part], depth)
+            self._settle()
+            self._logging = [
+                self._loggers.submit(self._replay.add, index[part], times[part], depth),
+                self._loggers.submit(self._mcap.add, times[part], depth),
+            ]
             for image in depth:
                 self._keepsakes.add(image)
-        self._index += [int(frame.index) for frame in frames]
+        self._index += index
         self._times_ns += times
+        if seen is not None:
+            stamps = {_INDEX: np.array(index, np.int64), _TIMES: np.array(times, np.int64)}
+            self._checkpoint.seen.append({**columns_of(seen), **stamps})
+        if self._checkpoint.due:
+            self._take_down()
         self._seconds += time.perf_counter() - began
+
+    def seen(self, kind: Callable[..., Kept]) -> Kept:
+        """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its columns in order."""
+        kept = self._checkpoint.seen.read()
+        return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (_INDEX, _TIMES)))
+
+    def _settle(self) -> None:
+        """Wait until the logs have written what they were given; what went wrong is raised here."""
+        waiting, self._logging = self._logging, []
+        for one in waiting:
+            one.result()
+
+    def _take_down(self) -> None:
+        """A checkpoint: everything so far need not be done again. Only what `seen` was given for can go on."""
+        self._settle()
+        sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
+        if len(self._checkpoint.seen) == len(self._index):
+            self._checkpoint.save(len(self._index), self._checkpoint.seconds_before + self._elapsed, sizes)
 
     @property
     def track(self) -> Track:
@@ -122,8 +179,16 @@ class SessionWriter:
     def track(self, track: Track) -> None:
         """Replace the track, for one that was smoothed over the whole recording."""
         _check_times(np.array(self._times_ns, np.int64), track)
-        self._held = TrackBuffer(self.origin.skeleton, 0)
-        self._held.append(track)
+        self._held = TrackBuffer.of(track)
+
+    def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
+        """The track of all frames so far, what was found out about its flips, and what it was made of."""
+        self.track, self._flips = tracked.track, tracked.flips
+        write_evidence(self._folder, seen, subject)
+
+    def keep(self, folder: Path) -> None:
+        """Put a copy of a folder into the session."""
+        shutil.copytree(folder, self._folder / folder.name)
 
     @property
     def rows(self) -> Rows:
@@ -144,12 +209,18 @@ class SessionWriter:
 
         n_frames, n_joints = len(self._index), self.origin.skeleton.n_joints
         codes = np.tile(np.arange(n_joints, dtype=np.int8), n_frames)
-        place = self.track.joints_mm.reshape(-1, 3)
+        # what was bridged was not measured
+        place = np.where(self.track.bridged[:, None, None], np.nan, self.track.joints_mm).reshape(-1, 3)
         return pd.DataFrame({
             "frame_index": np.repeat(np.array(self._index, np.int64), n_joints),
             "joint": pd.Categorical.from_codes(codes, pd.Index(self.origin.skeleton.names)),
-            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2],
+            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2], "sd_mm": self.track.sd_mm.ravel(),
         })  # fmt: skip
+
+    @property
+    def gaps(self) -> pd.DataFrame:
+        """The table `gaps` of the track so far."""
+        return tables.to_pandas(tables.GAPS, self.rows.gaps())
 
     def note(self, **sections: Any) -> None:
         """Add facts found on the way to session.json: tables are merged, lists extended, the rest replaced."""
@@ -165,9 +236,7 @@ class SessionWriter:
     def close(
         self,
         *,
-        kinematics: pd.DataFrame | None = None,
-        bouts: pd.DataFrame | None = None,
-        summary: pd.DataFrame | None = None,
+        results: Mapping[str, pd.DataFrame] | None = None,
         columns: Sequence[Column] = (),
         actions: Mapping[str, str] | None = None,
         record: Mapping[str, Any] | None = None,
@@ -175,28 +244,35 @@ class SessionWriter:
     ) -> Session:
         """Write everything else and put the session in its place.
 
-        columns: describe those of kinematics and summary, and those that bouts has beyond `tables.BOUTS`; actions: the
-        ethogram's vocabulary, word -> definition; record: what else session.json should hold (see `note`).
+        results: tables by name (kinematics, bouts, summary and others); columns: describe theirs, of bouts those beyond
+        `tables.BOUTS`; actions: the ethogram's vocabulary, word -> definition; record: what else session.json should
+        hold (see `note`).
         """
         from liex_lab.sessions.session import Session
 
         if not self._index:
             raise SessionError("the recording holds no frame, so there is no session to write; see `liex doctor`")
         began = time.perf_counter()
+        self._settle()
+        if self._checkpoint.state.n_frames:  # it took long: what follows may be interrupted, too
+            self._take_down()
         rows = self.rows
         _check_times(np.array(self._times_ns, np.int64), rows.track)
-        if bouts is None:
-            bouts = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
-        kinematics = rows_only(rows) if kinematics is None else kinematics
-        self._write_tables(rows, {"kinematics": kinematics, "bouts": bouts, "summary": summary}, columns)
+        results = dict(results or {})
+        if "bouts" not in results:
+            results["bouts"] = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
+        bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
+        self._write_tables(rows, results, columns)
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems)
         self._mcap.finish(rows, bouts, words, problems)
+        self._checkpoint.join_logs()
         self.note(actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {}))
         self._document["thumbnails"] = self._keepsakes.save(self._folder, rows, self.origin.camera)
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
+        self._document["files"] = file_facts(self._folder, self._checkpoint.logs)
         self._document.update(self._account(rows, dict(timings_s or {})))
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
@@ -207,30 +283,32 @@ class SessionWriter:
             self._publish()
         return Session.open(self.path)
 
-    def _write_tables(
-        self, rows: Rows, results: Mapping[str, pd.DataFrame | None], columns: Sequence[Column]
-    ) -> None:
+    def _write_tables(self, rows: Rows, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]) -> None:
         """All parquet files, summary.csv and columns.json."""
         described = self.origin.table_metadata()
         own: dict[str, Any] = {
             "frames": [rows.frames()], "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
-            "flips": [tables.from_pandas(tables.FLIPS, tables.empty_table(tables.FLIPS))],
+            "flips": [rows.flips(self._flips)],
             "sessions": [self._session_row(rows)],
         }  # fmt: skip
         for name, blocks in own.items():
             tables.write_table(self._folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
         for name, result in results.items():
             schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
-            if result is None or not schema:
+            if not schema:  # kinematics without any measure
                 continue
             block = tables.from_pandas(schema, result)
             if name == "summary":
                 tables.check_described(block, schema, name)
-                result.to_csv(self._folder / "summary.csv", index=False, lineterminator="\n")
+                result.map(tables.harmless).to_csv(self._folder / "summary.csv", index=False, lineterminator="\n")
             else:
                 tables.write_table(self._folder / f"{name}.parquet", schema, [block], described)
         text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
         (self._folder / "columns.json").write_text(text + "\n", encoding="utf-8")
+
+    @property
+    def _elapsed(self) -> float:
+        return time.perf_counter() - self._started
 
     def _session_row(self, rows: Rows) -> dict[str, Any]:
         track, subject = rows.track, self.origin.subject
@@ -247,7 +325,7 @@ class SessionWriter:
 
     def _account(self, rows: Rows, timings_s: dict[str, float]) -> dict[str, Any]:
         """Counts of the frames, and what the run cost."""
-        track, elapsed = rows.track, time.perf_counter() - self._started
+        track, elapsed = rows.track, self._checkpoint.seconds_before + self._elapsed
         time_s = rows.time_s
         row = self._session_row(rows)
         flags = {flag or "good": int(np.sum(track.flag == flag)) for flag in np.unique(track.flag)}
@@ -262,14 +340,18 @@ class SessionWriter:
             "timings_s": {**timings_s, "write": round(self._seconds, 4), "total": round(elapsed, 4)},
             "frames_per_s": round(track.n_frames / elapsed, 2),
             "peak_memory_mb": peak_memory_mb(),
+            "machine": {"name": platform.node(), "system": platform.platform(), "cores": os.cpu_count()},
+            "interruptions": self._checkpoint.n_parts - 1,
         }  # fmt: skip
 
     def _publish(self) -> None:
         """Rename the whole folder into place; an older session goes only after that."""
-        old = self.path.with_name(f"{self.path.name}.old-{os.getpid()}")
+        old = self.path.with_name(f"{self.path.name}.old")
         check_place(self.path, self._overwrite)
         if self.path.exists():
+            shutil.rmtree(old, ignore_errors=True)
             self.path.rename(old)
+        self._checkpoint.drop_parts()
         try:
             self._folder.rename(self.path)
         except OSError:
@@ -277,62 +359,19 @@ class SessionWriter:
                 old.rename(self.path)
             raise
         self._done = True
+        self._loggers.shutdown()
+        self._checkpoint.tidy(self.path)
         shutil.rmtree(old, ignore_errors=True)
 
-    def _abandon(self) -> None:
-        """Close what is open and remove the temporary folder."""
+    def _abandon(self, keep: bool) -> None:
+        """Close what is open; keep: what there is a checkpoint of."""
+        self._loggers.shutdown(cancel_futures=True)
         for log in (self._replay, self._mcap):
             try:
                 log.abandon()
             except Exception:  # an error is under way already; it is the one to tell
                 continue
-        shutil.rmtree(self._folder, ignore_errors=True)
-
-
-class TrackBuffer:
-    """A track that grows by parts, in arrays made for the expected number of frames, so that nothing is held twice."""
-
-    def __init__(self, skeleton: Skeleton, n_expected: int) -> None:
-        self._room = Track.empty(skeleton, np.zeros(n_expected, np.int64))
-        self._n = 0
-
-    def append(self, part: Track) -> None:
-        """Take the next rows."""
-        needed = self._n + part.n_frames
-        if needed > self._room.n_frames:
-            more = max(needed - self._room.n_frames, self._room.n_frames // 2)
-            self._room = Track.join([self._room, Track.empty(part.skeleton, np.zeros(more, np.int64))])
-        for column in fields(Track):
-            if column.name != "skeleton":
-                getattr(self._room, column.name)[self._n : needed] = getattr(part, column.name)
-        self._n = needed
-
-    @property
-    def track(self) -> Track:
-        """The rows so far, not copied."""
-        columns = [column.name for column in fields(Track) if column.name != "skeleton"]
-        return Track(self._room.skeleton, *(getattr(self._room, name)[: self._n] for name in columns))
-
-
-def check_place(path: Path, overwrite: bool) -> None:
-    """Refuse to write over what must not be lost, or where no folder can be."""
-    nearest = next((folder for folder in path.parents if folder.exists()), None)
-    if nearest is not None and not nearest.is_dir():
-        raise SessionError(f"{nearest} is a file, and a session needs a folder; choose another place with --out")
-    if not path.exists():
-        return
-    if not (path / "session.json").is_file():
-        raise SessionError(f"{path} exists and is not a session, so it is left alone; choose another place with --out")
-    if not overwrite:
-        raise SessionError(f"the session {path} exists already; choose another place with --out, or say --overwrite")
-
-
-def rows_only(rows: Rows) -> pd.DataFrame:
-    """A kinematics table without any measure."""
-    return tables.to_pandas(tables.FRAMES[:5], {k: v for k, v in rows.frames().items() if k in _ROW_NAMES})
-
-
-_ROW_NAMES = {column.name for column in tables.FRAMES[:5]}
+        self._checkpoint.leave(keep)
 
 
 def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:

@@ -15,21 +15,23 @@ Array = NDArray[np.float64]
 FLAGS = {
     "": "a pose was measured and is trusted",
     "doubtful": "a pose was measured, but its predicted error is large for this animal",
-    "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN",
-    "no_depth": "the frame holds no depth at all; the row is NaN",
+    "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged",
+    "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
 }
 
 
 @dataclass(frozen=True)
 class Track:
-    """Poses over time: one row for EVERY frame of the recording, NaN where nothing was measured.
+    """Poses over time: one row for EVERY frame of the recording, NaN where there is none.
 
     times_ns (n,) int64; joints_mm (n, J, 3) arena frame; uv_px (n, J, 2) pixels of the depth image; sd_mm (n, J);
     root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; sd_root (n, 6) rad and mm, in the root's own frame;
     angles_rad (n, J, 3) rotation vectors relative to the parent joint; sd_angles_rad (n, J, 3); scale (n,) of the
     skeleton's bones; predicted_error_mm (n,) mean joint error expected by the learned metric; residual_mm (n,) median
     distance between the rendered body and the observed depth; n_foreground_px (n,); centroid_mm (n, 3) centre of the
-    animal as seen from above and its mean height, arena frame; centroid_px (n, 2); flag (n,) a word of `FLAGS`.
+    animal as seen from above and its mean height, arena frame; centroid_px (n, 2); p_flip (n,): probability that head
+    and tail are exchanged; bridged (n,): nothing was measured, but shortly before and after, and the pose is what lies
+    between; flag (n,) a word of `FLAGS`.
     """
 
     skeleton: Skeleton
@@ -48,6 +50,8 @@ class Track:
     n_foreground_px: NDArray[np.int64]
     centroid_mm: Array
     centroid_px: Array
+    p_flip: Array
+    bridged: NDArray[np.bool_]
     flag: NDArray[np.str_]
 
     @staticmethod
@@ -59,7 +63,8 @@ class Track:
             skeleton, np.asarray(times_ns, np.int64), nan((n, j, 3), np.nan), nan((n, j, 2), np.nan),
             nan((n, j), np.nan), nan((n, 3, 3), np.nan), nan((n, 3), np.nan), nan((n, 6), np.nan),
             nan((n, j, 3), np.nan), nan((n, j, 3), np.nan), nan(n, np.nan), nan(n, np.nan), nan(n, np.nan),
-            np.zeros(n, np.int64), nan((n, 3), np.nan), nan((n, 2), np.nan), np.full(n, flag, dtype="<U12"),
+            np.zeros(n, np.int64), nan((n, 3), np.nan), nan((n, 2), np.nan), nan(n, np.nan),
+            np.zeros(n, np.bool_), np.full(n, flag, dtype="<U12"),
         )  # fmt: skip
 
     @staticmethod
@@ -68,15 +73,25 @@ class Track:
         columns = [f.name for f in fields(Track) if f.name != "skeleton"]
         return Track(parts[0].skeleton, *(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
+    def __getitem__(self, rows: slice) -> Track:
+        """Some consecutive frames."""
+        columns = [f.name for f in fields(Track) if f.name != "skeleton"]
+        return Track(self.skeleton, *(getattr(self, name)[rows] for name in columns))
+
     @property
     def n_frames(self) -> int:
         """Frames of the recording, measured or not."""
         return len(self.times_ns)
 
     @property
+    def posed(self) -> NDArray[np.bool_]:
+        """(n,) True where there is a pose, measured or bridged."""
+        return np.isfinite(self.joints_mm[:, 0, 0])
+
+    @property
     def observed(self) -> NDArray[np.bool_]:
         """(n,) True where a pose was measured."""
-        return np.isfinite(self.joints_mm[:, 0, 0])
+        return self.posed & ~self.bridged
 
     @property
     def root(self) -> SE3:
@@ -87,3 +102,27 @@ class Track:
     def spine_mm(self) -> Array:
         """(n,) length of the fitted chain, all bones added up, mm."""
         return self.scale * self.skeleton.length
+
+
+@dataclass(frozen=True)
+class Flip:
+    """Frames start to stop (exclusive) in which head and tail may have been exchanged.
+
+    p_flip: probability that they were, in the single frames' answers where `applied` says that this was undone, else in
+    the track; source: model or human; undone_at: when a human took the correction back, ISO 8601.
+    """
+
+    start: int
+    stop: int
+    p_flip: float
+    applied: bool
+    source: str = "model"
+    undone_at: str = ""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A track and what was found out about head and tail on the way."""
+
+    track: Track
+    flips: tuple[Flip, ...]

@@ -1,9 +1,10 @@
-"""Following one animal frame by frame: every frame of the recording becomes one row of the track."""
+"""Before the curve: the animal's size and girth, and what every frame of a recording says of the pose by itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +14,21 @@ from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.tracking.curve import Subject, single_frames, track_whole
+from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.residual import BodyResidual
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Flip, Track, Tracked
+
+BRIDGE_S = 0.5
 
 
 @dataclass(frozen=True)
 class FrameTracker:
-    """Measures each frame on its own. size: the animal's spine over the skeleton's home length, a fact of the session.
+    """Measures each frame on its own; `track` then makes the curve of them all.
 
-    size_origin says where the size comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger predicted
-    error are flagged.
+    size: the animal's spine over the skeleton's home length, a fact of the session. size_origin says where the size
+    comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long
+    a stretch without a measurement is bridged.
     """
 
     estimator: PoseEstimator
@@ -31,6 +37,7 @@ class FrameTracker:
     size_origin: str
     body: BodyResidual
     doubtful_mm: float
+    bridge_s: float = BRIDGE_S
 
     @staticmethod
     def prepare(
@@ -39,6 +46,7 @@ class FrameTracker:
         sample: NDArray[np.float32],
         spine_mm: float | None = None,
         doubtful_mm: float | None = None,
+        bridge_s: float = BRIDGE_S,
     ) -> FrameTracker:
         """A tracker for a recording, from a sample (n, H, W) mm of its frames: the animal's size and girth are found.
 
@@ -54,38 +62,58 @@ class FrameTracker:
         camera_view = estimator.model.method.camera_view
         body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view)
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
-        return FrameTracker(estimator, scene, size, "plan" if spine_mm else "recording", body, limit)
+        return FrameTracker(estimator, scene, size, "plan" if spine_mm else "recording", body, limit, bridge_s)
 
     @property
     def spine_mm(self) -> float:
         """The animal's spine, mm."""
         return self.size * self.estimator.skeleton.length
 
-    def follow(self, frames: Sequence[DepthFrame]) -> Track:
-        """The track of consecutive frames."""
+    @cached_property
+    def subject(self) -> Subject:
+        """Whom the track is of."""
+        skeleton = self.estimator.skeleton
+        share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
+        return Subject(skeleton, self.scene.camera, self.scene.floor.T_arena_camera, self.spine_mm, self.doubtful_mm,
+                       self.bridge_s, share)  # fmt: skip
+
+    def observe(self, frames: Sequence[DepthFrame]) -> Observations:
+        """What consecutive frames say, each by itself."""
         depths = np.stack([frame.depth for frame in frames])
         times = np.array([frame.time_ns for frame in frames], np.int64)
-        return self.track_of(self.estimator.estimate(depths, self.scene, self.size), depths, times)
+        seen = Observations.empty(self.estimator.skeleton, times)
+        seen.has_depth[:] = (depths > 0).any(axis=(1, 2))
+        for h, estimates in enumerate(self.estimator.hypotheses(depths, self.scene, self.size)):
+            self._put(seen, h, estimates)
+        return seen
 
-    def track_of(self, estimates: Estimates, depths: NDArray[np.float32], times: NDArray[np.int64]) -> Track:
-        """Estimates of frames (n, H, W) mm as rows of a track in the arena frame."""
-        skeleton, chosen = self.estimator.skeleton, estimates.chosen
-        track = Track.empty(skeleton, times)
-        seen = estimates.found
-        in_camera = chosen.pose.joints(skeleton)
+    def follow(self, frames: Sequence[DepthFrame]) -> Track:
+        """The track of consecutive frames, each by itself."""
+        return self.follow_again(self.observe(frames))
+
+    def follow_again(self, seen: Observations) -> Track:
+        """The same from what was seen of them."""
+        return single_frames(self.subject, seen)
+
+    def track(self, seen: Observations, corrections: Sequence[Flip] = ()) -> Tracked:
+        """The track of a whole recording."""
+        return track_whole(self.subject, seen, corrections)
+
+    def _put(self, seen: Observations, h: int, estimates: Estimates) -> None:
+        """What the estimator says as hypothesis h, and what is seen of the thing that it is of."""
+        found = np.flatnonzero(estimates.found)
+        chosen, crops = estimates.chosen, estimates.crops
         pose = chosen.pose.moved(self.scene.floor.T_arena_camera)
-        track.joints_mm[:] = self.scene.floor.T_arena_camera @ in_camera
-        track.uv_px[seen] = self.scene.camera.project(in_camera[seen])
-        track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
-        track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
-        track.sd_mm[:], track.sd_root[:], track.sd_angles_rad[:] = chosen.sd_mm, chosen.sd_root, chosen.sd_angles
-        track.predicted_error_mm[:] = chosen.error_mm
-        track.n_foreground_px[:] = estimates.crops.n_px
-        camera_view = self.estimator.model.method.camera_view
-        track.centroid_mm[seen] = self.scene.middles(estimates.crops[seen], camera_view)
-        to_camera = self.scene.floor.T_arena_camera.inverse()
-        track.centroid_px[seen] = self.scene.camera.project(to_camera @ track.centroid_mm[seen])
-        track.residual_mm[seen] = self.body.of(pose[seen], estimates.crops[seen], self.scene)
-        track.flag[seen] = np.where(chosen.error_mm[seen] > self.doubtful_mm, "doubtful", "")
-        track.flag[~seen & ~(depths > 0).any(axis=(1, 2))] = "no_depth"
-        return track
+        seen.put_pose(h, pose)
+        seen.error_mm[:, h], seen.score[:, h] = chosen.error_mm, chosen.score
+        seen.n_px[found, h] = crops.n_px[found]
+        if not len(found):
+            return
+        centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
+        seen.centroid_mm[found, h] = centre
+        in_camera = self.scene.floor.T_arena_camera.inverse() @ centre
+        seen.centroid_px[found, h] = self.scene.camera.project(in_camera)
+        if h % 2:  # the body turned round covers the same pixels, nearly
+            seen.residual_mm[found, h] = seen.residual_mm[found, h - 1]
+        else:
+            seen.residual_mm[found, h] = self.body.of(pose[found], crops[found], self.scene)

@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.behaviour.columns import KINEMATICS
-from liex_lab.behaviour.kinematics import BodyPoints, kinematics, neighbours, segments, smallest_turn
+from liex_lab.behaviour.body import Body
+from liex_lab.behaviour.columns import kinematics_columns
+from liex_lab.behaviour.kinematics import kinematics, neighbours, segments, smallest_turn
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.sessions import tables
 from liex_lab.sessions.rows import Rows
@@ -109,15 +110,19 @@ def test_neighbours_agree_with_the_search_a_reader_would_write():
 
 
 def test_body_points_are_found_by_name_or_along_the_chain():
-    named = BodyPoints.of(["rump", "loin", "chest", "neck", "nose"])
-    assert (named.rump, named.neck, named.nose, named.back) == ("rump", "neck", "nose", ("loin", "chest", "neck"))
-    chain = BodyPoints.of(["a", "b", "c", "d"])
-    assert (chain.rump, chain.neck, chain.nose) == ("a", "c", "d")
+    named = Body.of(["neck", "loin", "chest", "rump", "nose"])
+    assert (named.front, named.rear, named.axis, named.swims) == (4, 3, (3, 0), False)
+    chain = Body.of(["a", "b", "c", "d"])
+    assert (chain.spine, chain.axis, chain.back, chain.trunk) == ((3, 2, 1, 0), (0, 2), (2, 1), (0, 1, 2))
+    fish = Body.of(["head", *(f"spine_{k}" for k in range(8)), "tail_tip"])
+    assert (fish.front, fish.rear, fish.axis, fish.swims) == (0, 9, (2, 0), True)
+    alone = Body.of(["a"])
+    assert (alone.front, alone.rear, alone.back) == (0, 0, (0,))
 
 
 def test_the_table_has_the_listed_columns_and_one_row_per_frame():
     moved = kinematics(*tables_of(WalkingMouse(steady(1.0))))
-    assert list(moved.columns) == [column.name for column in KINEMATICS]
+    assert list(moved.columns) == [column.name for column in kinematics_columns(swims=False)]
     assert len(moved) == 30
 
 

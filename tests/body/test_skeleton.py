@@ -106,7 +106,7 @@ def test_an_unknown_animal_names_the_nearest():
 def test_a_view_follows_from_the_animals_size_unless_the_toml_states_it():
     mouse, fish = Skeleton.load("mouse"), Skeleton.load("fish")
     assert mouse.view == View("floor", 120.0, 2.0, (0.12, 1.3), 7.0)
-    assert (mouse.relative_size, fish.view.frame, fish.view.behind_mm) == (1.0, "camera", 21.0)
+    assert (mouse.relative_size, fish.view.frame, fish.view.behind_mm) == (1.0, "camera", 30.0)
     assert fish.relative_size == pytest.approx(30.0 / 52.834, abs=1e-6)
     table = {**mouse.table, "joints": [dict(joint) for joint in mouse.table["joints"]]}
     for joint in table["joints"][1:]:

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import re
+import tarfile
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas as pd
 import pytest
 from liex_lab.dashboards import figures
+from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 from liex_lab.dashboards.report import methods, render, write_report
 
+from liex_lab.behaviour import measure_session
+from liex_lab.behaviour.around import around_onsets
+from liex_lab.body import Skeleton
+from liex_lab.exchange import export
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
-from liex_lab.sessions import Session
+from liex_lab.sessions import Session, tables
 from liex_lab.sessions.rrd import PALETTE
 from liex_lab.water import Water
+from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(4.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
@@ -42,7 +51,7 @@ def test_the_report_is_written_with_the_session_and_can_be_made_again(session, p
 
 def test_the_report_asks_for_nothing_from_outside(page):
     assert not re.search(r"https?://|<script|<link|@import|url\((?!#)", page)
-    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    sources = [source for source in re.findall(r'(?:src|href)="([^"]*)"', page) if not source.startswith("#")]
     assert sources
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert len(page) < 1_500_000
@@ -68,7 +77,8 @@ def test_the_page_is_well_formed(page):
 
 def test_every_figure_is_well_formed_svg_of_finite_numbers(page):
     drawn = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
-    assert len(drawn) == 4 + 7  # pictures; lanes, three curves, budget, way, histogram
+    # pictures; histogram, lanes, three curves, budget, activity, matrix, way
+    assert len(drawn) == 4 + 9 + page.count(" bouts</figcaption>")
     for svg in drawn:
         ElementTree.fromstring(svg)
         assert "nan" not in re.sub(r"base64,[^\"]*", "", svg)
@@ -86,6 +96,66 @@ def test_the_numbers_of_the_summary_are_on_the_page(session, page):
 def test_text_from_the_recording_cannot_become_markup(page):
     assert "Dark &amp; &lt;cold&gt;." in page
     assert "<cold>" not in page
+
+
+def test_warnings_come_before_everything_else_and_say_what_is_wrong(session, page):
+    sentences = warnings(session)
+    assert sentences[0] == "Dark & <cold>."
+    assert any("did not deliver 6 frames, in 1 gaps" in sentence for sentence in sentences)
+    assert page.index("Read this first") < page.index('class="cards"')
+    shares = [share for _, share, _, _ in frame_account(session)]
+    assert sum(shares) == pytest.approx(1.0)
+
+
+def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatch):
+    flips = tables.to_pandas(tables.FLIPS, {
+        "session_id": "circle", "individual": "mouse_1", "start_s": [1.0, 2.0], "stop_s": [1.5, 2.25],
+        "start_frame": [30, 60], "stop_frame": [45, 68], "p_flip": [0.9, 0.4], "applied": [True, False],
+        "source": ["model", "model"], "undone_at": ["", ""],
+    })  # fmt: skip
+    again = Session.open(session.path)
+    monkeypatch.setattr(type(again), "flips", flips)
+    assert any("2 stretches of 0.8 s in all; 1 were put right" in sentence for sentence in warnings(again))
+    assert flip_rows(again) == [("1.00", "1.50", "0.90", "put right"), ("2.00", "2.25", "0.40", "left as it was")]
+    assert "Head and tail perhaps exchanged" in render(again)
+
+
+def test_noise_that_hides_a_pause_is_warned_of(tmp_path):
+    assert not any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE)))
+    track = replace(MOUSE, sd_mm=8.0)
+    assert any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track)))
+
+
+def test_the_matrix_and_the_zones_are_on_the_page(tmp_path):
+    nest = Zone("nest <1>", polygon_mm=((0.0, 0.0), (250.0, 0.0), (250.0, 250.0), (0.0, 250.0)))
+    page = render(write(tmp_path / "z.liex", WalkingMouse(steady(12.0), rear_s=(2.0, 3.0)), zones=(nest,)))
+    assert "nest &lt;1&gt;" in page
+    assert "nest <1>" not in page
+    assert "rear to walk: 1 times, 100%" in page
+
+
+def test_a_measure_around_an_onset_is_what_the_frames_say():
+    """A speed that steps from 10 to 90 mm/s at each of five onsets."""
+    time = np.arange(0, 50, 1 / 30)
+    speed = np.where((time % 10) >= 5.0, 90.0, 10.0)
+    moved = pd.DataFrame({"time_s": time, "speed_mm_s": speed})
+    bouts = pd.DataFrame({"action": ["run"] * 5 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 45.0, 1.0]})
+    found = around_onsets(moved, bouts, "run", "speed_mm_s")
+    assert found is not None
+    assert found.n == 5
+    np.testing.assert_allclose(found.median[found.time_s < -0.05], 10.0)
+    np.testing.assert_allclose(found.median[found.time_s > 0.05], 90.0)
+    assert around_onsets(moved, bouts, "walk", "speed_mm_s") is None
+
+
+def test_a_fish_has_a_report_of_its_own(tmp_path):
+    """Its curves are the tail's, and what a slow camera cannot measure is said."""
+    session = write(tmp_path / "fish.liex", WalkingMouse(steady(3.0), skeleton=Skeleton.load("fish")))
+    page = render(session)
+    assert "Tail beat" in page
+    assert "Nose height" not in page
+    assert "frames/s these cannot be measured and are empty" in page
+    assert "first_bend_s" in page
 
 
 def test_the_methods_state_what_was_done(session):
@@ -106,6 +176,17 @@ def test_walls_zones_and_what_was_undone_are_shown(tmp_path):
     for said in ("round, radius 250 mm; zones: nest", "kannala_brandt 0.125", "450 mm below the lens", "<title>nest"):
         assert said in page, said
     assert "ideal camera in air" in " ".join(methods(session))
+
+
+@pytest.mark.parametrize("archive", sorted((REPOSITORY / "tests" / "golden").glob("*.tar.gz")), ids=lambda a: a.stem)
+def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp_path, archive):
+    with tarfile.open(archive) as packed:
+        packed.extractall(tmp_path, filter="data")
+    (found,) = tmp_path.rglob("session.json")
+    assert "How good it is" in render(Session.open(found.parent))
+    assert len(measure_session(Session.open(found.parent)).summary) == 1
+    for target in ("csv", "boris", "dlc", "movement", "sleap"):
+        assert export(Session.open(found.parent), target, tmp_path).exists()
 
 
 def test_a_session_without_behaviour_has_a_report_too(tmp_path):

@@ -18,7 +18,7 @@ from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR
 from liex_lab.recordings.synthetic import FRAME_NS, SyntheticSession
 from liex_lab.recordings.walking import walking_session
 from liex_lab.sessions import Session
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.tracker import FrameTracker
 from tests.recordings.writers import START_NS, write_png_folder
 
@@ -81,9 +81,18 @@ def test_every_delivered_frame_is_a_row_of_every_table(session, times_ns):
 
 def test_no_frame_is_lost_without_a_flag(session):
     lost = np.isnan(joints_of(session)).any(axis=(1, 2))
-    assert np.flatnonzero(lost).tolist() == [BLANK]
+    assert not lost.any()
+    assert np.flatnonzero(session.frames["bridged"]).tolist() == [BLANK]
     assert session.frames["flag"][BLANK] == "no_depth"
-    assert not session.frames["flag"][~lost].isin(["no_depth", "not_found"]).any()
+    assert not session.frames["flag"].drop(BLANK).isin(["no_depth", "not_found"]).any()
+    assert np.isnan(session.kinematics["speed_mm_s"][BLANK]), "what was bridged was not measured"
+
+
+def test_nothing_is_bridged_where_the_plan_forbids_it(folder, tmp_path):
+    plan = Plan.load("mouse").with_settings(["tracking.bridge_s=0.0"])
+    session = Session.open(run_session(folder, plan, tmp_path))
+    assert np.flatnonzero(np.isnan(joints_of(session)).any(axis=(1, 2))).tolist() == [BLANK]
+    assert not session.frames["bridged"].any()
 
 
 def test_joints_are_near_the_truth(session, mouse):
@@ -147,15 +156,15 @@ def test_a_size_that_the_plan_states_is_taken_as_it_is(folder, tmp_path):
 
 
 def test_an_accident_midway_leaves_no_folder(folder, tmp_path, monkeypatch):
-    follow, calls = FrameTracker.follow, []
+    observe, calls = FrameTracker.observe, []
 
-    def once(self: FrameTracker, frames: list[DepthFrame]) -> Track:
+    def once(self: FrameTracker, frames: list[DepthFrame]) -> Observations:
         calls.append(len(frames))
         if len(calls) == 2:
             raise RuntimeError("the power went out")
-        return follow(self, frames)
+        return observe(self, frames)
 
-    monkeypatch.setattr(FrameTracker, "follow", once)
+    monkeypatch.setattr(FrameTracker, "observe", once)
     with pytest.raises(RuntimeError, match="the power went out"):
         run_session(folder, Plan.load("mouse"), tmp_path / "out")
     assert calls == [32, 8]
@@ -164,7 +173,7 @@ def test_an_accident_midway_leaves_no_folder(folder, tmp_path, monkeypatch):
 
 def test_an_accident_midway_leaves_an_older_session_as_it_was(session, folder, tmp_path, monkeypatch):
     path = shutil.copytree(session.path, tmp_path / "walk.liex")
-    monkeypatch.setattr(FrameTracker, "follow", lambda self, frames: 1 / 0)
+    monkeypatch.setattr(FrameTracker, "observe", lambda self, frames: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run_session(folder, Plan.load("mouse"), tmp_path, overwrite=True)
     assert tables_of(Session.open(path)) == tables_of(session)

@@ -9,6 +9,8 @@ import pytest
 
 import liex_lab.sessions.rrd as replay
 from liex_lab.recordings.times import find_gaps, median_step
+from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.zones import Zone
 from tests.oracles.rvl import unpack_rvl
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -53,6 +55,37 @@ def test_the_expected_entities_are_there_on_both_timelines(session):
         assert columns.get("frame"), entity
         assert len(columns["frame"]) == len(columns["time"]), entity
     assert columns_of(session, "log")["TextLog:text"] == [["It was dark."]]
+
+
+def test_spheres_hold_the_joints_with_95_per_cent(session):
+    columns = columns_of(session, replay.UNCERTAINTY)
+    assert len(columns["frame"]) == len(MOUSE.times_s)
+    sizes, centres = columns["Ellipsoids3D:half_sizes"], columns["Ellipsoids3D:centers"]
+    assert len(sizes[0]) == len(centres[0]) == 5
+    assert len(sizes[20]) == 0  # the mouse is lost
+    assert sizes[0][0][0] == pytest.approx(2.795 * MOUSE.sd_mm / 1000)
+    draws = np.random.default_rng(0).normal(size=(20_000, 3))
+    assert np.mean(np.linalg.norm(draws, axis=1) < 2.795) == pytest.approx(0.95, abs=0.005)
+
+
+def test_walls_and_zones_are_drawn_on_the_floor_and_in_the_picture(tmp_path, strict):
+    nest = Zone("nest a/b", polygon_mm=((0.0, 0.0), (50.0, 0.0), (50.0, 50.0)))
+    bowl = Arena("round", (10.0, 0.0), 150.0)
+    session = write(tmp_path / "c.liex", WalkingMouse(steady(0.5)), arena=bowl, zones=(nest,))
+    (ring,) = columns_of(session, f"{replay.FLOOR}/walls")["LineStrips3D:strips"][0]
+    np.testing.assert_allclose(np.hypot(np.array(ring)[:, 0] - 0.01, np.array(ring)[:, 1]), 0.15, atol=1e-6)
+    (zone,) = columns_of(session, replay.FLOOR + "/zones/nest\\ a\\/b")["LineStrips3D:strips"][0]
+    np.testing.assert_allclose(np.array(zone)[:, :2] * 1000, [[0, 0], [50, 0], [50, 50], [0, 0]], atol=1e-4)
+    (seen,) = columns_of(session, replay.OVERLAY + "/zones/nest\\ a\\/b")["LineStrips2D:strips"][0]
+    camera = session.camera
+    np.testing.assert_allclose(seen[0], [camera.cx + 0.5, camera.cy + 0.5], atol=1e-3)  # the foot of the camera
+
+
+def test_the_worst_frames_can_be_jumped_to(session):
+    columns = columns_of(session, "log/worst")
+    error = session.frames.set_index("frame_index")["predicted_error_mm"]
+    assert len(columns["frame"]) == 12
+    assert error.loc[columns["frame"]].min() >= error.drop(columns["frame"]).max()
 
 
 def test_short_recordings_hold_the_depth_as_it_is(session):

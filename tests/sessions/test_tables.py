@@ -9,7 +9,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from liex_lab.behaviour import COLUMNS
+from liex_lab.behaviour.listing import all_columns
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.tables import BOUTS, TABLES, Column, columns, dictionary, empty_table, to_pandas, write_table
@@ -35,8 +35,17 @@ def test_every_written_column_has_an_entry_in_columns_json(session):
 
 
 def test_a_unit_in_a_name_is_the_unit_of_the_entry():
-    suffixes = {"_mm_s": "mm/s", "_rad_s": "rad/s", "_mm": "mm", "_px": "px", "_rad": "rad", "_ns": "ns", "_s": "s"}
-    for entry in dictionary(COLUMNS):
+    suffixes = {
+        "_mm_s": "mm/s",
+        "_rad_s": "rad/s",
+        "_mm": "mm",
+        "_px": "px",
+        "_hz": "Hz",
+        "_rad": "rad",
+        "_ns": "ns",
+        "_s": "s",
+    }
+    for entry in dictionary(list(all_columns().values())):
         for suffix, unit in suffixes.items():
             if entry["name"].endswith(suffix):
                 assert entry["unit"] == unit, entry["name"]
@@ -80,7 +89,7 @@ def test_equal_input_gives_equal_tables_whatever_the_chunks(tmp_path):
     mouse = WalkingMouse(steady(2.0), rear_s=(0.5, 1.2), lost=(3,))
     first, second = write(tmp_path / "a.liex", mouse, chunk=7), write(tmp_path / "b.liex", mouse, chunk=60)
     names = sorted(path.name for path in first.path.iterdir() if path.suffix in (".parquet", ".csv", ".toml"))
-    assert len(names) == 10
+    assert len(names) == 13
     for name in [*names, "columns.json", "session.mcap"]:
         assert (first.path / name).read_bytes() == (second.path / name).read_bytes(), name
 

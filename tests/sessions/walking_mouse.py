@@ -34,6 +34,7 @@ class WalkingMouse:
     radius_mm: float = 150.0
     rear_s: tuple[float, float] | None = None
     lost: tuple[int, ...] = ()
+    sd_mm: float = 1.0
     camera: Camera = SMALL
     skeleton: Skeleton = field(default_factory=lambda: Skeleton.load("mouse"))
 
@@ -70,12 +71,12 @@ class WalkingMouse:
         uv = self.camera.project(self.T_arena_camera.inverse() @ joints)
         track = Track(
             skeleton=skeleton, times_ns=self.times_ns, joints_mm=joints, uv_px=uv,
-            sd_mm=np.full(joints.shape[:2], 2.0), root_rotation=rotation, root_mm=pose.root.translation,
+            sd_mm=np.full(joints.shape[:2], self.sd_mm), root_rotation=rotation, root_mm=pose.root.translation,
             sd_root=np.tile([0.02, 0.02, 0.05, 1.5, 1.5, 2.0], (n, 1)), angles_rad=angles,
             sd_angles_rad=np.full(angles.shape, 0.05), scale=scale,
             predicted_error_mm=2.0 + 0.5 * np.sin(self.times_s), residual_mm=np.full(n, 1.5),
             n_foreground_px=np.full(n, 900, np.int64), centroid_mm=joints.mean(axis=1), centroid_px=uv.mean(axis=1),
-            flag=np.full(n, "", "<U12"),
+            p_flip=np.zeros(n), bridged=np.zeros(n, bool), flag=np.full(n, "", "<U12"),
         )  # fmt: skip
         return forget(track, self.lost)
 
@@ -154,5 +155,7 @@ def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Se
     with Session.create(folder, mouse.provenance(**more), **own) as writer:
         for frames, track in mouse.chunks(chunk):
             writer.add(frames, track)
-        zones = [zone.name for zone in writer.origin.zones]
-        return writer.close(**behaviour.measure(writer.frames, writer.poses, zones=zones).for_session())
+        origin = writer.origin
+        around = behaviour.Surroundings(origin.arena, [zone.name for zone in origin.zones])
+        measured = behaviour.measure(writer.frames, writer.poses, None, around, writer.gaps)
+        return writer.close(**measured.for_session())

@@ -1,0 +1,117 @@
+"""Kernels of a semi-Markov chain of actions: each lasts at least so many ticks, then ends with a constant chance.
+
+An action k is a row of D_k states that are passed one by one; in the last one it may stay. scores (m, K): logarithms of
+how well each tick fits each action; first (K,): index of each action's first state, with the total as one more; stay,
+leave (K,): log chances of the last state; switch (K, K): log chances of what follows, -inf for itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_NEVER = -1e30
+
+
+@njit(cache=True)
+def best_path(scores, first, stay, leave, switch, label):
+    """The most probable actions, into label (m,)."""
+    m, n = scores.shape
+    total = first[n]
+    value, fresh = np.empty(total), np.empty(total)
+    came_from, stayed = np.empty((m, n), np.int16), np.zeros((m, n), np.bool_)
+    for k in range(n):
+        value[first[k] : first[k + 1]] = scores[0, k] - np.log(total)  # a recording may begin in the middle of one
+    for t in range(1, m):
+        for k in range(n):
+            best, source = _NEVER, 0
+            for j in range(n):
+                if j != k:
+                    reach = value[first[j + 1] - 1] + leave[j] + switch[j, k]
+                    if reach > best:
+                        best, source = reach, j
+            came_from[t, k] = source
+            last = first[k + 1] - 1
+            for s in range(last, first[k], -1):
+                fresh[s] = value[s - 1]
+            fresh[first[k]] = best
+            if value[last] + stay[k] > fresh[last]:
+                fresh[last], stayed[t, k] = value[last] + stay[k], True
+            for s in range(first[k], last + 1):
+                fresh[s] += scores[t, k]
+        value[:] = fresh
+    state = int(np.argmax(value))
+    k = 0
+    while first[k + 1] <= state:
+        k += 1
+    for t in range(m - 1, -1, -1):
+        label[t] = k
+        if t == 0:
+            break
+        if state == first[k + 1] - 1 and stayed[t, k]:
+            continue
+        if state > first[k]:
+            state -= 1
+        else:
+            k = came_from[t, k]
+            state = first[k + 1] - 1
+
+
+@njit(cache=True)
+def probabilities(scores, first, stay, leave, switch, out):
+    """The probability (m, K) of each action at every tick, by sums forward and backward in time."""
+    m, n = scores.shape
+    total = first[n]
+    go, end, follow = np.exp(stay), np.exp(leave), np.exp(switch)
+    ahead = np.empty((m, total), np.float32)
+    now, fresh, like = np.ones(total) / total, np.empty(total), np.empty(n)
+    for t in range(m):
+        _likelihood(scores, t, like)
+        if t > 0:
+            for k in range(n):
+                enter = 0.0
+                for j in range(n):
+                    enter += now[first[j + 1] - 1] * end[j] * follow[j, k]
+                last = first[k + 1] - 1
+                held = now[last] * go[k]
+                for s in range(last, first[k], -1):
+                    fresh[s] = now[s - 1]
+                fresh[first[k]] = enter
+                fresh[last] += held
+            now[:] = fresh
+        for k in range(n):
+            for s in range(first[k], first[k + 1]):
+                now[s] *= like[k]
+        now /= now.sum()
+        ahead[t] = now
+    back = np.ones(total)
+    for t in range(m - 1, -1, -1):
+        norm = 0.0
+        for k in range(n):
+            out[t, k] = 0.0
+            for s in range(first[k], first[k + 1]):
+                out[t, k] += ahead[t, s] * back[s]
+            norm += out[t, k]
+        for k in range(n):
+            out[t, k] /= norm
+        if t == 0:
+            break
+        _likelihood(scores, t, like)
+        for k in range(n):
+            onward = 0.0
+            for j in range(n):
+                onward += follow[k, j] * back[first[j]] * like[j]
+            last = first[k + 1] - 1
+            for s in range(first[k], last):
+                fresh[s] = back[s + 1] * like[k]
+            fresh[last] = back[last] * like[k] * go[k] + end[k] * onward
+        back[:] = fresh / fresh.sum()
+
+
+@njit(cache=True)
+def _likelihood(scores, t, like):
+    top = scores[t, 0]
+    for k in range(1, len(like)):
+        top = max(top, scores[t, k])
+    for k in range(len(like)):
+        like[k] = np.exp(scores[t, k] - top)

@@ -1,0 +1,95 @@
+"""What an animal did and when: named stretches of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+
+UNLABELLED = ""  # the word of a frame that no action names
+
+
+@dataclass(frozen=True)
+class Bout:
+    """One stretch with a name, half open: the frame at stop_ns is the first outside. score: probability of its name."""
+
+    start_ns: int
+    stop_ns: int
+    action: str
+    score: float = 1.0
+
+
+@dataclass(frozen=True)
+class Ethogram:
+    """One animal's bouts, in order and without overlap; vocabulary: word -> definition. source: model or human."""
+
+    bouts: tuple[Bout, ...]
+    vocabulary: Mapping[str, str] = field(default_factory=dict)
+    source: str = "model"
+
+    def __post_init__(self) -> None:
+        last = None
+        for bout in self.bouts:
+            if bout.stop_ns <= bout.start_ns:
+                raise LiexError(f"a bout of {bout.action} stops at {bout.stop_ns} ns, which is not after its start")
+            if last is not None and bout.start_ns < last.stop_ns:
+                raise LiexError(
+                    f"bouts overlap: {last.action} stops at {last.stop_ns} ns, but {bout.action} starts at "
+                    f"{bout.start_ns} ns; end one before the next begins"
+                )
+            last = bout
+
+    def __iter__(self) -> Iterator[Bout]:
+        """The bouts in order."""
+        return iter(self.bouts)
+
+    def __len__(self) -> int:
+        """The number of bouts."""
+        return len(self.bouts)
+
+    def words(self, times_ns: NDArray[np.int64]) -> NDArray[np.str_]:
+        """(n,) the word of every frame, UNLABELLED outside all bouts."""
+        longest = max((len(bout.action) for bout in self.bouts), default=1)
+        out = np.full(len(times_ns), UNLABELLED, dtype=f"<U{max(longest, 1)}")
+        for bout in self.bouts:
+            start, stop = np.searchsorted(times_ns, [bout.start_ns, bout.stop_ns])
+            out[start:stop] = bout.action
+        return out
+
+    @staticmethod
+    def of_words(
+        words: Sequence[str] | NDArray[np.str_], times_ns: NDArray[np.int64],
+        vocabulary: Mapping[str, str] | None = None,
+        score: NDArray[np.float64] | None = None, part: NDArray[np.int64] | None = None, source: str = "model",
+    ) -> Ethogram:  # fmt: skip
+        """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never leaves its `part`
+        (n,), the unbroken stretch of the recording that it lies in.
+        """
+        label = np.asarray(words, dtype=np.str_)
+        n = len(label)
+        if n == 0:
+            return Ethogram((), vocabulary or {}, source)
+        part = np.zeros(n, np.int64) if part is None else part
+        changes = (label[1:] != label[:-1]) | (part[1:] != part[:-1])
+        starts = np.flatnonzero(np.append(True, changes))
+        stops = np.append(starts[1:], n)
+        stop_ns, sure = frame_stops(times_ns), np.ones(n) if score is None else score
+        bouts = [
+            Bout(int(times_ns[a]), int(stop_ns[b - 1]), str(label[a]), float(sure[a:b].mean()))
+            for a, b in zip(starts, stops, strict=True)
+            if label[a] != UNLABELLED
+        ]
+        return Ethogram(tuple(bouts), vocabulary or {}, source)
+
+
+def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median step later."""
+    if len(times_ns) < 2:
+        return times_ns + 1
+    step = np.diff(times_ns)
+    usual = int(np.median(step))
+    return times_ns + np.append(np.where(step > 1.5 * usual, usual, step), usual)

@@ -1,0 +1,65 @@
+"""Labels that people made: tables of bouts, ours or anybody's, and their place on a track."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from liex_lab.actions.ethogram import UNLABELLED
+from liex_lab.errors import LiexError
+
+HUMAN = "human"
+_NEEDED = ("action", "start_s", "stop_s")
+
+
+def read_labels(path: str | Path) -> pd.DataFrame:
+    """Bouts from a table: our bouts.parquet, or a CSV with the columns action, start_s, stop_s and, where it tells of
+    several recordings, session_id. Raises LiexError where it is not such a table.
+    """
+    source = Path(path)
+    try:
+        table = pd.read_parquet(source) if source.suffix == ".parquet" else pd.read_csv(source)
+    except (OSError, ValueError) as error:
+        raise LiexError(f"{source} should be a table of bouts, as CSV or parquet, but: {error}") from None
+    lacking = [name for name in _NEEDED if name not in table]
+    if lacking:
+        raise LiexError(
+            f"{source} should have the columns {', '.join(_NEEDED)} (session_id, too, for several recordings); it "
+            f"lacks {', '.join(lacking)}"
+        )
+    return checked(table.assign(source=HUMAN), str(source))
+
+
+def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
+    """A table of bouts that can be used, in order of time."""
+    times = table[["start_s", "stop_s"]].apply(pd.to_numeric, errors="coerce")
+    wrong = np.flatnonzero(~np.isfinite(times).all(axis=1) | (times["stop_s"] <= times["start_s"]))
+    if len(wrong):
+        row = table.iloc[wrong[0]]
+        raise LiexError(
+            f"{origin}: each bout starts before it stops, in seconds; the one of {row['action']} in row {wrong[0] + 1} "
+            f"has start_s={row['start_s']} and stop_s={row['stop_s']}"
+        )
+    out = table.assign(start_s=times["start_s"], stop_s=times["stop_s"], action=table["action"].astype(str))
+    return out.sort_values("start_s", kind="stable").reset_index(drop=True)
+
+
+def words_of(table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str = "") -> NDArray[np.str_]:
+    """(n,) the word of each frame at time_s (n,), UNLABELLED outside all bouts of that session."""
+    if "session_id" in table and session_id:
+        table = table[table["session_id"].astype(str) == session_id]
+    longest = max([len(word) for word in table["action"]], default=1)
+    out = np.full(len(time_s), UNLABELLED, dtype=f"<U{max(1, longest)}")
+    for action, start_s, stop_s in zip(table["action"], table["start_s"], table["stop_s"], strict=True):
+        start, stop = np.searchsorted(time_s, [start_s - 1e-6, stop_s - 1e-6])
+        out[start:stop] = action
+    return out
+
+
+def vocabulary(table: pd.DataFrame) -> Mapping[str, str]:
+    """The words of a table, without definitions."""
+    return dict.fromkeys(sorted(set(table["action"])), "")

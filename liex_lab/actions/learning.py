@@ -1,0 +1,111 @@
+"""Training the default recogniser from labelled tracks, and validating it on animals that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.actions.chain import ActionChain
+from liex_lab.actions.ethogram import UNLABELLED
+from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.scores import timeline_scores
+from liex_lab.actions.timeline import Examples, Network, TimelineModel, clock_of, gather
+from liex_lab.errors import LiexError
+from liex_lab.progress import Progress, silent
+
+Array = NDArray[np.float64]
+
+_HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 10, 512, 2
+_LEAST_STEPS, _MOST_EPOCHS = 1500, 200  # of few labels
+_WEIGHT_DECAY = 2e-3
+_MOST_TICKS = 120_000  # to learn from; of more, every so many-th
+_SHARPNESS = 0.1
+_NEVER = -30.0  # what a network says of a word that it has not seen
+
+
+def learn(
+    tracks: Sequence[LabelledTrack], *, seed: int = 0, definitions: dict[str, str] | None = None,
+    sequences: Sequence[LabelledTrack] = (), progress: Progress = silent,
+) -> TimelineModel:  # fmt: skip
+    """A recogniser from labelled tracks; sequences: single actions cut out of somewhere, without their surroundings."""
+    words = vocabulary_of([*tracks, *sequences])
+    clock_hz = clock_of(tracks[0].track.skeleton)
+    progress(0, 3, "features of the labelled recordings")
+    examples = gather([*tracks, *sequences], words, clock_hz)
+    progress(1, 3, "learning what each action looks like")
+    networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
+    share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
+    chain = ActionChain.learn(examples.runs[: len(tracks)], len(words))
+    return TimelineModel(
+        tracks[0].track.skeleton.name, clock_hz, words, share, networks, chain, _SHARPNESS, definitions or {}
+    )
+
+
+def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
+    """The words of labelled tracks, what has no name among them."""
+    found = sorted({str(word) for one in tracks for word in np.unique(one.words)} - {UNLABELLED})
+    if len(found) < 2 and not any((one.words == UNLABELLED).any() for one in tracks):
+        raise LiexError(
+            f"labels of at least two actions, or of one and stretches without it, are needed; got {found or 'none'}"
+        )
+    return (UNLABELLED, *found)
+
+
+def train_network(examples: Examples, n_words: int, seed: int) -> Network:
+    """A network with one hidden layer, by scikit-learn's stochastic gradient descent (Adam)."""
+    from sklearn.neural_network import MLPClassifier
+
+    step = max(1, -(-len(examples.code) // _MOST_TICKS))
+    rows = np.arange(seed % step, len(examples.code), step)
+    features, code = examples.features[rows], examples.code[rows]
+    centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
+    inputs = np.clip((features - centre) / scale, -6.0, 6.0)
+    batch = int(np.clip(len(code) // 8, 1, _BATCH))
+    epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
+    present = np.unique(code)  # of the vocabulary; stretches without a name may be missing
+    classifier = MLPClassifier(
+        (_HIDDEN,), alpha=_WEIGHT_DECAY, batch_size=batch, learning_rate_init=1.5e-3, max_iter=1, warm_start=True,
+        random_state=seed,
+    )  # fmt: skip
+    for epoch in range(epochs):
+        classifier.learning_rate_init = 1.5e-3 * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs)) + 1e-5
+        classifier.partial_fit(inputs, code, classes=present if epoch == 0 else None)
+    weights, bias = classifier.coefs_[-1], classifier.intercepts_[-1]
+    if len(present) == 2:  # one number decides between two words
+        weights, bias = np.hstack([0 * weights, weights]), np.hstack([0 * bias, bias])
+    last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
+    last[0][:, present], last[1][present] = weights, bias
+    layers = (classifier.coefs_[0], classifier.intercepts_[0]), last
+    return Network(
+        centre.astype(np.float32), scale.astype(np.float32),
+        tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers),
+    )  # fmt: skip
+
+
+def leave_one_animal_out(
+    tracks: Sequence[LabelledTrack], *, seed: int = 0, progress: Progress = silent
+) -> dict[str, Any]:
+    """Scores on each animal of a recogniser that learned from the others."""
+    animals = sorted({one.animal for one in tracks})
+    if len(animals) < 2:
+        return {"animals": len(animals), "note": "one animal only: nobody knows how well this works on another"}
+    words = vocabulary_of(tracks)
+    held_out: dict[str, Any] = {}
+    pairs: list[tuple[LabelledTrack, NDArray[np.str_]]] = []
+    for k, animal in enumerate(animals):
+        progress(k, len(animals), f"learning without {animal}")
+        model = learn([one for one in tracks if one.animal != animal], seed=seed)
+        own = [(one, model.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns))
+               for one in tracks if one.animal == animal]  # fmt: skip
+        held_out[animal] = timeline_scores(own, words)["macro_f1"]
+        pairs += own
+    return {"animals": len(animals), "macro_f1_by_animal": held_out, **timeline_scores(pairs, words)}
+
+
+def with_card(model: TimelineModel, **facts: Any) -> TimelineModel:
+    """The model with more facts on its card."""
+    return replace(model, card={**model.card, **facts})

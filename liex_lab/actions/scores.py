@@ -1,0 +1,95 @@
+"""How well actions were recognised: frame by frame, bout by bout, and as a confusion matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.actions.ethogram import UNLABELLED
+from liex_lab.actions.labelled import LabelledTrack
+
+Array = NDArray[np.float64]
+Words = NDArray[np.str_]
+
+
+def timeline_scores(pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequence[str]) -> dict[str, Any]:
+    """Scores of recognised words (n,) beside the labels of their tracks.
+
+    macro_f1: mean over the actions of their frame-wise F1; segment_f1_50: F1 of bouts, of which one is right where it
+    and a true bout of its action share at least half of what either covers; per_action: F1, precision and recall of
+    frames, segment F1, and how many bouts there were.
+    """
+    named = [word for word in words if word != UNLABELLED]
+    hits, found, true = (dict.fromkeys(named, 0) for _ in range(3))
+    frames = {word: np.zeros(3, np.int64) for word in words}
+    for one, recognised in pairs:
+        for word in words:
+            a, b = one.words == word, recognised == word
+            frames[word] += [int((a & b).sum()), int(b.sum()), int(a.sum())]
+        for word in named:
+            counted = match_bouts(one.words == word, recognised == word)
+            for total, n in zip((hits, found, true), counted, strict=True):
+                total[word] += n
+    per_action = {
+        word or "unlabelled": {
+            "f1": _f1(*frames[word]), "precision": _share(frames[word][0], frames[word][1]),
+            "recall": _share(frames[word][0], frames[word][2]),
+            **({"segment_f1_50": _f1(hits[word], found[word], true[word]), "bouts": true[word]} if word else {}),
+        }
+        for word in words
+    }  # fmt: skip
+    seen = [word for word in named if frames[word][2] > 0]
+    return {
+        "macro_f1": float(np.mean([per_action[word]["f1"] for word in seen])) if seen else float("nan"),
+        "segment_f1_50": _f1(sum(hits.values()), sum(found.values()), sum(true.values())),
+        "per_action": per_action,
+    }
+
+
+def match_bouts(true: NDArray[np.bool_], found: NDArray[np.bool_], overlap: float = 0.5) -> tuple[int, int, int]:
+    """How many runs of `found` (n,) match a run of `true` (n,), how many were found, and how many there are."""
+    spans, guesses = _spans(true), _spans(found)
+    taken, hits = set(), 0
+    for start, stop in guesses:
+        shares = [
+            (min(stop, b) - max(start, a)) / (max(stop, b) - min(start, a)) if min(stop, b) > max(start, a) else 0.0
+            for a, b in spans
+        ]
+        best = int(np.argmax(shares)) if shares else -1
+        if best >= 0 and shares[best] >= overlap and best not in taken:
+            taken.add(best)
+            hits += 1
+    return hits, len(guesses), len(spans)
+
+
+def _spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _share(part: int, whole: int) -> float:
+    return float(part / whole) if whole else float("nan")
+
+
+def _f1(hits: int, found: int, true: int) -> float:
+    return float(2.0 * hits / (found + true)) if found + true else float("nan")
+
+
+def confusion(true: Sequence[str], found: Sequence[str], words: Sequence[str]) -> list[list[int]]:
+    """Rows: what it was; columns: what it was taken for."""
+    place = {word: k for k, word in enumerate(words)}
+    out = np.zeros((len(words), len(words)), int)
+    for a, b in zip(true, found, strict=True):
+        if b in place:
+            out[place[a], place[b]] += 1
+    return out.tolist()
+
+
+def interval95(hits: float, n: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share of hits out of n."""
+    z, p = 1.959964, hits / n
+    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return float((middle - half) / (1 + z * z / n)), float((middle + half) / (1 + z * z / n))

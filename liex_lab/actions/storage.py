@@ -1,0 +1,84 @@
+"""Action models on disk: skops files, which hold numbers and words and no code, and where the bundled ones are."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liex_lab.actions.chain import ActionChain
+from liex_lab.actions.timeline import Network, TimelineModel
+from liex_lab.catalog import MODELS, sha256
+from liex_lab.errors import ModelError
+
+SUFFIX = ".skops"
+_FORMAT = 1
+
+
+def save_action_model(model: TimelineModel, path: str | Path) -> Path:
+    """Write a model; returns the path. Equal models give files of equal content."""
+    from skops import io
+
+    target = Path(path).with_suffix(SUFFIX)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    document: dict[str, Any] = {
+        "format": _FORMAT, "skeleton": model.skeleton, "clock_hz": model.clock_hz, "words": list(model.words),
+        "share": model.share, "sharpness": model.sharpness, "definitions": dict(model.definitions),
+        "card": dict(model.card),
+        "chain": {name: getattr(model.chain, name) for name in ActionChain.__dataclass_fields__},
+        "networks": [
+            {"centre": n.centre, "scale": n.scale, "layers": [[w.astype(np.float32), b] for w, b in n.layers]}
+            for n in model.networks
+        ],
+    }  # fmt: skip
+    unfinished = target.with_name(f"{target.name}.part")
+    io.dump(document, unfinished, compression=8)  # zip's deflate
+    unfinished.replace(target)
+    return target
+
+
+def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
+    """A bundled model by its animal ('mouse'), or one from a file. Raises ModelError where it cannot be used."""
+    path = find_action_model(name, folder)
+    try:
+        from skops import io
+
+        document = io.load(path, trusted=[])
+        if document["format"] != _FORMAT:
+            raise ModelError(f"the action model {path} has format {document['format']}, this liex_lab reads {_FORMAT}")
+        chain = ActionChain(*(np.asarray(document["chain"][name]) for name in ActionChain.__dataclass_fields__))
+        networks = tuple(
+            Network(n["centre"], n["scale"], tuple((w, b) for w, b in n["layers"])) for n in document["networks"]
+        )
+        return TimelineModel(
+            document["skeleton"], float(document["clock_hz"]), tuple(document["words"]), document["share"], networks,
+            chain, float(document["sharpness"]), document["definitions"], {**document["card"], "sha256": sha256(path)},
+        )  # fmt: skip
+    except ModelError:
+        raise
+    except Exception as error:  # a file that is not ours can fail anywhere in the reader
+        raise ModelError(
+            f"{path} should be an action model made by `liex train actions`, but: {type(error).__name__}: {error}"
+        ) from None
+
+
+def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
+    """The file of a bundled model or of a path."""
+    bundled = folder / f"{name}{SUFFIX}"
+    path = bundled if bundled.is_file() else Path(name)
+    if not path.is_file():
+        known = bundled_action_models(folder)
+        near = difflib.get_close_matches(str(name), known, 1)
+        hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
+        raise ModelError(
+            f"there is no action model '{name}'; {hint}, or give the path of a {SUFFIX} file made by "
+            "`liex train actions`"
+        )
+    return path
+
+
+def bundled_action_models(folder: Path = MODELS) -> list[str]:
+    """The animals that have a bundled action model."""
+    return sorted(path.stem for path in folder.glob(f"*{SUFFIX}"))

@@ -1,0 +1,193 @@
+"""The default recogniser: names for every moment of an uncut recording, at any frame rate from 15 to 120 per second.
+
+Channels on a clock of its own (in seconds and body lengths), windows around each tick, a small network for what the
+tick looks like, and a semi-Markov chain for what can follow what and for how long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.actions.chain import ActionChain
+from liex_lab.actions.channels import Stretch, channel_names, stretches_of
+from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops
+from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.windows import window_features
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.tracking.track import Track
+
+Array = NDArray[np.float64]
+
+CLOCKS_HZ = {"fish": 50.0}
+_CLOCK_HZ = 30.0
+_PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
+_LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
+_TICKS_NEEDED = 3.0  # frames within a bout for its shape to be seen
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network with one hidden layer on standardised features: weights as they are multiplied, no code in them."""
+
+    centre: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+
+    def logits(self, features: NDArray[np.float32]) -> Array:
+        """(m, K) of features (m, F)."""
+        x = np.clip((features - self.centre) / self.scale, -_LIMIT, _LIMIT)
+        for k, (weights, bias) in enumerate(self.layers):
+            x = x @ weights + bias
+            if k + 1 < len(self.layers):
+                x = np.maximum(x, 0.0)
+        return x.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class TimelineModel:
+    """A trained recogniser. words (K): its vocabulary, UNLABELLED among them; share (K,): of the training time;
+    sharpness: how much one tick counts in the chain, as ticks beside each other tell much the same.
+    """
+
+    skeleton: str
+    clock_hz: float
+    words: tuple[str, ...]
+    share: Array
+    networks: tuple[Network, ...]
+    chain: ActionChain
+    sharpness: float
+    definitions: dict[str, str] = field(default_factory=dict)
+    card: dict[str, Any] = field(default_factory=dict)
+
+    def log_probabilities(self, stretch: Stretch, names: Sequence[str]) -> Array:
+        """(m, K) of each word at each tick by itself."""
+        margin = round(_MARGIN_S * self.clock_hz)
+        out = np.empty((len(stretch.times_s), len(self.words)))
+        for start in range(0, len(out), _PIECE):
+            stop = min(start + _PIECE, len(out))
+            low, high = max(0, start - margin), min(len(out), stop + margin)
+            features = window_features(Stretch(stretch.times_s[low:high], stretch.values[low:high]), names)
+            features = features[start - low : stop - low]
+            p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
+            out[start:stop] = np.log(np.maximum(p, 1e-6))
+        return out
+
+    def scores(self, log_probabilities: Array) -> Array:
+        """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is."""
+        return self.sharpness * (log_probabilities - np.log(np.maximum(self.share, 1e-3)))
+
+    def recognise(self, track: Track, wall_mm: Array | None = None) -> Recognised:
+        """The ethogram of a track, and the probability of each word in each of its frames."""
+        n, words = track.n_frames, np.array(self.words)
+        probability = np.full((n, len(words)), np.nan)
+        label, part = np.full(n, UNLABELLED, dtype=words.dtype), np.full(n, -1)
+        time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
+        names = channel_names(track.skeleton)
+        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm)):
+            scores = self.scores(self.log_probabilities(stretch, names))
+            decoded = self.chain.decode(scores, 1.0 / self.clock_hz)
+            certain = self.chain.probabilities(scores, 1.0 / self.clock_hz)
+            begin, step = stretch.times_s[0], 1.0 / self.clock_hz
+            rows = np.arange(*np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step]))
+            tick = np.clip(np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1)
+            label[rows], probability[rows], part[rows] = words[decoded[tick]], certain[tick], number
+        code = np.array([self.words.index(word) for word in self.words])
+        chosen = np.searchsorted(words[np.argsort(words)], label)
+        score = np.take_along_axis(probability, code[np.argsort(words)][chosen][:, None], axis=1)[:, 0]
+        ethogram = Ethogram.of_words(label, track.times_ns, self.definitions, np.nan_to_num(score), part)
+        return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
+
+    def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
+        """Per word, what this frame rate cannot tell: actions whose shortest bouts hold fewer than three frames."""
+        if len(times_ns) < 2:
+            return {}
+        rate = 1e9 / float(np.median(np.diff(times_ns)))
+        found = {}
+        for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):
+            if word != UNLABELLED and shortest * rate < _TICKS_NEEDED:
+                found[word] = (
+                    f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at {rate:.0f} per second: "
+                    f"they may be missed, and their latency and peak speed cannot be told below "
+                    f"{_TICKS_NEEDED / shortest:.0f} frames per second"
+                )
+        return found
+
+    def name(self, track: Track, wall_mm: Array | None = None) -> str:
+        """The one word that fits a cut-out sequence best; UNLABELLED only where nothing was measured."""
+        total = np.zeros(len(self.words))
+        names = channel_names(track.skeleton)
+        for stretch in stretches_of(track, self.clock_hz, wall_mm):
+            log_p = self.log_probabilities(stretch, names) - np.log(np.maximum(self.share, 1e-3))
+            total += log_p.sum(axis=0)
+        if not total.any():
+            return UNLABELLED
+        named = [k for k, word in enumerate(self.words) if word != UNLABELLED]
+        return self.words[named[int(np.argmax(total[named]))]]
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """An ethogram, the words and their probability (n, K) in every frame (NaN where there is no pose), and what the
+    frame rate cannot resolve, word -> why.
+    """
+
+    ethogram: Ethogram
+    words: tuple[str, ...]
+    probability: Array
+    unresolved: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What a recogniser learns from: features (m, F) and word codes (m,) of ticks, the animal's number (m,) and which
+    recording's (m,) they are; and the bouts (word, s) of every recording.
+    """
+
+    features: NDArray[np.float32]
+    code: NDArray[np.int64]
+    animal: NDArray[np.int64]
+    recording: NDArray[np.int64]
+    runs: list[list[tuple[int, float]]]
+
+
+def clock_of(skeleton: Skeleton) -> float:
+    """Ticks a second of an animal's recogniser."""
+    return CLOCKS_HZ.get(skeleton.name, _CLOCK_HZ)
+
+
+def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: float) -> Examples:
+    """The examples of labelled tracks."""
+    features, codes, animals, recordings, runs = [], [], [], [], []
+    number = {name: k for k, name in enumerate(sorted({one.animal for one in tracks}))}
+    place = {word: k for k, word in enumerate(words)}
+    for k, one in enumerate(tracks):
+        names = channel_names(one.track.skeleton)
+        time_s = (one.track.times_ns - one.track.times_ns[:1]) * 1e-9
+        code = np.array([place[str(word)] for word in one.words], np.int64)
+        for stretch in stretches_of(one.track, clock_hz, one.wall_mm):
+            row = np.clip(np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz), 0, len(time_s) - 1)
+            features.append(window_features(stretch, names))
+            codes.append(code[row])
+            animals.append(np.full(len(row), number[one.animal]))
+            recordings.append(np.full(len(row), k))
+        runs.append(_runs(one.words, one.track.times_ns, place))
+    return Examples(*(np.concatenate(some) for some in (features, codes, animals, recordings)), runs)
+
+
+def _runs(words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str, int]) -> list[tuple[int, float]]:
+    """The bouts (word, s) of a recording, those without a name among them."""
+    if not len(words):
+        return []
+    starts = np.flatnonzero(np.append(True, words[1:] != words[:-1]))
+    stops, ends = np.append(starts[1:], len(words)), frame_stops(times_ns)
+    return [(place[str(words[a])], float(ends[b - 1] - times_ns[a]) * 1e-9) for a, b in zip(starts, stops, strict=True)]
+
+
+def _softmax(logits: Array) -> Array:
+    e = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(e / e.sum(axis=1, keepdims=True))

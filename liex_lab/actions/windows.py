@@ -1,0 +1,53 @@
+"""Features of every moment: what the channels do around it, over windows in seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.actions.channels import Stretch
+
+Array = NDArray[np.float64]
+
+HALF_WINDOWS_S = (0.06, 0.2, 0.6)
+SIDE_WINDOWS_S = ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9))
+RANGE_S = 0.25
+
+
+def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float32]:
+    """Features (m, F) of every tick of a stretch: its channels now, and their mean and spread around it.
+
+    Windows end where the stretch does. Of channels that change sign in a mirror (their names end in ~) the sizes of the
+    means count, and their signs in the shorter windows only.
+    """
+    x = stretch.values
+    step = stretch.times_s[1] - stretch.times_s[0]
+    signed = np.array([name.endswith("~") for name in names])
+    sums, squares = (np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(v, axis=0)]) for v in (x, x * x))
+    out = [x, np.abs(x[:, signed])]
+    for half in HALF_WINDOWS_S:
+        mean, square = (_window_mean(total, -half, half, step) for total in (sums, squares))
+        out += [mean, np.abs(mean[:, signed]), np.sqrt(np.maximum(square - mean * mean, 0.0))]
+    for start, stop in SIDE_WINDOWS_S:
+        mean, square = (_window_mean(total, start, stop, step) for total in (sums, squares))
+        out += [np.where(signed, np.abs(mean), mean), np.sqrt(np.maximum(square, 0.0))]
+    out += [_extreme(np.abs(x), RANGE_S, step)]
+    return np.concatenate(out, axis=1).astype(np.float32)
+
+
+def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:
+    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C); beyond the ends, the nearest tick."""
+    m = len(total) - 1
+    rows = np.arange(m)
+    low = np.clip(rows + round(start_s / step), 0, m - 1)
+    high = np.clip(rows + round(stop_s / step), 0, m - 1) + 1
+    return np.asarray((total[high] - total[low]) / (high - low)[:, None])
+
+
+def _extreme(x: Array, half_s: float, step: float) -> Array:
+    """The largest (m, C) within half_s of each tick."""
+    from scipy.ndimage import maximum_filter1d
+
+    return np.asarray(maximum_filter1d(x, 2 * max(1, round(half_s / step)) + 1, axis=0, mode="nearest"))

@@ -1,0 +1,205 @@
+"""Groups compared: from one row per session to one row per measure and contrast, with n at every level.
+
+Every measure that was asked for is in the table, significant or not, tested or refused. The false discovery rate is
+that of the whole table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from liex_lab.behaviour.design import CAGE, NotComparable, Units, animal_means, find_units
+from liex_lab.behaviour.multiplicity import false_discovery
+from liex_lab.behaviour.statistics import (
+    FEWEST_FOR_MODEL,
+    Estimate,
+    check_reachable,
+    estimate,
+    mixed_model,
+    permutation,
+    smallest_p,
+    spread_of_animals,
+)
+from liex_lab.sessions.tables import Column, columns, to_pandas
+
+if TYPE_CHECKING:
+    from liex_lab.sessions import Session
+
+WHO = ("subject_id", "group", "cage", "sex", "batch")
+ENGINES = ("auto", "permutation", "mixed")
+
+STATS: tuple[Column, ...] = columns(
+    "stats",
+    ("measure", "string", "", "column of the summary that is compared"),
+    ("contrast", "string", "", "second group - first group"),
+    ("estimate", "float64", "", "difference of the groups, in the measure's own unit"),
+    ("ci_low", "float64", "", "lower end of the difference's 95 % interval", "t, over the units"),
+    ("ci_high", "float64", "", "upper end of it", "t, over the units"),
+    ("effect_size", "float64", "", "Hedges' g: the difference in standard deviations between animals",
+     "J x estimate / pooled sd of the animals' means"),
+    ("effect_low", "float64", "", "lower end of its interval", "as effect_size, of ci_low"),
+    ("effect_high", "float64", "", "upper end of its interval", "as effect_size, of ci_high"),
+    ("p", "float64", "", "two-sided p of the test; empty where there is none, see refused"),
+    ("p_fdr", "float64", "", "p, corrected for the size of the family", "Benjamini-Hochberg"),
+    ("test", "string", "", "the test that was made"),
+    ("refused", "string", "", "why there is no test; empty where there is one"),
+    ("unit", "string", "", "what was assigned to a group, and so what n counts: cage, animal, or an animal's own "
+     "difference"),
+    ("n_units_first", "int64", "", "units in the first group"),
+    ("n_units_second", "int64", "", "units in the second group"),
+    ("n_animals", "int64", "", "animals in both groups"),
+    ("n_cages", "int64", "", "cages they live in; 0 when not stated"),
+    ("n_sessions", "int64", "", "sessions with a value"),
+    ("n_bouts", "int64", "", "bouts in them; 0 when not told"),
+    ("observed_min", "float64", "min", "time with a pose in them"),
+    ("n_without_value", "int64", "", "sessions of these groups that have no value and are left out"),
+    ("smallest_p", "float64", "", "the smallest p that a permutation of these units can give", "2 / arrangements"),
+    ("family", "string", "", "the tests that p_fdr is corrected for"),
+    ("n_family", "int64", "", "how many they are"),
+)  # fmt: skip
+
+
+def collect(sessions: Iterable[Session]) -> pd.DataFrame:
+    """One row per session and animal: who it is (the table `sessions`), its summary, its number of bouts."""
+    rows = []
+    for session in sessions:
+        who = session.table("sessions")
+        table = who.merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
+        rows.append(table.assign(n_bouts=len(session.bouts)))
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame(columns=["session_id", *WHO])
+
+
+def compare(
+    table: pd.DataFrame,
+    measures: Sequence[str],
+    reference: str | None = None,
+    *,
+    engine: str = "auto",
+    blocks: Sequence[str] = ("batch",),
+    alpha: float = 0.05,
+    family: str = "all measures and contrasts",
+    seed: int = 0,
+) -> pd.DataFrame:
+    """The table `stats` from one row per session (see `collect`): every measure, every pair of groups.
+
+    reference: compare each group with this one only. engine: permutation, mixed, or auto, which takes the mixed model
+    where something is nested, there are `FEWEST_FOR_MODEL` units in each group and its variance is not zero. blocks:
+    columns within which animals are exchanged.
+    """
+    table = _prepared(table, blocks)
+    groups = sorted(set(table["group"]) - {""})
+    if reference is None:
+        pairs = list(combinations(groups, 2))
+    else:
+        pairs = [(reference, other) for other in groups if other != reference and reference in groups]
+    rows = []
+    for k, (measure, pair) in enumerate((measure, pair) for measure in measures for pair in pairs):
+        own = table.assign(value=_values(table, measure))
+        rows.append(_compare_one(own, measure, pair, engine, blocks, alpha, np.random.default_rng([seed, k])))
+    corrected = false_discovery([row["p"] for row in rows])
+    n_family = int(np.isfinite(corrected).sum())
+    for row, p in zip(rows, corrected, strict=True):
+        row |= {"p_fdr": p, "family": family, "n_family": n_family}
+    return to_pandas(STATS, {column.name: [row[column.name] for row in rows] for column in STATS})
+
+
+def _prepared(table: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
+    """The table with every name as text, empty where it is not known."""
+    names = {*WHO, *blocks}
+    texts = {name: table[name].fillna("").astype(str) if name in table else "" for name in names}
+    return table.assign(**texts)
+
+
+def _values(table: pd.DataFrame, measure: str) -> pd.Series[Any]:
+    return table[measure].astype(float) if measure in table else pd.Series(np.nan, index=table.index)
+
+
+def _compare_one(
+    table: pd.DataFrame, measure: str, groups: tuple[str, str], engine: str, blocks: Sequence[str], alpha: float,
+    rng: np.random.Generator,
+) -> dict[str, Any]:  # fmt: skip
+    """One row of the table."""
+    own = table[table["group"].isin(groups)]
+    rows = own[np.isfinite(own["value"])]
+    cages = set(rows["cage"]) - {""}
+    row: dict[str, Any] = {
+        "measure": measure, "contrast": f"{groups[1]} - {groups[0]}", "unit": "", "test": "", "refused": "",
+        **dict.fromkeys(("estimate", "ci_low", "ci_high", "effect_size", "effect_low", "effect_high", "p",
+                         "smallest_p"), np.nan),
+        "n_units_first": 0, "n_units_second": 0, "n_animals": int(rows["subject_id"].nunique()), "n_cages": len(cages),
+        "n_sessions": len(rows), "n_bouts": int(rows["n_bouts"].sum()) if "n_bouts" in rows else 0,
+        "observed_min": float(rows["observed_s"].sum()) / 60.0 if "observed_s" in rows else np.nan,
+        "n_without_value": len(own) - len(rows),
+    }  # fmt: skip
+    try:
+        units = find_units(rows, groups, blocks)
+        row |= _described(units)
+        found = estimate(units)
+        row |= _sized(found, rows, groups)
+        if float(np.ptp(units.values)) == 0.0 and not (units.paired and units.values[0] != 0.0):
+            raise NotComparable("every unit has the same value, so there is nothing to compare")
+        row |= _tested(rows, units, groups, engine, alpha, rng)
+    except NotComparable as reason:
+        row["refused"] = str(reason)
+    return row
+
+
+def _described(units: Units) -> dict[str, Any]:
+    n = len(units.values)
+    first, second = (n, n) if units.paired else (int((~units.second).sum()), int(units.second.sum()))
+    return {"unit": units.unit, "n_units_first": first, "n_units_second": second, "smallest_p": smallest_p(units)}
+
+
+def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
+    """The difference, and the same in standard deviations between animals."""
+    second = (rows["group"] == groups[1]).to_numpy()
+    animal = pd.factorize(rows["subject_id"])[0] * 2 + second  # one that was in both groups counts in both
+    places, number = np.unique(animal, return_inverse=True)
+    sd, correction = spread_of_animals(animal_means(rows["value"].to_numpy(float), number), places % 2 == 1)
+    known = {"estimate": found.difference, "ci_low": found.low, "ci_high": found.high}
+    effect = {"effect_size": found.difference, "effect_low": found.low, "effect_high": found.high}
+    return {**known, **{name: correction * value / sd if sd > 0 else np.nan for name, value in effect.items()}}
+
+
+def _tested(
+    rows: pd.DataFrame, units: Units, groups: tuple[str, str], engine: str, alpha: float, rng: np.random.Generator
+) -> dict[str, Any]:
+    """The p and the test's name. Raises NotComparable where the permutation cannot reach alpha."""
+    enough = min(int((~units.second).sum()), int(units.second.sum())) >= FEWEST_FOR_MODEL
+    if engine == "mixed" or (engine == "auto" and enough):
+        model = mixed_model(rows, units, groups)
+        if model is not None:
+            what = "the animals' means" if model.random == CAGE else "the sessions' values"
+            name = f"mixed model of {what}, random intercept per {model.random}, t with units - 2 degrees of freedom"
+            return {"p": model.p, "test": name, **_sized(model.found, rows, groups)}
+    check_reachable(units, alpha)
+    within = ""
+    if len(np.unique(units.block)) > 1:
+        within = " within blocks"
+    of = "signs of the animals' own differences" if units.paired else f"{units.unit}s{within}"
+    return {"p": permutation(units, rng), "test": f"permutation of {of}"}
+
+
+def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
+    """A sentence or three for a methods section, from the table `stats`."""
+    done, refused = stats[stats["test"] != ""], stats[stats["refused"] != ""]
+    if len(stats) == 0:
+        return ""
+    units = ", ".join(sorted(set(done["unit"])))
+    tests = "; ".join(sorted(set(done["test"])))
+    text = (f"Sessions were averaged per animal; the unit of comparison is the {units}. " if units else "") + (
+        f"Tests: {tests}. " if tests else ""
+    )
+    text += (
+        "Differences are given with 95 % intervals, and as Hedges' g relative to the standard deviation between "
+        f"animals. p values are two-sided and corrected by Benjamini and Hochberg's procedure over {len(done)} tests "
+        f"(family: {stats['family'].iloc[0]}); {alpha:g} was taken as the limit."
+    )
+    if len(refused):
+        text += f" {len(refused)} comparisons were not tested, as the design does not allow it."
+    return text

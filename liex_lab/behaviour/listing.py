@@ -1,0 +1,47 @@
+"""The columns that a reader is told of first: README.md's list is printed from the columns' own descriptions.
+
+`python -m liex_lab.behaviour.listing` prints it; a test holds README.md to it.
+"""
+
+from __future__ import annotations
+
+from liex_lab.behaviour.bouts import ACTIONS
+from liex_lab.behaviour.summary_columns import Vocabulary
+from liex_lab.sessions.tables import TABLES, Column
+
+FIRST = (
+    "frames.frame_index", "frames.time_s", "frames.gap_before", "frames.predicted_error_mm", "frames.residual_mm",
+    "frames.flag", "frames.bridged", "frames.p_flip", "frames.centroid_x_mm", "frames.wall_distance_mm",
+    "frames.zone", "poses.joint", "poses.x_mm",
+    "poses.z_mm", "poses.u_px", "poses.sd_mm", "kinematics.speed_mm_s", "kinematics.speed_sd_mm_s",
+    "kinematics.acceleration_mm_s2", "kinematics.heading_rad", "kinematics.yaw_rate_rad_s",
+    "kinematics.body_pitch_rad", "kinematics.length_mm", "kinematics.bend_rad", "kinematics.nose_height_mm",
+    "kinematics.tail_beat_hz", "kinematics.tail_beat_mm", "bouts.action", "bouts.start_s", "bouts.stop_s",
+    "bouts.path_mm", "bouts.peak_speed_mm_s", "bouts.net_turn_rad", "bouts.since_last_s", "summary.observed_s",
+    "summary.distance_m", "summary.mean_speed_mm_s", "summary.speed_noise_mm_s", "summary.outer_half_share",
+    "summary.rear_count", "summary.rear_share", "summary.rear_latency_s", "transitions.n", "transitions.by_chance",
+    "transitions.p_fdr", "zones.n_visits", "activity.distance_mm",
+)  # fmt: skip
+
+
+def all_columns() -> dict[str, Column]:
+    """Every column that a session can have, of animals that walk and that swim, by `table.name`."""
+    walking, swimming = (Vocabulary(ACTIONS, (), swims).columns for swims in (False, True))
+    stored = [column for rows in TABLES.values() for column in rows]
+    return {f"{c.table}.{c.name}": c for c in (*stored, *swimming, *walking)}
+
+
+def first_columns() -> str:
+    """README.md's table of columns, Markdown."""
+    known = all_columns()
+    lines = ["| column | unit | meaning |", "|---|---|---|"]
+    for name in FIRST:
+        column = known[name]
+        formula = f" ({column.formula})" if column.formula and len(column.formula) < 60 else ""
+        text = f"{column.meaning}{formula}".replace("|", "\\|")
+        lines.append(f"| {column.table} `{column.name}` | {column.unit} | {text} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(first_columns(), end="")

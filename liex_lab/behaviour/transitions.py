@@ -1,0 +1,83 @@
+"""Which action follows upon which, and whether more often than chance would have it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from liex_lab.behaviour.multiplicity import false_discovery
+from liex_lab.behaviour.summary_columns import TRANSITIONS
+from liex_lab.sessions.tables import to_pandas
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+_ROUNDS = 500  # of iterative scaling; it converges in some dozens
+
+
+def transitions(bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float) -> pd.DataFrame:
+    """The table `transitions` of one animal: every ordered pair of different actions.
+
+    Chance: each action is followed by another one in proportion to how often those occur. One bout's action depends on
+    the last one's only; longer patterns are not looked for.
+    """
+    counts = count_transitions(bouts, words, gaps, longest_pause_s)
+    expected = by_chance(counts)
+    rows, columns = np.nonzero(~np.eye(len(words), dtype=bool))
+    n, n_from, chance = counts[rows, columns], counts.sum(axis=1)[rows], expected[rows, columns]
+    p = np.array([_binomial(int(k), int(total), q) for k, total, q in zip(n, n_from, chance, strict=True)])
+    names = np.array(words, dtype=object)
+    return to_pandas(TRANSITIONS, {
+        **{name: [_first(bouts, name)] * len(n) for name in ("session_id", "individual")},
+        "from_action": names[rows], "to_action": names[columns], "n": n, "n_from": n_from,
+        "probability": np.divide(n, n_from, out=np.full(len(n), np.nan), where=n_from > 0), "by_chance": chance,
+        "p": p, "p_fdr": false_discovery(p),
+    })  # fmt: skip
+
+
+def count_transitions(bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float) -> Counts:
+    """(k, k) how often word j followed upon word i != j, without a gap or a longer nameless stretch in between."""
+    place = {word: k for k, word in enumerate(words)}
+    code = np.array([place[word] for word in bouts["action"]], np.int64)
+    start, stop = bouts["start_s"].to_numpy(float), bouts["stop_s"].to_numpy(float)
+    counts = np.zeros((len(words), len(words)), np.int64)
+    if len(code) < 2:
+        return counts
+    broken = gaps.loc[gaps["n_frames_missing"] > 0, "start_s"].to_numpy(float, copy=True)
+    broken.sort()  # a gap parts two bouts when it begins after the one and before the other
+    parted = np.searchsorted(broken, start[1:] - 1e-9) != np.searchsorted(broken, stop[:-1] - 1e-9)
+    near = (start[1:] - stop[:-1] <= longest_pause_s) & ~parted & (code[1:] != code[:-1])
+    np.add.at(counts, (code[:-1][near], code[1:][near]), 1)
+    return counts
+
+
+def by_chance(counts: Counts) -> Array:
+    """(k, k) probability of j after i under quasi-independence: rows and columns as counted, the diagonal empty.
+
+    NaN in the rows of actions that nothing followed.
+    """
+    rows, columns = counts.sum(axis=1).astype(float), counts.sum(axis=0).astype(float)
+    fitted = (~np.eye(len(counts), dtype=bool)).astype(float) * np.outer(rows > 0, columns > 0)
+    for _ in range(_ROUNDS):
+        fitted *= np.divide(rows, fitted.sum(axis=1), out=np.zeros_like(rows), where=fitted.sum(axis=1) > 0)[:, None]
+        off = np.divide(columns, fitted.sum(axis=0), out=np.zeros_like(rows), where=fitted.sum(axis=0) > 0)
+        fitted *= off
+        if np.abs(off[columns > 0] - 1.0).max(initial=0.0) < 1e-9:
+            break
+    total = fitted.sum(axis=1, keepdims=True)
+    return np.divide(fitted, total, out=np.full_like(fitted, np.nan), where=total > 0)
+
+
+def _binomial(n: int, total: int, chance: float) -> float:
+    """Two-sided p of n out of total; NaN where chance leaves no choice."""
+    if total == 0 or not 1e-9 < chance < 1.0 - 1e-9:
+        return float("nan")
+    from scipy.stats import binomtest
+
+    return float(binomtest(n, total, chance).pvalue)
+
+
+def _first(table: pd.DataFrame, name: str) -> str:
+    return str(table[name].iloc[0]) if len(table) else ""

@@ -1,0 +1,105 @@
+"""What people labelled or corrected in BORIS, as labels: from its projects and from its exports.
+
+A project is JSON; state events are pairs of rows, start and stop. `liex export SESSION --to boris` writes one.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from liex_lab.actions.labels import HUMAN, checked
+from liex_lab.errors import LiexError
+
+_STATE = "State event"
+
+
+def read_boris_project(path: str | Path) -> dict[str, Any]:
+    """The content of a project, .boris or .boris.gz. Raises LiexError where it is none."""
+    source = Path(path)
+    try:
+        raw = source.read_bytes()
+        document = json.loads(gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw)
+    except (OSError, EOFError, ValueError) as error:
+        raise LiexError(f"{source} should be a BORIS project (JSON), but: {error}") from None
+    if not isinstance(document, dict) or not isinstance(document.get("observations"), dict):
+        raise LiexError(f"{source} should be a BORIS project, but holds no observations; save it from BORIS again")
+    return document
+
+
+def boris_labels(path: str | Path) -> pd.DataFrame:
+    """The state events of a project as labels: session_id (the observation), individual, action, start_s, stop_s.
+
+    The observation's time offset is taken off. An event without its end raises a LiexError that names it; point events
+    have no length and are left out.
+    """
+    document = read_boris_project(path)
+    points = {str(b.get("code")) for b in _values(document.get("behaviors_conf"))
+              if str(b.get("type", _STATE)).lower().startswith("point")}  # fmt: skip
+    rows: list[dict[str, Any]] = []
+    for name, observation in document["observations"].items():
+        offset = float(observation.get("time offset") or 0.0)
+        rows += _pairs(observation.get("events", []), points, str(name), offset, path)
+    columns = ["session_id", "individual", "action", "start_s", "stop_s", "source"]
+    return checked(pd.DataFrame(rows, columns=columns), str(path))
+
+
+def boris_export_labels(path: str | Path) -> pd.DataFrame:
+    """The labels of BORIS's export 'aggregated events' (TSV or CSV); see `boris_labels`."""
+    source = Path(path)
+    try:
+        table = pd.read_csv(source, sep="\t" if source.suffix == ".tsv" else ",")
+    except (OSError, ValueError) as error:
+        raise LiexError(f"{source} should be an export of BORIS, but: {error}") from None
+    wanted = {"Observation id": "session_id", "Subject": "individual", "Behavior": "action", "Start (s)": "start_s",
+              "Stop (s)": "stop_s"}  # fmt: skip
+    lacking = [name for name in wanted if name not in table]
+    if lacking:
+        raise LiexError(f"{source} should be BORIS's export of aggregated events; it lacks the column {lacking[0]}")
+    if "Behavior type" in table:
+        table = table[table["Behavior type"] == "STATE"]
+    return checked(table[list(wanted)].rename(columns=wanted).assign(source=HUMAN), str(source))
+
+
+def is_boris_export(path: str | Path) -> bool:
+    """Whether a table's first line is that of BORIS's exports."""
+    with Path(path).open(encoding="utf-8", errors="replace") as file:
+        return file.readline().lstrip("\ufeff").startswith(("Observation id", '"Observation id"'))
+
+
+def _pairs(
+    events: Sequence[Sequence[Any]], points: set[str], name: str, offset: float, path: str | Path
+) -> list[dict[str, Any]]:
+    """Rows of labels from the events of one observation: state events alternate between start and stop."""
+    begun: dict[tuple[str, str, str], float] = {}
+    rows = []
+    try:
+        events = sorted(events, key=lambda event: float(event[0]))
+        for time, subject, code, modifier, *_ in events:
+            if str(code) in points:
+                continue
+            key = (str(subject), str(code), str(modifier))
+            if key not in begun:
+                begun[key] = float(time)
+                continue
+            start = begun.pop(key)
+            rows.append({"session_id": name, "individual": key[0], "action": key[1], "start_s": start - offset,
+                         "stop_s": float(time) - offset, "source": HUMAN})  # fmt: skip
+    except (TypeError, ValueError, IndexError):
+        raise LiexError(f"{path}: the observation {name} has an event that cannot be read; check it in BORIS") from None
+    if begun:
+        (_, code, _), start = next(iter(begun.items()))
+        raise LiexError(
+            f"{path}: in the observation {name}, {code} starts at {start:g} s and never stops; pair it in BORIS "
+            "(Observations, Check state events)"
+        )
+    return rows
+
+
+def _values(conf: Any) -> list[dict[str, Any]]:
+    return [entry for entry in conf.values() if isinstance(entry, dict)] if isinstance(conf, dict) else []

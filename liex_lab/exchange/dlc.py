@@ -1,0 +1,37 @@
+"""DeepLabCut's tables: three header rows, then one row for every frame.
+
+poses_3d.csv has x, y, z in millimetres of the arena, without likelihood, as DeepLabCut's own 3D tables; poses_2d.csv
+has x, y in pixels of the depth picture and a likelihood. The format has no times: they are in times.csv, row by row;
+the actions are in bouts.csv.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from liex_lab.exchange.poses import Array, Poses, write_times
+from liex_lab.sessions import Session
+
+SCORER = "liex_lab"
+
+
+def write(session: Session, path: Path) -> None:
+    """The folder `path` with both tables, the times and the bouts."""
+    poses = Poses.of(session)
+    path.mkdir()
+    table(poses, poses.xyz_mm, "xyz").to_csv(path / "poses_3d.csv", lineterminator="\n")
+    flat = np.concatenate([poses.uv_px, poses.score[..., None]], axis=-1)
+    table(poses, flat, ("x", "y", "likelihood")).to_csv(path / "poses_2d.csv", lineterminator="\n")
+    write_times(path / "times.csv", poses)
+    session.bouts.to_csv(path / "bouts.csv", index=False, lineterminator="\n")
+
+
+def table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.DataFrame:
+    """Values (n, J, k) with DeepLabCut's columns: scorer, bodyparts, coords."""
+    columns = pd.MultiIndex.from_product(
+        [[SCORER], list(poses.joints), list(coords)], names=["scorer", "bodyparts", "coords"]
+    )
+    return pd.DataFrame(values.reshape(len(values), -1), index=poses.frame_index, columns=columns)

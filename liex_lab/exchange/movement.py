@@ -1,0 +1,60 @@
+"""movement's poses: an xarray data set, and the same as netCDF (`movement.io` and xarray open it).
+
+movement's own loaders make times from one frame rate; here the time coordinate is the frames' true one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.exchange.poses import Poses
+from liex_lab.sessions import Session
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def to_movement(session: Session) -> xarray.Dataset:
+    """The session as a movement poses data set: millimetres of the arena, seconds; actions in attrs["actions"]."""
+    import xarray
+
+    poses = Poses.of(session)
+    dims = ("time", "space", "keypoints", "individuals")
+    rate = session.metadata["frames"]["fps_median"]
+    attrs: dict[str, Any] = {
+        "source_software": "liex_lab", "ds_type": "poses", "time_unit": "seconds", "source_file": session.path.name,
+        "space_unit": "mm", "axes": "arena: z up from the floor",
+        **({"fps": float(rate)} if rate else {}),
+    }  # fmt: skip
+    return xarray.Dataset(
+        data_vars={
+            "position": (dims, np.moveaxis(poses.xyz_mm, 1, 2)[..., None]),
+            "confidence": (("time", "keypoints", "individuals"), poses.score[..., None]),
+            "sd_mm": (("time", "keypoints", "individuals"), poses.sd_mm[..., None]),
+            "action": (("time", "individuals"), _actions(session, poses)[:, None]),
+        },
+        coords={
+            "time": poses.time_s, "space": ["x", "y", "z"], "keypoints": list(poses.joints),
+            "individuals": [poses.individual],
+        },
+        attrs=attrs,
+    )  # fmt: skip
+
+
+def _actions(session: Session, poses: Poses) -> np.ndarray[Any, Any]:
+    """(n,) the action of every frame, empty where it has none."""
+    out = np.full(len(poses.frame_index), "", dtype=object)
+    bouts = session.bouts
+    starts = np.searchsorted(poses.frame_index, bouts["start_frame"].to_numpy())
+    stops = np.searchsorted(poses.frame_index, bouts["stop_frame"].to_numpy())
+    for start, stop, action in zip(starts, stops, bouts["action"], strict=True):
+        out[start:stop] = action
+    return out.astype(str)
+
+
+def write(session: Session, path: Path) -> None:
+    """NetCDF 4 at `path`."""
+    to_movement(session).to_netcdf(path, engine="h5netcdf")

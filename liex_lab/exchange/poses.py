@@ -1,0 +1,56 @@
+"""A session's poses as arrays, which every other program's format is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.sessions import Session
+
+Array = NDArray[np.float64]
+_COLUMNS = ["frame_index", "time_s", "joint", "x_mm", "y_mm", "z_mm", "u_px", "v_px", "score", "sd_mm"]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """One row for every recorded frame: frame_index (n,), time_s (n,); NaN where there is no pose.
+
+    joints: their names; xyz_mm (n, J, 3) in the arena; uv_px (n, J, 2) in the depth picture; score and sd_mm (n, J).
+    """
+
+    individual: str
+    joints: tuple[str, ...]
+    bones: tuple[tuple[int, int], ...]
+    frame_index: NDArray[np.int64]
+    time_s: Array
+    xyz_mm: Array
+    uv_px: Array
+    score: Array
+    sd_mm: Array
+
+    @staticmethod
+    def of(session: Session) -> Poses:
+        """Those of a session."""
+        about = session.metadata
+        joints = tuple(about["animal"]["joints"])
+        table = session.table("poses", _COLUMNS)
+        n, shape = len(joints), (-1, len(joints))
+
+        def array(*names: str) -> Array:
+            columns = [table[name].to_numpy(float).reshape(shape) for name in names]
+            return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
+
+        return Poses(
+            about["individual"], joints, tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),
+            table["frame_index"].to_numpy()[::n], table["time_s"].to_numpy(float)[::n], array("x_mm", "y_mm", "z_mm"),
+            array("u_px", "v_px"), array("score"), array("sd_mm"),
+        )  # fmt: skip
+
+
+def write_times(path: Path, poses: Poses) -> None:
+    """A CSV with the true time of each row, for formats that have no room for it."""
+    lines = [f"{index},{time:.9f}" for index, time in zip(poses.frame_index, poses.time_s, strict=True)]
+    path.write_text("\n".join(["frame_index,time_s", *lines]) + "\n", encoding="utf-8")

@@ -1,0 +1,102 @@
+"""What the track of a session was made of, kept beside it: so that it can be made again after a human's correction."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import SessionError
+from liex_lab.recordings.times import Gap
+from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.rows import LOST
+from liex_lab.tracking.curve import Subject
+from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking.track import Flip
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from liex_lab.sessions.session import Session
+
+FILE = "observations.npz"
+_HUMAN = "human"
+
+
+def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
+    """Write observations.npz: every frame's hypotheses, and whom they are of; no pickle."""
+    facts = {
+        "skeleton": subject.skeleton.table, "length_mm": subject.length_mm, "doubtful_mm": subject.doubtful_mm,
+        "bridge_s": subject.bridge_s, "joint_share": list(subject.joint_share),
+    }  # fmt: skip
+    told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+    np.savez_compressed(folder / FILE, subject=told, **{name: getattr(seen, name) for name in COLUMNS})
+
+
+def read_evidence(session: Session) -> tuple[Observations, Subject]:
+    """What `write_evidence` wrote. Raises SessionError for a session that has nothing of it."""
+    path = session.path / FILE
+    if not path.is_file():
+        raise SessionError(
+            f"{session.path} does not hold what its single frames said ({FILE}), as sessions of earlier versions; "
+            "run `liex run` on the recording again"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            facts = json.loads(kept["subject"].tobytes())
+            skeleton = Skeleton.from_table(facts["skeleton"], str(path))
+            seen = Observations(skeleton, *(kept[name] for name in COLUMNS))
+        subject = Subject(
+            skeleton, session.camera, session.T_arena_camera, facts["length_mm"], facts["doubtful_mm"],
+            facts["bridge_s"], tuple(facts["joint_share"]),
+        )  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(f"{path} is damaged ({error}); run `liex run` on the recording again") from None
+    return seen, subject
+
+
+def read_corrections(session: Session) -> list[Flip]:
+    """The flips that a human has stated, with frames counted by row."""
+    index = session.frames["frame_index"].to_numpy()
+    table = session.flips[session.flips["source"] == _HUMAN]
+    return [
+        Flip(
+            int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
+            float(row["p_flip"]), bool(row["applied"]), _HUMAN, str(row["undone_at"]),
+        )
+        for row in _rows_of(table)
+    ]  # fmt: skip
+
+
+def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
+    """The origin of a session, as it was told when the session was first written."""
+    about, camera = session.metadata, session.metadata["camera"]
+    source, home = about["input"], {"name", "joints", "bones", "home_length_mm"}
+    return Provenance(
+        name=session.name, skeleton=skeleton, camera=session.camera, T_arena_camera=session.T_arena_camera,
+        floor_distance_mm=camera["floor_distance_mm"], input_sha256=source["sha256"], plan_toml=session.plan,
+        format=source["format"], profile=source.get("profile", {}), individual=about["individual"],
+        n_frames=len(session.frames), gaps=_camera_gaps(session), problems=about["problems"],
+        truncated=source["truncated"], subject=about["subject"], session_start_time=about["session_start_time"] or "",
+        model=about["model"], animal_size={k: v for k, v in about["animal"].items() if k not in home},
+        optics=camera.get("optics", {}), arena=session.arena, zones=session.zones,
+    )  # fmt: skip
+
+
+def _camera_gaps(session: Session) -> list[Gap]:
+    """What the camera did not deliver and stamps that were moved, out of the table."""
+    times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
+    found = []
+    for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
+        at, missing = int(times[np.searchsorted(index, row["start_frame"])]), int(row["n_frames_missing"])
+        first = at - round(1e9 * (row["stop_s"] - row["start_s"])) if missing else at
+        found.append(Gap(int(row["start_frame"]), int(row["stop_frame"]), first, at, missing, str(row["reason"])))
+    return found
+
+
+def _rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """A short table row by row."""
+    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]

@@ -1,0 +1,72 @@
+"""What a session leaves behind that could not be measured: failed.json, with the reason and what to do about it."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import traceback
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from liex_lab.errors import LiexError
+from liex_lab.sessions.provenance import versions
+
+FAILED_FILE = "failed.json"
+_REPORT = "report it to the makers of liex_lab with the lines under traceback"
+
+
+def describe_failure(error: BaseException, stage: str, frame: int | None) -> dict[str, Any]:
+    """What is to be said about an error. stage: what was being done; frame: the last one that was measured, if any."""
+    ours = not isinstance(error, LiexError | OSError | MemoryError)
+    if isinstance(error, LiexError):
+        reason, _, remedy = str(error).rpartition("; ")
+        reason, remedy = (reason, remedy) if reason else (remedy, "see `liex doctor`")
+    elif isinstance(error, OSError):
+        where = f" {error.filename}" if error.filename else ""
+        reason = f"the system refused{where}: {error.strerror or error}"
+        remedy = "make room, correct the permissions or mend the drive, and try again"
+    elif isinstance(error, MemoryError):
+        reason, remedy = "the memory was not enough", "give each worker more memory, or use fewer workers"
+    else:
+        reason, remedy = f"{type(error).__name__}: {error}", _REPORT
+    told: dict[str, Any] = {
+        "stage": stage, "frame": frame, "reason": reason, "remedy": remedy, "kind": type(error).__name__,
+        "at": datetime.now(UTC).isoformat(timespec="seconds"), "machine": platform.node(), "versions": versions(),
+    }  # fmt: skip
+    return {**told, "traceback": traceback.format_exception(error)} if ours else told
+
+
+def write_failure(folder: Path, failure: dict[str, Any]) -> None:
+    """Write failed.json into the session's folder, whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / FAILED_FILE, json.dumps(failure, indent=2, default=str) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file under another name and rename it, so that nobody ever reads half of it."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with beside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def read_failure(folder: Path) -> dict[str, Any] | None:
+    """The failed.json in a folder, None where there is none; a damaged one says so as its reason."""
+    path = folder / FAILED_FILE
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(found, dict) and isinstance(found.get("reason"), str):
+            return found
+    except (ValueError, OSError, RecursionError):
+        pass
+    return {"reason": f"{path} cannot be read", "stage": "", "frame": None, "remedy": "try the session again"}

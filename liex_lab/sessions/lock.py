@@ -1,0 +1,59 @@
+"""One process at a time: a lock on a file that the system takes back when its holder ends, however it ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from liex_lab.errors import SessionError
+
+
+def take_lock(path: Path) -> IO[bytes] | None:
+    """Hold `path`, made if needed; None where another process holds it. Close the file to let go of it.
+
+    A folder that was renamed or removed in between is no longer the one that was asked for: None, too.
+    """
+    file = path.open("ab")
+    try:
+        _lock(file)
+        same = os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        same = False
+    if not same:
+        file.close()
+        return None
+    return file
+
+
+@contextmanager
+def locked(path: Path, held: str) -> Iterator[None]:
+    """Hold `path` within the block. Raises SessionError with `held`, half a sentence, where another one does."""
+    file = take_lock(path)
+    if file is None:
+        raise SessionError(f"{held}; wait until it is done, or end it")
+    try:
+        yield
+    finally:
+        if sys.platform != "win32":  # there, a file in use cannot go
+            path.unlink(missing_ok=True)
+        file.close()
+        if sys.platform == "win32":
+            with suppress(OSError):
+                path.unlink()
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Raises OSError where another process holds it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,0 +1,41 @@
+"""Where a session may be written, and where it lies until it is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from liex_lab.catalog import sha256
+from liex_lab.errors import SessionError
+from liex_lab.sessions.checkpoint import OWN
+from liex_lab.sessions.failure import FAILED_FILE
+
+_HASHED = {".parquet", ".csv", ".json", ".toml"}
+
+
+def part_folder(path: Path) -> Path:
+    """Where the session `path` lies until it is whole."""
+    return path.with_name(f"{path.name}.part")
+
+
+def check_place(path: Path, overwrite: bool) -> None:
+    """Refuse to write over what must not be lost, or where no folder can be."""
+    nearest = next((folder for folder in path.parents if folder.exists()), None)
+    if nearest is not None and not nearest.is_dir():
+        raise SessionError(f"{nearest} is a file, and a session needs a folder; choose another place with --out")
+    if not path.exists() or {entry.name for entry in path.iterdir()} <= {FAILED_FILE}:
+        return  # what failed before may be replaced
+    if not (path / "session.json").is_file():
+        raise SessionError(f"{path} exists and is not a session, so it is left alone; choose another place with --out")
+    if not overwrite:
+        raise SessionError(f"the session {path} exists already; choose another place with --out, or say --overwrite")
+
+
+def file_facts(folder: Path, logs: Mapping[str, Path]) -> dict[str, Any]:
+    """Bytes and SHA-256 of the tables and of what is small, bytes of the logs, for `liex verify`."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix in _HASHED and path.name not in OWN:
+            found[path.name] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
+    return found | {log: {"bytes": path.stat().st_size} for log, path in logs.items()}

@@ -1,0 +1,255 @@
+"""A study: which animals, in which groups, recorded in which sessions, measured by which plan; one small TOML file.
+
+The file names recordings and never leaves the folder it lies in: its recordings, plans and results are inside.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from liex_lab.errors import PlanError, StudyError
+from liex_lab.plan import Plan, known_plans
+
+# as in NeuroBlueprint: letters and digits alone, so that no name is a path, a formula or markup
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,64}$")]
+SessionName = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,32}(_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,6}$")]
+Text = Annotated[str, Field(max_length=500)]
+PathText = Annotated[str, Field(min_length=1, max_length=1000)]
+Settings = dict[str, Any]
+
+STUDY_FILE = "study.toml"
+RAW, DERIVED = "rawdata", "derivatives/liex-lab"
+RESULTS = "behav"  # the session folder of one recording, as NeuroBlueprint calls what shows behaviour
+VIRTUAL = "synthetic:"
+_PATHS = (("arena", "zones"), ("estimation", "model"), ("animal", "skeleton"))  # settings that may name a file
+_SAY = {
+    "id": "should be letters and digits only, as in m01",
+    "animal": "should be the id of an animal: letters and digits only, as in m01",
+    "session": "should be letters and digits, with key-value pairs after them, as in 01 or 01_date-20260821",
+}
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class StudyAnimal(_Table):
+    """[[animals]]: one animal of the study."""
+
+    id: Name
+    group: Text = ""
+    cage: Text = ""
+    sex: Text = ""
+    batch: Text = ""
+    set: Settings = {}
+
+
+class StudySession(_Table):
+    """[[sessions]]: one recording of one animal."""
+
+    animal: Name
+    session: SessionName
+    recording: PathText
+    plan: PathText | None = None
+    start_time: str | None = None
+    exclude: Text = ""
+    set: Settings = {}
+
+
+class StudyTable(_Table):
+    """The whole file as it is written."""
+
+    name: Text = "study"
+    plan: PathText = "mouse"
+    results: PathText = DERIVED
+    set: Settings = {}
+    animals: list[StudyAnimal] = []
+    sessions: list[StudySession] = []
+
+    @model_validator(mode="after")
+    def _agree(self) -> StudyTable:
+        known: set[str] = set()
+        for animal in self.animals:
+            if animal.id.lower() in known:  # some file systems take M01 and m01 for one
+                raise ValueError(f"the animal {animal.id} is listed twice; keep one")
+            known.add(animal.id.lower())
+        taken: set[tuple[str, str]] = set()
+        for one in self.sessions:
+            if one.animal not in {animal.id for animal in self.animals}:
+                raise ValueError(f"the session {one.session} is of {one.animal}, an animal that is not in [[animals]]")
+            key = one.animal.lower(), one.session.lower()
+            if key in taken:
+                raise ValueError(f"the animal {one.animal} has two sessions {one.session}; give each its own name")
+            taken.add(key)
+        return self
+
+
+@dataclass(frozen=True)
+class PlannedSession:
+    """One recording of the study with everything it is measured by.
+
+    id: unique in the study, as in sub-m01_ses-01; recording: a path, or the address of a virtual one; folder: where
+    its results lie; exclude: why it is left out, empty where it is not.
+    """
+
+    id: str
+    animal: StudyAnimal
+    recording: str
+    folder: Path
+    plan: Plan
+    exclude: str = ""
+
+    @property
+    def recording_exists(self) -> bool:
+        """Whether there is anything at the recording's place."""
+        return self.recording.startswith(VIRTUAL) or Path(self.recording).exists()
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study file that was read. path: of the file; paths in it count from its folder."""
+
+    path: Path
+    table: StudyTable
+
+    @staticmethod
+    def load(path: str | Path) -> Study:
+        """The study in a TOML file. Raises StudyError with one sentence about what is wrong in it."""
+        file = Path(path)
+        if file.is_dir():
+            file = file / STUDY_FILE
+        if not file.is_file():
+            raise StudyError(f"there is no study file {file}; `liex cohort init FOLDER` begins one")
+        try:
+            table = tomllib.loads(file.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
+        return Study.from_table(table, file)
+
+    @staticmethod
+    def from_table(table: dict[str, Any], path: Path) -> Study:
+        """The study in a nested dict, as TOML gives it; `path` is where its file is or would be."""
+        try:
+            study = Study(path.absolute(), StudyTable.model_validate(table))
+        except ValidationError as error:
+            raise StudyError(f"{path}: {_sentence(error)}") from None
+        for one in study.table.sessions:
+            if not one.recording.startswith(VIRTUAL):
+                study.inside(one.recording, f"the recording of {one.animal} {one.session}")
+        return study
+
+    @property
+    def name(self) -> str:
+        """The study's name."""
+        return self.table.name
+
+    @property
+    def folder(self) -> Path:
+        """The folder that everything of the study is in."""
+        return self.path.parent
+
+    @property
+    def results(self) -> Path:
+        """Where the sessions' folders go."""
+        found = self.inside(self.table.results, "results")
+        raw = self.folder / RAW
+        if found == raw or raw in found.parents:
+            raise StudyError(f"{self.path}: results = '{self.table.results}' lies in {RAW}, where nothing is written")
+        return found
+
+    @property
+    def cohort_folder(self) -> Path:
+        """Where the tables of the whole study go."""
+        return self.results / "cohort"
+
+    @cached_property
+    def sessions(self) -> tuple[PlannedSession, ...]:
+        """Every session of the file, in its order, with its plan resolved."""
+        animals = {animal.id: animal for animal in self.table.animals}
+        return tuple(self._planned(animals[one.animal], one) for one in self.table.sessions)
+
+    def inside(self, text: str, what: str) -> Path:
+        """A path of the study file, which may not leave the study's folder."""
+        parts = PurePosixPath(text.replace("\\", "/")).parts
+        bad = "\0" in text or text.startswith(("/", "\\", "~")) or ".." in parts or (len(text) > 1 and text[1] == ":")
+        if bad:
+            raise StudyError(
+                f"{self.path}: {what} is '{text}', and a study names only what is in its own folder {self.folder}; "
+                "move or link it there and write the path from there, without .."
+            )
+        return self.folder.joinpath(*parts)
+
+    def _planned(self, animal: StudyAnimal, one: StudySession) -> PlannedSession:
+        id = f"sub-{animal.id}_ses-{one.session}"
+        recording = one.recording
+        if not recording.startswith(VIRTUAL):
+            recording = str(self.inside(recording, f"the recording of {animal.id} {one.session}"))
+        folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / RESULTS
+        return PlannedSession(id, animal, recording, folder, self._plan(animal, one, id), one.exclude)
+
+    def _plan(self, animal: StudyAnimal, one: StudySession, id: str) -> Plan:
+        """The plan with the settings of study, animal and session put in, the later before the earlier."""
+        named = one.plan or self.table.plan
+        plan = Plan.load(named if named in known_plans() else self.inside(named, "plan"))
+        facts: Settings = {"name": id, "individual": animal.id, "subject_id": animal.id}
+        facts |= {key: value for key in ("group", "cage", "sex", "batch") if (value := getattr(animal, key))}
+        facts |= {"session_start_time": one.start_time} if one.start_time else {}
+        table = plan.model_dump(exclude_none=True)
+        for settings in (self.table.set, animal.set, {"session": facts}, one.set):
+            table = merged(table, settings)
+        for section, key in _PATHS:
+            text = table.get(section, {}).get(key) if isinstance(table.get(section), dict) else None
+            if isinstance(text, str) and (self.folder / text).is_file():
+                table[section][key] = str(self.inside(text, f"{section}.{key}"))  # workers run in other folders
+        try:
+            return Plan.from_table(table, f"{self.path}, session {id}")
+        except PlanError as error:
+            raise StudyError(str(error)) from None
+
+
+def merged(table: Settings, settings: Settings) -> Settings:
+    """Nested settings put into others: what both have is taken from `settings`."""
+    out = dict(table)
+    for key, value in settings.items():
+        below = out.get(key)
+        out[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return out
+
+
+def _sentence(error: ValidationError) -> str:
+    """The first complaint, as one sentence that says what to do."""
+    first, *others = error.errors(include_url=False)
+    more = f" (and {len(others)} more)" if others else ""
+    where = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    key = str(first["loc"][-1]) if first["loc"] else ""
+    if first["type"] == "extra_forbidden":
+        return f"{where} is not known here{_nearest(key, first['loc'])}; correct or remove it{more}"
+    if first["type"] == "value_error":
+        return first["msg"].removeprefix("Value error, ") + more
+    said = _SAY.get(key) if first["type"] == "string_pattern_mismatch" else None
+    expected = said or first["msg"].replace("Input should", "should").replace("String should", "should")
+    return f"{where} {expected}, got {_short(first['input'])}; correct it{more}"
+
+
+def _nearest(key: str, where: Sequence[Any]) -> str:
+    models: dict[str, type[BaseModel]] = {"animals": StudyAnimal, "sessions": StudySession}
+    model = models.get(str(where[0]), StudyTable) if len(where) > 1 else StudyTable
+    near = difflib.get_close_matches(key, model.model_fields, 1)
+    return f", did you mean {near[0]}" if near else ""
+
+
+def _short(value: Any) -> str:
+    try:
+        text = json.dumps(value, ensure_ascii=True, default=str)
+    except (ValueError, RecursionError):
+        text = type(value).__name__
+    return text if len(text) <= 80 else text[:77] + "..."

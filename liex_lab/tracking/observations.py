@@ -1,0 +1,142 @@
+"""What the single frames say: for each of them a few hypotheses of the pose, in the arena frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import SE3, so3
+from liex_lab.tracking._joints import place_joints
+
+Array = NDArray[np.float64]
+Small = NDArray[np.float32]
+
+N_HYPOTHESES = 4  # of two things in the frame one way round and the other: hypothesis h ^ 1 is h turned round
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Hypotheses (n, H) of n frames, NaN where there is none; the first is the single frame's own answer.
+
+    times_ns (n,); turn (n, H, 3) rad and place (n, H, 3) mm: T_arena_root, the rotation as its vector; angles (n, H, D)
+    rad about the skeleton's free axes, joint by joint; scale (n, H) of the bones; error_mm (n, H): expected mean joint
+    error; score (n, H): what the metric says of the candidates behind it, mm at home size; residual_mm (n, H): between
+    body and depth. Of the thing that it is a pose of: n_px, centroid_mm (n, H, 3) arena frame and centroid_px
+    (n, H, 2). has_depth (n,): anything was read. Single precision, for a recording may last hours.
+    """
+
+    skeleton: Skeleton
+    times_ns: NDArray[np.int64]
+    turn: Small
+    place: Small
+    angles: Small
+    scale: Small
+    error_mm: Small
+    score: Small
+    residual_mm: Small
+    n_px: NDArray[np.int32]
+    centroid_mm: Small
+    centroid_px: Small
+    has_depth: NDArray[np.bool_]
+
+    @staticmethod
+    def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
+        """Frames in which nothing was found."""
+        n, h, d = len(times_ns), N_HYPOTHESES, int(skeleton.axes[1:].sum())
+
+        def nothing(*shape: int) -> Small:
+            return np.full((n, h, *shape), np.nan, np.float32)
+
+        return Observations(
+            skeleton, np.asarray(times_ns, np.int64), nothing(3), nothing(3), nothing(d), nothing(), nothing(),
+            nothing(), nothing(), np.zeros((n, h), np.int32), nothing(3), nothing(2), np.ones(n, np.bool_),
+        )  # fmt: skip
+
+    def put_pose(self, h: int, pose: Pose) -> None:
+        """Poses (n) in the arena frame as hypothesis h, NaN where there is none."""
+        known = np.isfinite(pose.scale)
+        self.turn[known, h] = so3.log(pose.root.rotation[known])
+        self.place[:, h], self.scale[:, h] = pose.root.translation, pose.scale
+        self.angles[:, h] = pose.angles[:, 1:][:, self.skeleton.axes[1:]]
+
+    @staticmethod
+    def join(parts: Sequence[Observations]) -> Observations:
+        """Those of consecutive frames."""
+        return Observations(parts[0].skeleton, *(np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS))
+
+    def __getitem__(self, frames: slice) -> Observations:
+        return Observations(self.skeleton, *(getattr(self, name)[frames] for name in COLUMNS))
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    @property
+    def seconds(self) -> Array:
+        """(n,) since the first frame."""
+        return np.asarray((self.times_ns - self.times_ns[:1]) * 1e-9)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(n, H) where there is a hypothesis."""
+        return np.isfinite(self.score)
+
+    def pose(self, path: NDArray[np.int64]) -> Pose:
+        """The poses (n) of the hypotheses `path` (n,); NaN where it is negative or there is none."""
+        turn, place, free, scale = (self.along(v, path) for v in (self.turn, self.place, self.angles, self.scale))
+        angles = np.zeros((len(path), self.skeleton.n_joints, 3))
+        angles[:, 1:][:, self.skeleton.axes[1:]] = free
+        return Pose(SE3(so3.exp(turn), place), angles, scale)
+
+    def along(self, values: NDArray[np.generic], path: NDArray[np.int64]) -> Array:
+        """Some of the hypotheses' values (n, H, ...) along a path (n,), NaN where it is negative."""
+        taken = values[np.arange(len(path)), np.maximum(path, 0)].astype(np.float64)
+        taken[path < 0] = np.nan
+        return taken
+
+    def joints(self, joints: Sequence[int]) -> Small:
+        """Positions (n, H, len(joints), 3) mm of some joints in all hypotheses."""
+        out = np.full((*self.score.shape, len(joints), 3), np.nan, np.float32)
+        for start in range(0, len(self), _BLOCK):
+            part = self[start : start + _BLOCK]
+            for h in range(self.score.shape[1]):
+                rows = np.flatnonzero(part.known[:, h])
+                if len(rows):
+                    pose = part.pose(np.full(len(part), h))[rows]
+                    out[start + rows, h] = joints_of(self.skeleton, pose)[:, list(joints)]
+        return out
+
+
+def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
+    """Joint positions (n, J, 3) mm of poses (n); as `Pose.joints`, quicker."""
+    out = np.empty((len(pose.scale), skeleton.n_joints, 3))
+    place_joints(
+        skeleton.parents, skeleton.offsets, skeleton.rest, skeleton.axes.any(axis=1), pose.root.rotation,
+        pose.root.translation, pose.angles, np.asarray(pose.scale, float), out,
+    )  # fmt: skip
+    return out
+
+
+_BLOCK = 4096
+COLUMNS = tuple(field.name for field in fields(Observations) if field.name != "skeleton")
+
+
+def reversed_pose(skeleton: Skeleton, pose: Pose) -> Pose:
+    """Poses (n) that lie where others do, with head and tail exchanged; of one chain of joints.
+
+    The joints are moved along the body's line until it is measured from its other end.
+    """
+    joints = pose.joints(skeleton)
+    up = pose.root.rotation[:, :, 2]
+    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
+    reach = np.concatenate([[0.0], np.cumsum(bones)])
+    turned = np.empty_like(joints)
+    for i, line in enumerate(joints):
+        along = reach[-1] - reach[::-1]
+        for k in range(3):
+            turned[i, :, k] = np.interp(reach, along, line[::-1, k])
+    return Pose.from_joints(skeleton, turned, up)

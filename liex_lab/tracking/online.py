@@ -1,0 +1,63 @@
+"""Tracking while the recording goes on: the same chain and the same smoother over the last seconds, at a fixed lag."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.tracking.chain import NONE, Chain
+from liex_lab.tracking.curve import Subject, to_track
+from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.smoother import MOTION, Motion, smooth
+from liex_lab.tracking.track import Track
+
+_WINDOW = 48  # frames that have a say in the present one
+
+
+class OnlineTracker:
+    """Takes what frames say as they come; gives a row for every one, `lag` frames later.
+
+    Which hypothesis a frame of the past was stays as it was told; what is told can only get better with a longer lag.
+    With lag 0 a row is told at once, from the past alone.
+    """
+
+    def __init__(self, subject: Subject, lag: int = 0, motion: Motion = MOTION) -> None:
+        self._subject, self._lag, self._motion = subject, lag, motion
+        self._chain = Chain(subject.skeleton, subject.length_mm)
+        self._seen: Observations | None = None
+        self._told = 0  # of the window's frames
+        self._path: NDArray[np.int64] = np.zeros(0, np.int64)
+
+    def add(self, seen: Observations) -> Track | None:
+        """The rows that can be told once the next frames are known, None where there are none yet."""
+        rows = []
+        for k in range(len(seen)):
+            self._take(seen[k : k + 1])
+            if len(self._path) - self._told > self._lag:
+                rows.append(self._tell(1))
+        return Track.join(rows) if rows else None
+
+    def close(self) -> Track | None:
+        """The rows that were held back."""
+        left = len(self._path) - self._told
+        return self._tell(left) if left else None
+
+    def _take(self, frame: Observations) -> None:
+        """Move the window on by one frame."""
+        joined = frame if self._seen is None else Observations.join([self._seen, frame])
+        gone = max(0, len(joined) - _WINDOW)
+        self._seen, self._told = joined[gone:], self._told - gone
+        self._path = np.append(self._path[gone:], NONE)
+
+    def _tell(self, n: int) -> Track:
+        """The rows of the n frames after those that were told."""
+        assert self._seen is not None
+        seen, told = self._seen, self._told
+        path = self._chain.path(seen, self._path[:told])
+        self._path[told : told + n] = path[told : told + n]
+        pose, error = seen.pose(path), seen.along(seen.error_mm, path)
+        curve = smooth(self._subject.skeleton, seen.seconds, pose, error, self._subject.length_mm, self._motion)
+        doubt = self._chain.doubt(seen, path)
+        track = to_track(self._subject, seen, path, curve, doubt, ahead=True)
+        self._told += n
+        return track[told : told + n]

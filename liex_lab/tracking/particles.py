@@ -1,0 +1,164 @@
+"""Algorithm 3 of Lie-X to the letter: a particle filter whose base joints wander and whose other joints are regressed.
+
+What the paper leaves open is stated in `Wander` and in `ParticleFilter`. It keeps its row in the tables; the default
+tracker is `curve`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.estimation.cascade import Candidates, ImageSet
+from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.forests.forest import predict
+from liex_lab.geometry import SE3, brownian_path, brownian_steps, so3
+from liex_lab.recordings.crops import Foreground, view_of
+from liex_lab.recordings.frame import DepthFrame
+
+Array = NDArray[np.float64]
+
+_AVERAGING_PASSES = 10
+
+
+@dataclass(frozen=True)
+class Wander:
+    """What the paper leaves open: how far base joints wander, and how the metric weighs; lengths at home size.
+
+    turn_rad and shift_mm: standard deviations of a Brownian step of delta_s, Eq. 6; sigma_mm of Eq. 12.
+    """
+
+    n_particles: int = 200
+    turn_rad: float = 0.15
+    shift_mm: float = 4.0
+    delta_s: float = 1.0 / 30.0
+    sigma_mm: float = 2.0
+
+
+@dataclass
+class _Particles:
+    """Base joints (K) in the camera frame, their bones' scales (K,), and their weights (K,)."""
+
+    base: SE3
+    scale: Array
+    weight: Array
+
+
+class ParticleFilter:
+    """One animal, frame by frame. The first frame in which it is found gives all particles their place.
+
+    Selection, propagation of the base by Eq. 7 and of the other joints by Eq. 10, measurement by the learned metric
+    with Eq. 12 and 13, and Eq. 14, where the average of tangent vectors is taken about itself, that is on the group. In
+    a frame without a foreground particles wander on.
+    """
+
+    def __init__(
+        self, estimator: PoseEstimator, scene: Foreground, size: float, rng: np.random.Generator,
+        how: Wander | None = None,
+    ) -> None:  # fmt: skip
+        self._estimator, self._scene, self._size, self._rng = estimator, scene, size, rng
+        self._how = how or Wander()
+        self._particles: _Particles | None = None
+        self._last_ns = 0
+
+    def step(self, frame: DepthFrame) -> tuple[Pose, float] | None:
+        """The pose () of the next frame in the camera frame and its expected error, mm; None before the animal is
+        found, and where no particle can be measured.
+        """
+        method = self._estimator.model.method
+        depths = frame.depth[None]
+        if self._particles is None:
+            found = self._estimator.estimate(depths, self._scene, self._size)
+            self._last_ns = frame.time_ns
+            return self._begin(found) if found.found[0] else None
+        self._select()
+        self._propagate((frame.time_ns - self._last_ns) * 1e-9)
+        self._last_ns = frame.time_ns
+        crops = self._scene.extract(depths, self._size, camera_view=method.camera_view)
+        if not crops.found[0]:
+            return None
+        looks = self._scene.looks(crops, method.camera_view)
+        view = view_of(looks)
+        T_view_camera = SE3(view.rotation[0], view.translation[0])
+        images = ImageSet(crops.heights, looks, crops.moments)
+        rotations, positions, score = self._measure(images, T_view_camera @ self._particles.base)
+        w = np.exp(-(score**2 - (score**2).min()) / (2.0 * (self._how.sigma_mm * self._unit) ** 2))
+        self._particles.weight = w / w.sum()
+        pose = self._average(rotations, positions).moved(T_view_camera.inverse())
+        self._particles.base = T_view_camera.inverse() @ SE3(rotations[:, 0], positions[:, 0])
+        calibration, mean = self._estimator.model.calibration, float(self._particles.weight @ score)
+        return pose, (calibration.offset + calibration.slope * mean) * self._size
+
+    @property
+    def _unit(self) -> float:
+        return self._estimator.skeleton.relative_size
+
+    def _begin(self, found: Estimates) -> tuple[Pose, float]:
+        k = self._how.n_particles
+        pose = found.chosen.pose
+        base = SE3(np.repeat(pose.root.rotation, k, axis=0), np.repeat(pose.root.translation, k, axis=0))
+        self._particles = _Particles(base, np.repeat(pose.scale, k), np.full(k, 1.0 / k))
+        return Pose(SE3(pose.root.rotation[0], pose.root.translation[0]), pose.angles[0], pose.scale[0]), float(
+            found.chosen.error_mm[0]
+        )
+
+    def _select(self) -> None:
+        """Draw particles from the cumulative weights; all weigh the same afterwards."""
+        assert self._particles is not None
+        p, k = self._particles, self._how.n_particles
+        total = np.cumsum(p.weight)
+        drawn = np.searchsorted(total, self._rng.random(k) * total[-1])
+        self._particles = _Particles(
+            SE3(p.base.rotation[drawn], p.base.translation[drawn]), p.scale[drawn], np.full(k, 1.0 / k)
+        )
+
+    def _propagate(self, dt: float) -> None:
+        """Move every base joint along a Brownian path of dt seconds."""
+        assert self._particles is not None
+        how, p = self._how, self._particles
+        spread = np.array([how.turn_rad] * 3 + [how.shift_mm * self._size * self._unit] * 3)
+        n_steps = max(1, int(np.ceil(dt / how.delta_s - 1e-9)))
+        # the deviations are those of a whole step, so steps are drawn for a unit of time of delta_s
+        steps = brownian_steps(self._rng, np.diag(spread**2), n_steps, len(p.scale))
+        for i in range(len(p.scale)):
+            start = SE3(p.base.rotation[i], p.base.translation[i])
+            end = brownian_path(start, steps[i], 1.0, min(dt / how.delta_s, float(n_steps)))
+            p.base.rotation[i], p.base.translation[i] = end.rotation[0], end.translation[0]
+
+    def _measure(self, images: ImageSet, base: SE3) -> tuple[Array, Array, Array]:
+        """All joints of the particles, regressed from their bases, in the view frame, and the metric's scores (K,)."""
+        assert self._particles is not None
+        cascade, model = self._estimator.model.cascade, self._estimator.model
+        k = len(self._particles.scale)
+        candidates = Candidates.start(
+            cascade.skeleton, np.zeros(k, np.int32), base.rotation, base.translation, self._particles.scale,
+            np.full(k, self._size),
+        )  # fmt: skip
+        for joint, rounds in zip(cascade.skeleton.solved[1:], cascade.forests[1:], strict=True):
+            cascade.place(candidates, joint)
+            for forest in rounds:
+                cascade.apply(candidates, joint, predict(forest, cascade.samples(images, candidates, [joint])))
+        cascade.place_ends(candidates)
+        everything = cascade.samples(images, candidates, list(range(cascade.skeleton.n_joints)))
+        return candidates.rotations, candidates.positions, predict(model.metric, everything)[:, 0].astype(float)
+
+    def _average(self, rotations: Array, positions: Array) -> Pose:
+        """Eq. 14 about the average itself, for the base on SE(3) and for each other joint on its axes."""
+        assert self._particles is not None
+        weight, skeleton = self._particles.weight, self._estimator.skeleton
+        base = SE3(rotations[:, 0], positions[:, 0])
+        best = int(np.argmax(weight))
+        root = SE3(base.rotation[best], base.translation[best])
+        for _ in range(_AVERAGING_PASSES):
+            step = weight @ (root.inverse() @ base).log()
+            root = root @ SE3.exp(step)
+            if np.linalg.norm(step) < 1e-9:
+                break
+        angles = np.zeros((skeleton.n_joints, 3))
+        for joint in skeleton.solved[1:]:
+            home = rotations[:, skeleton.parents[joint]] @ skeleton.rest[joint]
+            angles[joint] = weight @ so3.log(np.swapaxes(home, 1, 2) @ rotations[:, joint])
+        return Pose(root, angles, np.asarray(weight @ self._particles.scale))

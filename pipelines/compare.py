@@ -1,0 +1,111 @@
+"""The job `liex compare`: sessions in, groups compared, tables out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.errors import SessionError
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_WHO = ("group", "cage", "sex", "batch")
+_USUAL = ("distance_m", "mean_speed_mm_s", "mean_abs_yaw_rate_rad_s", "turn_bias", "outer_half_share",
+          "top_third_share", "tail_beat_hz")  # fmt: skip
+
+
+def compare_sessions(
+    places: Sequence[str | Path],
+    out: str | Path,
+    measures: Sequence[str] = (),
+    *,
+    reference: str | None = None,
+    animals: str | Path | None = None,
+    engine: str = "auto",
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Compare the groups of all sessions in the given folders; writes stats, sessions, columns.json and methods.txt.
+
+    places: session folders, or folders with sessions anywhere in them. measures: columns of the summary; () takes the
+    usual ones and every action's share. reference: compare with this group only. animals: a CSV with subject_id and any
+    of group, cage, sex, batch, which overrules what the sessions say. Returns the table's rows and the files.
+    """
+    from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.tables import dictionary, from_pandas, write_table
+
+    if engine not in ENGINES:
+        raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")
+    folders = find_sessions(places)
+    sessions = []
+    for k, folder in enumerate(folders):
+        progress(k, len(folders), "reading sessions")
+        sessions.append(Session.open(folder))
+    table = collect(sessions)
+    if animals is not None:
+        table = _overruled(table, Path(animals))
+    wanted = list(measures) or usual_measures(table)
+    absent = [name for name in wanted if name not in table]
+    if absent:
+        raise SessionError(f"no session's summary has the column '{absent[0]}'; see columns.json in a session's folder")
+    groups = sorted({str(group) for group in table["group"].fillna("")} - {""})
+    if len(groups) < 2 or (reference is not None and reference not in groups):
+        raise SessionError(
+            f"a comparison needs two groups{f', one of them {reference!r}' if reference else ''}, and these "
+            f"{len(table)} sessions have {', '.join(groups) or 'none'}; state session.group, or name a CSV with "
+            "--animals"
+        )
+    stats = compare(table, wanted, reference, engine=engine)
+    target = Path(out)
+    target.mkdir(parents=True, exist_ok=True)
+    write_table(target / "stats.parquet", STATS, [from_pandas(STATS, stats)], {"table": "stats"})
+    stats.to_csv(target / "stats.csv", index=False, lineterminator="\n")
+    table.to_csv(target / "sessions.csv", index=False, lineterminator="\n")
+    entries = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
+    (target / "columns.json").write_text(json.dumps(entries, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (target / "methods.txt").write_text(methods(stats) + "\n", encoding="utf-8")
+    return {"stats": stats, "folder": target}
+
+
+def find_sessions(places: Sequence[str | Path]) -> list[Path]:
+    """Every session in the folders, each once, in order of their paths."""
+    found: set[Path] = set()
+    for place in map(Path, places):
+        if not place.is_dir():
+            raise SessionError(f"{place} is not a folder; name session folders, or folders with sessions in them")
+        inside = [place] if (place / "session.json").is_file() else [p.parent for p in place.rglob("session.json")]
+        if not inside:
+            raise SessionError(f"there is no session in {place}; `liex run` makes them")
+        found |= {folder.resolve() for folder in inside}
+    return sorted(found)
+
+
+def usual_measures(table: pd.DataFrame) -> list[str]:
+    """What is compared when nobody says: the usual ones that have values, and every action's share."""
+    shares = [str(name) for name in table.columns if str(name).removesuffix("_share") + "_count" in table.columns
+              and str(name).endswith("_share")]  # fmt: skip
+    return [name for name in (*_USUAL, *shares) if name in table and table[name].notna().any()]
+
+
+def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """The table with group, cage, sex and batch as a CSV of the animals states them."""
+    import pandas as pd
+
+    try:
+        stated = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        raise SessionError(f"{path} should be a CSV with the column subject_id, but: {error}; correct it") from None
+    if "subject_id" not in stated or not set(stated.columns) & set(_WHO) or stated["subject_id"].duplicated().any():
+        raise SessionError(
+            f"{path} should have a column subject_id, each animal once, and any of {', '.join(_WHO)}; it has "
+            f"{', '.join(map(str, stated.columns))}"
+        )
+    known = stated.set_index("subject_id")
+    unknown = sorted(set(table["subject_id"].astype(str)) - set(known.index))
+    if unknown:
+        raise SessionError(f"{path} does not list the animal '{unknown[0]}' of the sessions; add a row for it")
+    return table.assign(**{name: table["subject_id"].map(known[name]) for name in _WHO if name in known})

@@ -1,0 +1,101 @@
+"""The job `liex live`: skeletons of a recording that goes on, frame by frame, and the whole track when it is over."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from liex_lab.pipelines.build import build_recording, build_tracker
+
+from liex_lab.errors import RecordingError
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.arriving import Arrival, Arriving
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.tracking.track import Track, Tracked
+    from liex_lab.tracking.tracker import FrameTracker
+
+LEARN_FRAMES = 90  # that are waited for: the background, the floor and the animal's size are learned from them
+Viewer = Callable[["FrameTracker", "Arriving"], Any]
+
+
+def open_live(source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0) -> Arriving:
+    """What arrives at a source: a file or folder that is being written, HOST:PORT, or (replay) a recording sent at its
+    own pace.
+    """
+    from liex_lab.recordings.arriving import growing, received, replayed
+
+    partial = plan.with_settings(["recording.accept_truncated=true"])
+    if replay:
+        return replayed(build_recording(source, plan))
+    host, colon, port = source.rpartition(":")
+    if colon and port.isdigit() and not Path(source).exists():
+        return received(host, int(port))
+    return growing(lambda: build_recording(source, partial), patience_s)
+
+
+def follow_live(
+    arriving: Arriving, plan: Plan, *, learn_frames: int = LEARN_FRAMES, viewer: Viewer | None = None,
+    progress: Progress = silent,
+) -> tuple[dict[str, Any], Tracked]:  # fmt: skip
+    """Skeletons as frames come, shown in a viewer; returns latencies and the track of the whole, smoothed.
+
+    Latency: from when a frame was there to when its skeleton was told, of those frames that came when all before them
+    had been told.
+    """
+    from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.online import OnlineTracker
+
+    frames = arriving.frames
+    held = _first(frames, learn_frames)
+    if not held:
+        raise RecordingError("the recording was over before it had a frame")
+    progress(0, None, "learning the background, the floor and the animal's size")
+    tracker = build_tracker(_as_recording(arriving, held), plan)
+    online = OnlineTracker(tracker.subject)
+    view = viewer(tracker, arriving) if viewer else None
+    seen, latency, worked_until = [], [], time.perf_counter()
+    for arrival in _chained(held, frames):
+        waited = arrival.at_s >= worked_until
+        seen.append(tracker.observe([arrival.frame]))
+        row: Track | None = online.add(seen[-1])
+        if view is not None and row is not None:
+            view.show(arrival.frame, row)
+        worked_until = time.perf_counter()
+        if waited:
+            latency.append(worked_until - arrival.at_s)
+        progress(len(seen), None, "following")
+    if view is not None:
+        view.close()
+    tracked = tracker.track(Observations.join(seen))
+    quantiles = np.quantile(latency, [0.5, 0.95]) * 1e3 if latency else [None, None]
+    numbers = {
+        "name": arriving.name, "n_frames": len(seen), "n_live": len(latency), "latency_median_ms": quantiles[0],
+        "latency_p95_ms": quantiles[1], "n_measured": int(tracked.track.observed.sum()),
+        "n_bridged": int(tracked.track.bridged.sum()),
+    }  # fmt: skip
+    return numbers, tracked
+
+
+def _first(frames: Iterator[Arrival], n: int) -> list[Arrival]:
+    """The next n of them, or as many as there are."""
+    return [arrival for _, arrival in zip(range(n), frames, strict=False)]
+
+
+def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival]:
+    yield from held
+    yield from frames
+
+
+def _as_recording(arriving: Arriving, held: list[Arrival]) -> Recording:
+    """The frames that have come, as a recording."""
+    from liex_lab.recordings.recording import Recording
+
+    times = np.array([arrival.frame.time_ns for arrival in held], np.int64)
+    return Recording(name=arriving.name, format="live", camera=arriving.camera, times_ns=times,
+                     read=lambda index: held[index].frame.depth)  # fmt: skip

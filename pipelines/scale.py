@@ -1,0 +1,201 @@
+"""The job `liex evaluate scale`: sessions per hour by workers, memory by length, where the time goes."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from liex_lab.pipelines.build import build_recording
+from liex_lab.pipelines.session import CHUNK
+
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+from liex_lab.study import Study
+
+RunSession = Callable[..., Path]
+_VIRTUAL = "synthetic:walk?seed=5&frames={n}&sensor=primesense"
+_WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
+_N_SIMULATED = 2000  # sessions
+_FPS = 30
+ASSUMPTIONS = (
+    "simulated: every worker has the cores, the memory and the reading and writing speed that one has here; sessions "
+    "take the measured times, drawn with replacement and stretched to an hour of recording; they are handed out one by "
+    "one, and the scheduler spends its measured time on each, one after the other; starting workers is not counted"
+)
+
+
+def evaluate_scale(
+    run: RunSession, n_frames: int = 900, minutes: tuple[float, ...] = (1.0, 10.0), progress: Progress = silent
+) -> dict[str, Any]:
+    """Measure one session's stages, two workers against one, memory by length, and simulate many workers.
+
+    n_frames: of each virtual recording, 640 x 480; minutes: lengths of recording whose memory is measured.
+    """
+    with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
+        folder = Path(scratch)
+        progress(0, 4, "making recordings")
+        recordings = [_recording(folder, k, n_frames) for k in range(2)]
+        progress(1, 4, "measuring the stages of a session")
+        stages = _stages(run, recordings[0], folder)
+        progress(2, 4, "measuring one worker and two")
+        workers = _workers(run, recordings, folder)
+        progress(3, 4, "measuring memory by length")
+        memory = {f"{length:g} min": _memory(length, folder) for length in minutes}
+    hour = [seconds * 3600 * _FPS / n_frames for seconds in workers["seconds_each"]]
+    simulated = simulate(hour, workers["scheduler_s_per_session"])
+    return {
+        **stages, "sessions_per_hour": workers["sessions_per_hour"], "two_workers_over_one": workers["gain"],
+        "memory_mb_by_length": memory, "simulated_sessions_per_hour": simulated, "assumptions": ASSUMPTIONS,
+        "n_frames": n_frames,
+    }  # fmt: skip
+
+
+def _recording(folder: Path, seed: int, n_frames: int) -> Path:
+    """A virtual mouse, written as an MCAP file: reading it costs what reading a recording costs."""
+    from liex_lab.pipelines.convert import convert
+
+    path = folder / "rawdata" / f"walk{seed}.mcap"
+    path.parent.mkdir(exist_ok=True)
+    convert(_VIRTUAL.format(n=n_frames).replace("seed=5", f"seed={5 + seed}"), path)
+    return path
+
+
+def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
+    """One session after a first one has compiled everything: where its time goes, and the bound it is held against."""
+    from liex_lab.sessions import Session
+
+    plan = Plan.load("mouse")
+    run(recording, plan, folder / "warm")
+    session = Session.open(run(recording, plan, folder / "measured"))
+    n = session.metadata["frames"]["n_frames"]
+    spent = session.metadata["timings_s"]
+    bound = _decode_and_write(session, recording, plan, folder / "bound.liex")
+    return {
+        "frames_per_s": n / spent["total"], "frames_per_s_without_preparation": n / (spent["total"] - spent["prepare"]),
+        "ms_per_frame": {
+            name: 1e3 * value / n for name, value in {**bound, **spent}.items() if name != "bound"
+        },
+        "times_decode_and_write": spent["total"] / bound["bound"], "peak_memory_mb": session.metadata["peak_memory_mb"],
+    }  # fmt: skip
+
+
+def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) -> dict[str, float]:
+    """Seconds that reading all frames takes, and reading them and writing both logs: nothing can be quicker."""
+    from liex_lab.sessions.mcap import McapWriter
+    from liex_lab.sessions.provenance import Provenance
+    from liex_lab.sessions.rrd import ReplayWriter
+
+    began = time.perf_counter()
+    with build_recording(recording, plan) as opened:
+        for _ in opened.chunks(CHUNK):
+            pass
+        decode = time.perf_counter() - began
+        from liex_lab.body.skeleton import Skeleton
+        from liex_lab.recordings.rvl import to_millimetres
+
+        place.mkdir()
+        origin = Provenance("bound", Skeleton.load("mouse"), opened.camera, session.T_arena_camera, 1000.0, "0",
+                            n_frames=len(opened))  # fmt: skip
+        replay, messages = ReplayWriter(place / "session.rrd", origin), McapWriter(place / "session.mcap", origin)
+        began = time.perf_counter()
+        for frames in opened.chunks(CHUNK):
+            depth, times = [to_millimetres(frame.depth) for frame in frames], [frame.time_ns for frame in frames]
+            replay.add([frame.index for frame in frames], times, depth)
+            messages.add(times, depth)
+        replay.abandon()
+        messages.abandon()
+    return {"decode": decode, "bound": time.perf_counter() - began}
+
+
+def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str, Any]:
+    """The same sessions on one worker and on two, each with one core, by the wall clock."""
+    from liex_lab.pipelines.cohort import measure_cohort
+    from liex_lab.pipelines.study_state import standings
+
+    table = {
+        "animals": [{"id": path.stem} for path in recordings],
+        "sessions": [{"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
+                     for path in recordings for k in range(2)],
+    }  # fmt: skip
+    wall, each = {}, []
+    for workers in (1, 2):
+        study = Study.from_table({**table, "results": f"derivatives/w{workers}"}, folder / "study.toml")
+        began = time.perf_counter()
+        results = measure_cohort(standings(study), run, workers=workers, threads=1)
+        wall[workers] = time.perf_counter() - began
+        each = [result["seconds"] for result in results] if workers == 1 else each
+    n = len(table["sessions"])
+    return {
+        "sessions_per_hour": {str(workers): 3600 * n / seconds for workers, seconds in wall.items()},
+        "gain": wall[1] / wall[2], "seconds_each": each,
+        "scheduler_s_per_session": max(wall[1] - sum(each), 0.0) / n,
+    }  # fmt: skip
+
+
+def simulate(
+    session_s: list[float], scheduler_s: float, workers: tuple[int, ...] = _WORKERS, seed: int = 0
+) -> dict[str, float]:
+    """Sessions per hour for each number of workers, by going through the handing out of `_N_SIMULATED` sessions.
+
+    session_s: measured times of sessions; scheduler_s: what handing out one of them costs, one after the other.
+    """
+    lengths = np.random.default_rng(seed).choice(session_s, _N_SIMULATED)
+    found = {}
+    for count in workers:
+        free, scheduler = [0.0] * count, 0.0
+        for length in lengths:
+            begins = max(heapq.heappop(free), scheduler)
+            scheduler = begins + scheduler_s
+            heapq.heappush(free, scheduler + float(length))
+        found[str(count)] = 3600 * _N_SIMULATED / max(free)
+    return found
+
+
+_WRITE_LONG = """
+import json, sys
+import numpy as np
+from liex_lab.pipelines.scale import write_long
+print(json.dumps(write_long(float(sys.argv[1]), sys.argv[2])))
+"""
+
+
+def _memory(minutes: float, folder: Path) -> float:
+    """Peak memory, MB, of a process that tracks and writes so many minutes of 30 frames a second."""
+    done = subprocess.run(
+        [sys.executable, "-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return float(json.loads(done.stdout.splitlines()[-1])["peak_memory_mb"])
+
+
+def write_long(minutes: float, out: str) -> dict[str, Any]:
+    """A session of any length from the frames of a short recording, over and over; returns its cost.
+
+    Depth is small, for its size does not matter here: it goes straight to disk. Every frame is seen, tracked and
+    written into every file as in `liex run`.
+    """
+    from liex_lab.pipelines.session import measure_session
+
+    from liex_lab.recordings import open_recording
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions import Session
+
+    with open_recording("synthetic:walk?seed=5&frames=300&sensor=primesense-qvga") as short:
+        depth = [short.frame(row).depth for row in range(len(short))]
+        n, there = int(minutes * 60 * _FPS), [*range(len(depth)), *range(len(depth) - 2, 0, -1)]
+        step = int(1e9 / _FPS)
+        long = Recording(
+            name="long", format="synthetic", camera=short.camera, times_ns=np.arange(n, dtype=np.int64) * step,
+            read=lambda row: depth[there[row % len(there)]],
+        )  # fmt: skip
+        long.take_digest("0" * 64)
+        metadata = Session.open(measure_session(long, Plan.load("mouse"), out)).metadata
+    return {name: metadata[name] for name in ("peak_memory_mb", "frames_per_s")}

@@ -1,0 +1,51 @@
+"""How to ask Slurm for workers: a small TOML file, `pipelines/plans/slurm.toml` to begin from."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from liex_lab.errors import StudyError
+from liex_lab.plan import plans_folder
+
+# one line of a job script each: nothing in the file may begin another line
+Line = Annotated[str, Field(pattern=r"^[^\r\n\x00]*$", max_length=1000)]
+Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:/@+-]+$", max_length=200)]
+
+
+class SlurmTable(BaseModel):
+    """Every setting of the file; the comments in slurm.toml say what each is for."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    jobs: int = Field(8, ge=1, le=10_000)
+    cores_per_job: int = Field(2, ge=1, le=256)
+    memory: Word = "4GB"
+    walltime: Word = "12:00:00"
+    partition: Word | None = None
+    account: Word | None = None
+    interface: Word | None = None
+    shared_folder: Line = "~/.liex_lab"
+    local_folder: Line | None = None
+    log_folder: Line | None = None
+    prologue: list[Line] = []
+    directives: list[Line] = []
+
+    @staticmethod
+    def load(path: str | Path) -> SlurmTable:
+        """The table in a TOML file; 'slurm' is the bundled one."""
+        file = plans_folder() / "slurm.toml" if str(path) == "slurm" else Path(path)
+        if not file.is_file():
+            raise StudyError(f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy")
+        try:
+            table: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+            return SlurmTable.model_validate(table)
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise StudyError(f"{file}: {where}: {first['msg']}; compare it with the bundled slurm.toml") from None

@@ -1,0 +1,175 @@
+"""The job `liex verify`: is a session what it was when it was written, and does its recording give it again?"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.sessions import Session
+
+RunAgain = Callable[..., Path]  # liex_lab.api.run_session
+_NEEDED = (
+    "schema_version", "session_id", "versions", "input.sha256", "plan.seed", "camera.calibration_hash", "animal",
+    "model.sha256", "timings_s.total", "machine", "problems", "files",
+)  # fmt: skip
+_TABLES = (".parquet", ".csv")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at. state: ok; wrong: the session is not what it says; note: worth knowing."""
+
+    state: str
+    sentence: str
+
+
+def verify_session(
+    path: str | Path, run: RunAgain, recording: str | None = None, progress: Progress = silent
+) -> list[Finding]:
+    """Look at everything a session says about itself. recording: it is measured again, which takes as long as then.
+
+    Raises SessionError where there is no session at all.
+    """
+    from liex_lab.sessions import Session
+
+    session = Session.open(path)
+    found = [*_provenance(session), *_files(session), *_logs(session), *_model(session)]
+    return [*found, *_again(session, run, recording, progress)] if recording else found
+
+
+def _provenance(session: Session) -> Iterator[Finding]:
+    """Whether everything is there that is needed to make the session again."""
+    missing = [name for name in _NEEDED if _at(session.metadata, name) in (None, "", {})]
+    if missing:
+        yield Finding("note", f"session.json does not say {', '.join(missing)}; it was written by an older liex_lab")
+    else:
+        yield Finding("ok", "session.json says how the session was made")
+    if Plan.from_toml(session.plan, "plan.toml") != Plan.from_table(session.metadata.get("plan", {}), "session.json"):
+        yield Finding("wrong", "plan.toml is not the plan in session.json")
+
+
+def _files(session: Session) -> Iterator[Finding]:
+    """Every file against its bytes and its hash."""
+    from liex_lab.catalog import sha256
+
+    stated = session.metadata.get("files")
+    if not isinstance(stated, dict):
+        return
+    wrong = []
+    for name, facts in stated.items():
+        file = session.path / Path(name).name
+        if not file.is_file():
+            wrong.append(f"{name} is missing")
+        elif file.stat().st_size != facts.get("bytes") or ("sha256" in facts and sha256(file) != facts["sha256"]):
+            wrong.append(f"{name} was changed")
+    yield from (Finding("wrong", sentence) for sentence in wrong)
+    if not wrong:
+        yield Finding("ok", f"{len(stated)} files are as they were written")
+
+
+def _logs(session: Session) -> Iterator[Finding]:
+    """Whether replay and messages are whole, by their own check sums and lengths."""
+    from liex_lab.sessions.joining import rrd_messages
+
+    try:
+        with (session.path / "session.rrd").open("rb") as file:
+            n = sum(1 for _ in rrd_messages(file, (session.path / "session.rrd").stat().st_size))
+        n_depth = _depth_messages(session)
+    except SessionError as error:
+        yield Finding("wrong", str(error))
+        return
+    wanted = session.metadata.get("frames", {}).get("n_frames")
+    if n_depth != wanted:
+        yield Finding("wrong", f"session.mcap holds {n_depth} depth pictures and the session {wanted} frames")
+    else:
+        yield Finding("ok", f"session.rrd ({n} messages) and session.mcap ({n_depth} pictures) are whole")
+
+
+def _depth_messages(session: Session) -> int:
+    """How many depth pictures the summary of session.mcap lists."""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    try:
+        with (session.path / "session.mcap").open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except (McapError, ValueError, OSError, EOFError):
+        summary = None
+    if summary is None or summary.statistics is None:
+        raise SessionError("session.mcap is damaged; run `liex run` on the recording again")
+    depth = [number for number, channel in summary.channels.items() if channel.topic == "/camera/depth"]
+    return sum(summary.statistics.channel_message_counts.get(number, 0) for number in depth)
+
+
+def _model(session: Session) -> Iterator[Finding]:
+    from liex_lab.catalog import find_model, sha256
+
+    stated = session.metadata.get("model", {})
+    try:
+        same = sha256(find_model(stated.get("name", ""))) == stated.get("sha256")
+    except LiexError as error:
+        yield Finding("note", f"its model is not here: {error}")
+        return
+    if same:
+        yield Finding("ok", "its model is the one that is installed")
+        return
+    yield Finding("note", f"it was made with another model {stated.get('name')} than the one that is installed")
+
+
+def _again(session: Session, run: RunAgain, recording: str, progress: Progress) -> Iterator[Finding]:
+    """Measure the recording once more and compare the tables byte by byte."""
+    from liex_lab.recordings import open_recording
+    from liex_lab.sessions import Session
+
+    plan = Plan.from_toml(session.plan, "plan.toml")
+    with open_recording(recording, fps=plan.recording.fps, topic=plan.recording.topic) as opened:
+        if opened.digest(progress) != _at(session.metadata, "input.sha256"):
+            yield Finding("wrong", f"{recording} is not the recording that the session was made of")
+            return
+    with tempfile.TemporaryDirectory(prefix="liex-verify-") as scratch:
+        plan = Plan.from_table({**plan.model_dump(exclude_none=True), "session": {
+            **plan.session.model_dump(exclude_none=True), "name": session.name}})  # fmt: skip
+        other = Session.open(run(recording, plan, scratch, progress=progress))
+        differing = [path.name for path in _tables(session) if not _same_rows(path, other.path / path.name)]
+    if differing:
+        yield Finding(
+            "wrong", f"measured again, it has other rows in {', '.join(differing)}{_versions(session, other)}"
+        )
+    else:
+        yield Finding("ok", f"measured again, all {len(_tables(session))} tables are the same")
+
+
+def _tables(session: Session) -> list[Path]:
+    return [path for path in sorted(session.path.iterdir()) if path.suffix in _TABLES]
+
+
+def _same_rows(path: Path, other: Path) -> bool:
+    """Whether two tables hold the same numbers; what is said about them, such as versions, may differ."""
+    import pandas as pd
+
+    if not other.is_file():
+        return False
+    if path.read_bytes() == other.read_bytes():
+        return True
+    return path.suffix == ".parquet" and pd.read_parquet(path).equals(pd.read_parquet(other))  # empty equals empty
+
+
+def _versions(session: Session, other: Session) -> str:
+    then, now = session.metadata.get("versions", {}), other.metadata["versions"]
+    changed = [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]
+    return f"; versions changed: {', '.join(changed)}" if changed else ""
+
+
+def _at(document: dict[str, Any], dotted: str) -> Any:
+    value: Any = document
+    for key in dotted.split("."):
+        value = value.get(key) if isinstance(value, dict) else None
+    return value

@@ -1,0 +1,121 @@
+"""The default recogniser learns from labelled tracks, works at other frame rates, and is kept without pickle."""
+
+from __future__ import annotations
+
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from liex_lab.actions.labelled import LabelledTrack, some_rows
+from liex_lab.actions.labels import read_labels, words_of
+from liex_lab.actions.learning import learn, leave_one_animal_out
+from liex_lab.actions.scores import timeline_scores
+from liex_lab.actions.storage import load_action_model, save_action_model
+from liex_lab.actions.suggestions import doubtful_stretches
+from liex_lab.actions.timeline import TimelineModel
+from liex_lab.errors import LiexError, ModelError
+from tests.actions.toy import GO, STAY, going_and_staying
+
+
+@pytest.fixture(scope="module")
+def model() -> TimelineModel:
+    return learn([going_and_staying(seed) for seed in range(3)], seed=1, definitions={GO: "goes", STAY: "stays"})
+
+
+def scores(model: TimelineModel, one: LabelledTrack) -> dict[str, float]:
+    found = model.recognise(one.track).ethogram.words(one.track.times_ns)
+    return timeline_scores([(one, found)], model.words)
+
+
+@pytest.mark.parametrize("rate_hz", [15.0, 30.0, 100.0])
+def test_it_recognises_what_it_learned_at_30_frames_a_second_at_any_rate(model: TimelineModel, rate_hz: float) -> None:
+    found = scores(model, going_and_staying(11, rate_hz))
+    assert found["macro_f1"] > 0.9
+    assert found["segment_f1_50"] > 0.9
+
+
+def test_no_bout_crosses_a_gap_and_every_frame_with_a_pose_has_probabilities(model: TimelineModel) -> None:
+    one = going_and_staying(12)
+    one.track.joints_mm[300:360] = np.nan
+    found = model.recognise(one.track)
+    times = one.track.times_ns
+    for bout in found.ethogram:
+        assert not (bout.start_ns < times[300] and bout.stop_ns > times[310])
+    assert np.isnan(found.probability[330]).all()
+    np.testing.assert_allclose(np.nansum(found.probability, axis=1)[:300], 1.0, atol=1e-5)
+    assert all(0.0 <= bout.score <= 1.0 for bout in found.ethogram)
+
+
+def test_what_a_frame_rate_cannot_resolve_is_told(model: TimelineModel) -> None:
+    assert model.unresolved(np.arange(9) * 10**9 // 120) == {}
+    assert set(model.unresolved(np.arange(9) * 10**9)) == {GO, STAY}
+
+
+def test_a_cut_out_sequence_gets_one_word(model: TimelineModel) -> None:
+    one = going_and_staying(13)
+    start = int(np.flatnonzero(one.words == STAY)[0])
+    assert model.name(some_rows(one.track, slice(start + 2, start + 20))) == STAY
+
+
+def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(model: TimelineModel, tmp_path: Path) -> None:
+    path = save_action_model(model, tmp_path / "own.skops")
+    again = load_action_model(path)
+    one = going_and_staying(14)
+    assert again.recognise(one.track).ethogram == model.recognise(one.track).ethogram
+    assert again.definitions == model.definitions
+    with zipfile.ZipFile(path) as archive:
+        assert not [name for name in archive.namelist() if name.endswith((".pkl", ".pickle"))]
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model", b"PK\x03\x04" + bytes(40)])
+def test_a_file_that_is_no_model_is_one_sentence(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "broken.skops"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match="made by `liex train actions`"):
+        load_action_model(path)
+    with pytest.raises(ModelError, match="no action model"):
+        load_action_model(tmp_path / "absent.skops")
+
+
+def test_each_animal_is_scored_by_a_model_that_has_not_seen_it() -> None:
+    report = leave_one_animal_out([going_and_staying(seed, seconds=25.0) for seed in range(2)])
+    assert set(report["macro_f1_by_animal"]) == {"mouse-0", "mouse-1"}
+    assert report["macro_f1"] > 0.8
+    assert "note" in leave_one_animal_out([going_and_staying(0)])
+
+
+def test_labels_of_one_word_only_are_refused() -> None:
+    one = going_and_staying(1)
+    with pytest.raises(LiexError, match="at least two actions"):
+        learn([LabelledTrack(one.track, np.full(len(one), GO), "m")])
+
+
+def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(model: TimelineModel) -> None:
+    one = going_and_staying(15)
+    rows = doubtful_stretches(model.recognise(one.track), one.track.times_ns, 6, 0.5)
+    assert rows
+    spans = sorted((row["start_s"], row["stop_s"]) for row in rows)
+    assert all(a[1] <= b[0] + 1e-6 for a, b in pairwise(spans))
+
+
+def test_labels_from_a_table_are_placed_on_frames_half_open(tmp_path: Path) -> None:
+    path = tmp_path / "labels.csv"
+    pd.DataFrame({"action": ["dig", "rest"], "start_s": [0.2, 0.5], "stop_s": [0.4, 0.7]}).to_csv(path, index=False)
+    words = words_of(read_labels(path), np.arange(10) * 0.1)
+    assert list(words) == ["", "", "dig", "dig", "", "rest", "rest", "", "", ""]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [("a,b\n1,2\n", "lacks action"), ("action,start_s,stop_s\nx,2,1\n", "starts before it stops"),
+     ("action,start_s,stop_s\nx,one,2\n", "starts before it stops")],
+)  # fmt: skip
+def test_a_table_that_holds_no_bouts_is_one_sentence(text: str, complaint: str, tmp_path: Path) -> None:
+    path = tmp_path / "labels.csv"
+    path.write_text(text)
+    with pytest.raises(LiexError, match=complaint):
+        read_labels(path)

@@ -1,0 +1,251 @@
+"""Transitions against chance, zones, walls, activity, latencies: stories with known answers."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
+from liex_lab.behaviour.activity import activity, intervals, time_within
+from liex_lab.behaviour.measures import measure_bouts
+from liex_lab.behaviour.multiplicity import false_discovery
+from liex_lab.behaviour.places import outer_margin_mm, visits
+from liex_lab.behaviour.transitions import by_chance, count_transitions, transitions
+from liex_lab.recordings.walls import Arena
+from liex_lab.recordings.zones import Zone, zone_names
+from liex_lab.sessions.tables import BOUTS, GAPS, empty_table, to_pandas
+from tests.behaviour.test_kinematics import tables_of
+from tests.sessions.walking_mouse import WalkingMouse, steady, write
+
+NO_GAPS = empty_table(GAPS)
+
+
+def ethogram(words: list[str], length_s: float = 1.0) -> pd.DataFrame:
+    """Bouts of equal length, one after the other."""
+    start = length_s * np.arange(len(words))
+    frames = np.rint(30 * start).astype(int)
+    return to_pandas(BOUTS, {
+        "session_id": "s", "individual": "m", "action": words, "start_s": start, "stop_s": start + length_s,
+        "duration_s": [length_s] * len(words), "start_frame": frames,
+        "stop_frame": frames + round(30 * length_s), "score": [1.0] * len(words), "source": ["human"] * len(words),
+        "model_hash": [""] * len(words),
+    })  # fmt: skip
+
+
+def rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a table as plain dicts."""
+    return [dict(row) for row in table.to_dict("records")]  # type: ignore[arg-type]
+
+
+def chain(n: int, seed: int, weights: dict[str, float]) -> list[str]:
+    """Actions that follow each other by chance: the next is drawn by weight from all but the last."""
+    rng = np.random.default_rng(seed)
+    words, out = list(weights), [next(iter(weights))]
+    while len(out) < n:
+        others = [word for word in words if word != out[-1]]
+        p = np.array([weights[word] for word in others])
+        out.append(others[rng.choice(len(others), p=p / p.sum())])
+    return out
+
+
+def test_a_mouse_that_rears_for_1_2_s_after_2_s():
+    """Of 1.2 s, 0.05 s at each end are below two thirds of the rearing height."""
+    row = measure(*tables_of(WalkingMouse(steady(6.0), rear_s=(2.0, 3.2)))).summary.iloc[0]
+    assert row["rear_count"] == 1
+    assert row["rear_s"] == pytest.approx(1.1, abs=2 / 30)
+    assert row["rear_mean_s"] == row["rear_s"]
+    assert row["rear_latency_s"] == pytest.approx(2.05, abs=1 / 30)
+    assert row["rear_per_min"] == pytest.approx(10.0)
+    assert row["rear_share"] == pytest.approx(row["rear_s"] / 6.0)
+    assert np.isnan(row["pause_latency_s"])
+    assert row["turn_bias"] == pytest.approx(1.0)  # it walks round to its left
+    assert row["mean_abs_yaw_rate_rad_s"] == pytest.approx(200.0 / 150.0, rel=1e-6)
+
+
+def test_the_bout_of_a_rear_tells_its_peak_and_its_turn():
+    bouts = measure(*tables_of(WalkingMouse(steady(6.0), rear_s=(2.0, 3.2)))).bouts
+    rear = bouts[bouts["action"] == "rear"].iloc[0]
+    assert rear["time_to_peak_height_s"] == pytest.approx(0.1, abs=0.07)
+    assert rear["net_turn_rad"] == pytest.approx(200 / 150 * (rear["duration_s"] - 1 / 30), rel=1e-6)
+    assert rear["net_turn_sd_rad"] > 0
+    chord = 2 * 150 * np.sin(rear["net_turn_rad"] / 2)
+    assert rear["displacement_mm"] == pytest.approx(chord, rel=1e-3)
+    walks = bouts[bouts["action"] == "walk"]
+    assert walks["since_last_s"].iloc[1] == pytest.approx(rear["duration_s"])
+    assert np.isnan(walks["since_last_s"].iloc[0])
+
+
+def test_the_time_since_the_last_bout_is_unknown_across_a_gap():
+    moved = measure(*tables_of(WalkingMouse(np.delete(steady(9.0), slice(100, 120))))).kinematics
+    named = ethogram(["walk", "pause", "walk", "pause", "walk"], 1.0)
+    bouts = measure_bouts(named, moved)
+    assert bouts["since_last_s"].iloc[2] == pytest.approx(1.0)
+    assert np.isnan(bouts["since_last_s"].iloc[4])
+
+
+def test_transitions_are_counted_and_a_gap_or_a_long_pause_parts_them():
+    words = ["walk", "rear", "walk", "pause", "walk", "rear"]
+    counts = count_transitions(ethogram(words), ("walk", "rear", "pause"), NO_GAPS, 0.33)
+    np.testing.assert_array_equal(counts, [[0, 2, 1], [1, 0, 0], [1, 0, 0]])
+    gap = to_pandas(GAPS, {
+        "session_id": "s", "individual": "m", "start_s": [1.0], "stop_s": [1.1], "start_frame": [33],
+        "stop_frame": [33], "n_frames_missing": [2], "reason": ["camera_dropped"],
+    })  # fmt: skip
+    late = ethogram(words)
+    late.loc[1, "start_s"] = 1.1
+    assert count_transitions(late, ("walk", "rear", "pause"), gap, 0.33)[0, 1] == 1
+    assert count_transitions(late, ("walk", "rear", "pause"), NO_GAPS, 0.33)[0, 1] == 2
+    apart = ethogram(words).assign(stop_s=lambda table: table["start_s"] + 0.5)
+    assert count_transitions(apart, ("walk", "rear", "pause"), NO_GAPS, 0.33).sum() == 0
+
+
+def test_chance_keeps_how_often_each_action_occurs_and_never_repeats_one():
+    counts = np.array([[0, 30, 10], [25, 0, 20], [15, 15, 0]])
+    chance = by_chance(counts)
+    np.testing.assert_array_equal(np.diag(chance), 0.0)
+    np.testing.assert_allclose(chance.sum(axis=1), 1.0)
+    np.testing.assert_allclose((chance * counts.sum(axis=1)[:, None]).sum(axis=0), counts.sum(axis=0), rtol=1e-6)
+
+
+def test_what_follows_by_chance_is_rarely_called_significant_and_a_habit_is():
+    words = ("rear", "run", "walk", "pause")
+    weights = {"rear": 1.0, "run": 1.0, "walk": 3.0, "pause": 2.0}
+    p = [transitions(ethogram(chain(300, seed, weights)), words, NO_GAPS, 0.33)["p"] for seed in range(60)]
+    assert np.mean(np.concatenate(p) < 0.05) <= 0.06
+    habit = []
+    for word in chain(300, 7, weights):
+        habit += [word] if word != "rear" else ["rear", "run"]
+    table = transitions(ethogram(habit), words, NO_GAPS, 0.33)
+    (pair,) = (row for row in rows_of(table) if (row["from_action"], row["to_action"]) == ("rear", "run"))
+    assert pair["p_fdr"] < 1e-3
+    assert pair["probability"] > 0.9 > 2 * pair["by_chance"]
+
+
+def test_two_actions_leave_no_choice_and_no_test():
+    table = transitions(ethogram(["walk", "rear"] * 20), ("walk", "rear"), NO_GAPS, 0.33)
+    assert table["p"].isna().all()
+    assert list(table["n"]) == [20, 19]
+
+
+def test_false_discovery_agrees_with_the_rule_as_it_is_printed():
+    rng = np.random.default_rng(2)
+    p = rng.random(30) ** 2
+    order = np.sort(p)
+    for value, corrected in zip(p, false_discovery(p), strict=True):
+        least = min(1.0, min(order[k] * 30 / (k + 1) for k in range(30) if order[k] >= value))
+        assert corrected == pytest.approx(least)
+    np.testing.assert_allclose(false_discovery([0.01, np.nan, 0.04]), [0.02, np.nan, 0.04])
+
+
+def test_a_mouse_on_a_circle_visits_a_zone_once_a_round():
+    """On a circle of 150 mm at 200 mm/s it is right of x = 75 mm for a third of each round of 4.71 s."""
+    mouse = WalkingMouse(steady(20.0))
+    frames, poses = tables_of(mouse)
+    right = Zone("right", polygon_mm=((75.0, -400.0), (400.0, -400.0), (400.0, 400.0), (75.0, 400.0)))
+    far = Zone("far", circle_mm=(900.0, 0.0, 10.0))
+    moved = measure(frames, poses).kinematics
+    frames["zone"] = zone_names([right, far], moved[["x_mm", "y_mm"]].to_numpy())
+    behaviour = measure(frames, poses, around=Surroundings(zones=("right", "far")))
+    right_zone, far_zone = rows_of(behaviour.zones)
+    assert right_zone["n_visits"] == 5  # it begins inside; 20 s are 4.2 rounds
+    assert right_zone["latency_s"] == 0.0
+    round_s = 2 * np.pi * 150 / 200
+    assert right_zone["time_s"] == pytest.approx(4 * round_s / 3 + round_s / 6, abs=0.2)
+    assert right_zone["distance_mm"] == pytest.approx(200 * right_zone["time_s"], rel=1e-3)
+    assert (far_zone["n_visits"], far_zone["time_s"]) == (0, 0.0)
+    assert np.isnan(far_zone["latency_s"])
+    assert behaviour.summary["zone_right_s"].iloc[0] == right_zone["time_s"]
+
+
+def test_a_border_that_is_crossed_by_jitter_is_one_visit():
+    frames, poses = tables_of(WalkingMouse(steady(4.0)))
+    inside = np.zeros(120, bool)
+    inside[30:80] = True
+    inside[[40, 55]] = False  # a frame outside
+    inside[100] = True  # and one inside
+    frames["zone"] = np.where(inside, "nest", "")
+    behaviour = measure(frames, poses)
+    found = visits(frames, behaviour.kinematics, ["nest"], behaviour.rules).iloc[0]
+    assert found["n_visits"] == 1
+    assert found["mean_visit_s"] == pytest.approx(50 / 30)
+    assert found["time_s"] == pytest.approx(49 / 30)
+
+
+@pytest.mark.parametrize(
+    "arena", [Arena("round", (0.0, 0.0), 200.0), Arena("rectangular", (0.0, 0.0), None, (250.0, 120.0), 0.0)]
+)
+def test_the_outer_half_is_half_of_the_floor(arena):
+    rng = np.random.default_rng(1)
+    wall = arena.wall_distance_mm(rng.uniform(-260, 260, (200_000, 2)))
+    wall = wall[wall > 0]
+    assert np.mean(wall < outer_margin_mm(arena)) == pytest.approx(0.5, abs=0.006)
+
+
+def test_a_mouse_along_the_wall_is_in_the_outer_half():
+    frames, poses = tables_of(WalkingMouse(steady(5.0), radius_mm=150.0))
+    bowl = Arena("round", (0.0, 0.0), 180.0)
+    frames["wall_distance_mm"] = 30.0
+    row = measure(frames, poses, around=Surroundings(bowl)).summary.iloc[0]
+    assert (row["wall_distance_mm"], row["outer_half_share"]) == (30.0, 1.0)
+    assert np.isnan(measure(frames, poses).summary["outer_half_share"].iloc[0])
+
+
+def test_activity_adds_up_to_the_session():
+    frames, poses = tables_of(WalkingMouse(steady(30.0), rear_s=(5.0, 8.0), lost=tuple(range(300, 360))))
+    behaviour = measure(frames, poses)
+    table, row = behaviour.activity, behaviour.summary.iloc[0]
+    assert len(table) == 10
+    assert table["observed_s"].sum() == pytest.approx(row["observed_s"])
+    assert table["distance_mm"].sum() == pytest.approx(1000 * row["distance_m"])
+    for word in ACTIONS:
+        assert table[f"{word}_s"].sum() == pytest.approx(row[f"{word}_s"])
+    assert table["rear_s"].iloc[1] == pytest.approx(0.95, abs=0.05)
+    assert table["rear_s"].iloc[2] == pytest.approx(1.95, abs=0.05)
+
+
+def test_long_sessions_are_cut_into_minutes():
+    edges = intervals(3600.5)
+    assert len(edges) == 62
+    np.testing.assert_allclose(np.diff(edges)[:-1], 60.0)
+    assert edges[-1] == 3600.5
+
+
+def test_time_within_agrees_with_the_loop_a_reader_would_write():
+    rng = np.random.default_rng(4)
+    at = np.sort(rng.uniform(0, 100, 40)).reshape(-1, 2)
+    edges = np.linspace(0, 100, 8)
+    slow = [sum(max(0.0, min(b, hi) - max(a, lo)) for a, b in at) for lo, hi in pairwise(edges)]
+    np.testing.assert_allclose(time_within(at[:, 0], at[:, 1], edges), slow)
+
+
+def test_activity_has_a_row_for_every_interval_of_an_animal_never_seen():
+    frames, poses = tables_of(WalkingMouse(steady(2.0), lost=tuple(range(60))))
+    table = activity(measure(frames, poses).kinematics, empty_table(BOUTS), ("walk",))
+    assert (table["observed_s"] == 0).all()
+    assert table["mean_speed_mm_s"].isna().all()
+
+
+@pytest.mark.slow
+def test_an_hour_is_measured_in_a_few_seconds():
+    frames, poses = tables_of(WalkingMouse(steady(3600.0), rear_s=(1000.0, 1500.0), speed_mm_s=90.0))
+    began = time.process_time()
+    behaviour = measure(frames, poses)
+    assert time.process_time() - began < 20.0
+    assert len(behaviour.kinematics) == 108_000
+    assert behaviour.activity["distance_mm"].sum() == pytest.approx(324_000, rel=1e-3)
+
+
+def test_the_tables_can_be_made_again_from_the_session_s_folder_alone(tmp_path):
+    nest = Zone("nest", polygon_mm=((0.0, 0.0), (200.0, 0.0), (200.0, 200.0), (0.0, 200.0)))
+    mouse = WalkingMouse(steady(5.0), rear_s=(1.0, 2.2), lost=(90, 91))
+    session = write(tmp_path / "c.liex", mouse, arena=Arena("round", (0.0, 0.0), 250.0), zones=(nest,))
+    again = measure_session(session)
+    for name, table in again.tables.items():
+        stored = session.summary if name == "summary" else session.table(name)
+        pd.testing.assert_frame_equal(table, stored, check_dtype=False)
+    assert set(again.tables) == {"kinematics", "bouts", "summary", "transitions", "activity", "zones"}

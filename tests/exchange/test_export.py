@@ -1,0 +1,188 @@
+"""Each format holds the session's own numbers, times and actions, and bad wishes are told in a sentence."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from importlib import import_module
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import xarray
+from nwbinspector import Importance, inspect_nwbfile
+from pynwb import NWBHDF5IO
+from typer.testing import CliRunner
+
+from liex_lab import cli
+from liex_lab.errors import SessionError
+from liex_lab.exchange import TARGETS, export
+from liex_lab.exchange.export import _EXTRA
+from liex_lab.exchange.movement import to_movement
+from liex_lab.exchange.poses import Poses
+from liex_lab.sessions import Session
+from tests.sessions.walking_mouse import WalkingMouse, steady, write
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("out")
+
+
+@pytest.fixture(scope="module")
+def nwb(session: Session, out: Path) -> Path:
+    return export(session, "nwb", out)
+
+
+def test_every_table_comes_back_from_csv_as_it_was(session, out):
+    folder = export(session, "csv", out)
+    tables = sorted(path.stem for path in folder.glob("*.csv"))
+    assert tables == sorted([*(path.stem for path in session.path.glob("*.parquet")), "summary"])
+    for name in ("frames", "poses", "kinematics", "bouts"):
+        again = pd.read_csv(folder / f"{name}.csv", keep_default_na=True)
+        stored = session.table(name)
+        numbers = stored.select_dtypes("number").columns
+        np.testing.assert_array_equal(again[numbers].to_numpy(float), stored[numbers].to_numpy(float))
+    described = {(entry["table"], entry["name"]) for entry in json.loads((folder / "columns.json").read_text())}
+    assert ("bouts", "path_mm") in described
+
+
+def test_deeplabcut_s_tables_have_its_header_and_a_row_for_every_frame(session, out):
+    folder = export(session, "dlc", out)
+    lines = (folder / "poses_3d.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in lines[:3]] == ["scorer", "bodyparts", "coords"]
+    solid = pd.read_csv(folder / "poses_3d.csv", header=[0, 1, 2], index_col=0)
+    flat = pd.read_csv(folder / "poses_2d.csv", header=[0, 1, 2], index_col=0)
+    poses = Poses.of(session)
+    np.testing.assert_array_equal(solid["liex_lab"]["nose"].to_numpy(), poses.xyz_mm[:, -1])
+    np.testing.assert_array_equal(flat["liex_lab"]["nose"][["x", "y"]].to_numpy(), poses.uv_px[:, -1])
+    assert list(flat["liex_lab"]["nose"].columns) == ["x", "y", "likelihood"]
+    assert solid["liex_lab"]["rump"].iloc[20].isna().all()
+    times = pd.read_csv(folder / "times.csv")
+    np.testing.assert_allclose(times["time_s"], session.frames["time_s"], atol=1e-9)
+    assert len(solid) == len(flat) == len(times) == 116
+
+
+def test_movement_s_data_set_has_the_true_times_and_the_actions(session, out):
+    data = xarray.load_dataset(export(session, "movement", out), engine="h5netcdf")
+    xarray.testing.assert_equal(data, to_movement(session))
+    np.testing.assert_array_equal(data["time"], session.frames["time_s"])
+    assert data["position"].dims == ("time", "space", "keypoints", "individuals")
+    nose = data["position"].sel(keypoints="nose", individuals="mouse_1", space="z")
+    np.testing.assert_array_equal(nose, session.poses.query("joint == 'nose'")["z_mm"])
+    assert data.attrs["ds_type"] == "poses"
+    rear = session.bouts[session.bouts["action"] == "rear"].iloc[0]
+    inside = (data["time"] >= rear["start_s"]) & (data["time"] < rear["stop_s"])
+    np.testing.assert_array_equal((data["action"][:, 0] == "rear").to_numpy(), inside.to_numpy())
+
+
+def test_sleap_s_arrays_have_its_shapes(session, out):
+    path = export(session, "sleap", out)
+    poses = Poses.of(session)
+    with h5py.File(path) as file:
+        assert file["tracks"].shape == (1, 2, 5, 116)
+        np.testing.assert_array_equal(file["tracks"][0].transpose(2, 1, 0), poses.uv_px)
+        assert list(file["node_names"].asstr()) == list(poses.joints)
+        assert file["track_occupancy"][:, 0].sum() == 114
+        assert file["edge_names"].asstr()[0].tolist() == ["rump", "loin"]
+        np.testing.assert_array_equal(file["time_s"], session.frames["time_s"])
+
+
+def test_boris_gets_two_rows_for_every_bout(session, out):
+    project = json.loads(export(session, "boris", out).read_text(encoding="utf-8"))
+    (observation,) = project["observations"].values()
+    codes = {entry["code"] for entry in project["behaviors_conf"].values()}
+    events = observation["events"]
+    assert len(events) == 2 * len(session.bouts)
+    assert [event[0] for event in events] == sorted(event[0] for event in events)
+    open_bouts: dict[str, float] = {}
+    found = []
+    for time, subject, code, _, _, _ in events:
+        assert code in codes
+        assert subject in {entry["name"] for entry in project["subjects_conf"].values()}
+        if code in open_bouts:
+            found.append((open_bouts.pop(code), time, code))
+        else:
+            open_bouts[code] = time
+    assert not open_bouts
+    stored = session.bouts[["start_s", "stop_s", "action"]].to_numpy().tolist()
+    for one, other in zip(sorted(found), stored, strict=True):
+        assert one[:2] == pytest.approx(other[:2], abs=1e-6)
+        assert one[2] == other[2]
+    media = observation["file"]["1"][0]
+    assert set(observation["media_info"]["length"]) == {media}
+    assert project["project_format_version"] == "7.0"
+
+
+def test_pynwb_reads_poses_times_rotations_and_actions(session, nwb):
+    poses = Poses.of(session)
+    with NWBHDF5IO(nwb, "r") as file:
+        read = file.read()
+        module = read.processing["behavior"]
+        estimate = module["PoseEstimation"]
+        assert list(estimate.skeleton.nodes[:]) == list(poses.joints)
+        for k, joint in enumerate(poses.joints):
+            series = estimate.pose_estimation_series[joint]
+            np.testing.assert_array_equal(series.data[:], poses.xyz_mm[:, k].astype(np.float32))
+            np.testing.assert_array_equal(series.timestamps[:], poses.time_s)
+            assert series.unit == "millimeters"
+        assert module["rotation_root"].data.shape == (116, 3)
+        actions = read.intervals["actions"].to_dataframe()
+        np.testing.assert_array_equal(actions["start_time"], session.bouts["start_s"])
+        np.testing.assert_array_equal(actions["stop_time"], session.bouts["stop_s"])
+        assert list(actions["label"]) == list(session.bouts["action"])
+        assert read.session_start_time == datetime.fromisoformat("2026-08-21T10:00:00+02:00")
+        assert (read.subject.subject_id, read.subject.species, read.subject.sex) == ("m01", "Mus musculus", "F")
+
+
+def test_nwbinspector_finds_nothing_that_would_be_refused(nwb):
+    light = Importance.BEST_PRACTICE_SUGGESTION.value
+    grave = [message for message in inspect_nwbfile(nwbfile_path=nwb) if message.importance.value > light]
+    # the animal's age is not ours to know; the archive for which it matters asks for it on upload
+    assert [message.check_function_name for message in grave if "age" not in message.check_function_name] == []
+
+
+def test_nwb_is_refused_without_a_beginning(tmp_path):
+    session = write(tmp_path / "c.liex", WalkingMouse(steady(0.5)))
+    with pytest.raises(SessionError, match="session_start_time=2026"):
+        export(session, "nwb", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["c.liex"]  # nothing half-written
+
+
+def test_a_wish_that_cannot_be_met_is_told(session, tmp_path):
+    with pytest.raises(SessionError, match="did you mean 'boris'"):
+        export(session, "borris", tmp_path)
+    path = export(session, "boris", tmp_path)
+    with pytest.raises(SessionError, match="exists already"):
+        export(session, "boris", tmp_path)
+    assert export(session, "boris", tmp_path, overwrite=True) == path
+    with pytest.raises(SessionError, match="is a file"):
+        export(session, "csv", path)
+
+
+def test_missing_packages_are_named(session, tmp_path, monkeypatch):
+    def missing(*_):
+        raise ModuleNotFoundError("No module named 'pynwb'", name="pynwb")
+
+    monkeypatch.setattr(import_module("liex_lab.exchange.nwb"), "write", missing)
+    with pytest.raises(SessionError, match="pynwb is missing") as told:
+        export(session, "nwb", tmp_path)
+    assert _EXTRA in str(told.value)
+
+
+def test_the_verb_writes_beside_the_session_or_where_it_is_told(session, tmp_path):
+    ran = CliRunner().invoke(cli.app, ["export", str(session.path), "--to", "csv", "--out", str(tmp_path)])
+    assert ran.exit_code == 0, ran.output
+    assert (tmp_path / "circle_csv" / "poses.csv").is_file()
+    assert set(TARGETS) == {"nwb", "boris", "dlc", "movement", "sleap", "csv"}
+
+
+def test_a_session_without_any_pose_can_be_exported(tmp_path):
+    session = write(
+        tmp_path / "lost.liex", WalkingMouse(steady(0.5), lost=tuple(range(15))),
+        session_start_time="2026-08-21T10:00:00+02:00",
+    )  # fmt: skip
+    for target in TARGETS:
+        assert export(session, target, tmp_path).exists()

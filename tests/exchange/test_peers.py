@@ -1,0 +1,44 @@
+"""movement's and SLEAP's own readers open what we write; collected where both are installed."""
+
+from __future__ import annotations
+
+import numpy as np
+import sleap_io
+import xarray
+from movement.io import load_poses
+from movement.validators.datasets import ValidPosesInputs
+
+from liex_lab.exchange import export
+from liex_lab.exchange.poses import Poses
+
+
+def test_movement_takes_the_netcdf_for_its_own(session, tmp_path):
+    data = xarray.load_dataset(export(session, "movement", tmp_path), engine="h5netcdf")
+    ValidPosesInputs.validate(data)
+    import movement.kinematics as kin
+
+    speed = kin.compute_speed(data["position"])
+    assert speed.sel(keypoints="rump").notnull().sum() > 100
+
+
+def test_movement_reads_our_deeplabcut_sleap_and_nwb_files(session, tmp_path):
+    poses = Poses.of(session)
+    dlc = load_poses.from_dlc_file(export(session, "dlc", tmp_path) / "poses_2d.csv")
+    np.testing.assert_allclose(dlc["position"][..., 0].transpose("time", "keypoints", "space"), poses.uv_px, rtol=1e-6)
+    sleap = load_poses.from_sleap_file(export(session, "sleap", tmp_path))
+    np.testing.assert_allclose(
+        sleap["position"][..., 0].transpose("time", "keypoints", "space"), poses.uv_px, rtol=1e-6
+    )
+    nwb = load_poses.from_nwb_file(export(session, "nwb", tmp_path))
+    np.testing.assert_allclose(
+        nwb["position"].sel(keypoints=list(poses.joints))[..., 0].transpose("time", "keypoints", "space"),
+        poses.xyz_mm, rtol=1e-6,
+    )  # fmt: skip
+
+
+def test_sleap_io_reads_the_analysis_file(session, tmp_path):
+    poses = Poses.of(session)
+    labels = sleap_io.load_file(str(export(session, "sleap", tmp_path)))
+    assert [node.name for node in labels.skeletons[0].nodes] == list(poses.joints)
+    assert len(labels.skeletons[0].edges) == len(poses.bones)
+    np.testing.assert_allclose(labels.numpy()[:, 0], poses.uv_px, rtol=1e-6)

@@ -1,0 +1,58 @@
+"""A run that takes no time: it writes what the study looks at, or breaks in the way the recording's name asks for."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+from liex_lab.errors import EstimationError, RecordingError
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress
+from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
+
+N_FRAMES = 40
+
+
+def pretended_run(
+    recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], progress: Progress
+) -> Path:
+    """Stands in for `run_session`."""
+    from liex_lab.catalog import find_model, sha256
+    from liex_lab.recordings.recording import file_digest
+
+    name = Path(recording).stem
+    marks = Path(recording).parents[1] / f"{name}.runs"
+    with marks.open("a") as file:
+        file.write("x")
+    progress(0, None, "learning the background")
+    if name.startswith("empty"):
+        raise EstimationError("no animal was found in the sampled frames; check the depth unit and the plan")
+    for done in (16, 32, N_FRAMES):
+        progress(done, N_FRAMES, "measuring poses")
+        if name.startswith("torn") and done == 32:
+            raise RecordingError("frame 33 cannot be read; copy the recording again")
+        if name.startswith("full") and done == 32:
+            raise OSError(errno.ENOSPC, "No space left on device", "/data/x")
+        if name.startswith("fault") and done == 16:
+            raise ZeroDivisionError("a slip of ours")
+        if name.startswith("deadly") or (name.startswith("unlucky") and marks.stat().st_size == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if name.startswith("slow"):
+            time.sleep(30)
+    (folder / "failed.json").unlink(missing_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {
+        "schema_version": SCHEMA_VERSION, "session_id": plan.session.name, "versions": versions(),
+        "plan": plan.model_dump(exclude_none=True),
+        "model": {"sha256": sha256(find_model(plan.estimation.model))},
+        "input": {"sha256": file_digest([Path(recording)]), **notes["input"]}, "run_id": notes["run_id"],
+        "frames": {"n_frames": N_FRAMES, "n_observed": 39, "observed_s": 1.3}, "frames_per_s": 100.0,
+        "peak_memory_mb": 500.0, "threads": os.environ.get("NUMBA_NUM_THREADS"),
+    }  # fmt: skip
+    (folder / "session.json").write_text(json.dumps(document))
+    return folder

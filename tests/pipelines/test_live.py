@@ -1,0 +1,82 @@
+"""Frames that are still to come: through a socket, and out of a folder that grows."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.live import follow_live, open_live
+
+from liex_lab.errors import RecordingError
+from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.arriving import growing, received, replayed
+from liex_lab.recordings.recording import Recording
+
+ADDRESS = "synthetic:walk?seed=3&frames=24&sensor=primesense-qvga&spine_mm=70"
+PLAN = Plan.load("mouse").with_settings(["animal.spine_mm=70"])
+
+
+def test_a_replay_sends_every_frame_as_it_is_and_not_before_its_time():
+    recording = open_recording(ADDRESS)
+    arriving = replayed(recording, speed=8.0)
+    assert (arriving.name, arriving.camera) == (recording.name, recording.camera)
+    came = list(arriving.frames)
+    assert [arrival.frame.time_ns for arrival in came] == recording.times_ns.tolist()
+    np.testing.assert_array_equal(came[7].frame.depth, recording.frame(7).depth)
+    assert came[-1].at_s - came[0].at_s > 0.8 * (recording.times_ns[-1] - recording.times_ns[0]) * 1e-9 / 8.0
+
+
+def test_skeletons_are_told_as_frames_come_and_the_whole_track_at_the_end():
+    shown: list[tuple[int, bool]] = []
+    closed = []
+
+    class View:
+        def show(self, frame, row):
+            shown.append((frame.index, bool(row.posed[0])))
+
+        def close(self):
+            closed.append(True)
+
+    arriving = open_live(ADDRESS, PLAN, replay=True)
+    numbers, tracked = follow_live(arriving, PLAN, learn_frames=16, viewer=lambda *_: View())
+    assert closed == [True]
+    assert [index for index, _ in shown] == list(range(24))
+    assert sum(posed for _, posed in shown) >= 22
+    assert tracked.track.n_frames == numbers["n_frames"] == 24
+    assert numbers["n_measured"] >= 22
+    assert 0 <= numbers["n_live"] <= 24
+
+
+def test_a_recording_that_grows_is_read_as_it_grows_and_over_when_nothing_comes():
+    whole = open_recording(ADDRESS)
+    there = [3]
+
+    def reopen() -> Recording:
+        n = there[0]
+        return Recording(name="growing", format="test", camera=whole.camera, times_ns=whole.times_ns[:n],
+                         read=lambda index: whole.frame(index).depth)  # fmt: skip
+
+    def write() -> None:
+        for n in (5, 9, 12):
+            time.sleep(0.1)
+            there[0] = n
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    came = [arrival.frame.index for arrival in growing(reopen, patience_s=1.5).frames]
+    thread.join()
+    assert came == list(range(12))
+
+
+def test_where_nobody_sends_or_writes_that_is_said():
+    with pytest.raises(RecordingError, match="nobody sends frames"):
+        received("127.0.0.1", 9)
+
+    def nothing() -> Recording:
+        raise RecordingError("there is no such file")
+
+    with pytest.raises(RecordingError, match="no such file"):
+        growing(nothing, patience_s=0.1)

@@ -1,0 +1,223 @@
+"""Killed at any moment, a session goes on where it was, and its tables are those of an undisturbed run."""
+
+from __future__ import annotations
+
+import errno
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from liex_lab.errors import SessionError
+from liex_lab.sessions import Session, checkpoint, rrd
+from liex_lab.sessions.checkpoint import Checkpoint, Columns
+from liex_lab.sessions.joining import rrd_messages
+from tests.sessions.interrupted import CHUNK, MOUSE, start, write_session
+from tests.sessions.test_rrd import columns_of
+
+N_KILLS = 8  # tests/campaign.py does many more
+
+
+def tables_of(folder: Path) -> dict[str, bytes]:
+    """Everything that has to be equal."""
+    kinds = {".parquet", ".csv", ".toml"}
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in kinds}
+
+
+def depth_messages(folder: Path) -> list[tuple[int, bytes]]:
+    with (folder / "session.mcap").open("rb") as file:
+        return [(m.log_time, m.data) for _, _, m in make_reader(file).iter_messages(topics=["/camera/depth"])]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("whole") / "circle.liex"
+    write_session(str(place), every_s=1000.0)
+    return place
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
+    """A session whose process was killed again and again, and how far it was each time."""
+    place = tmp_path_factory.mktemp("killed") / "circle.liex"
+    rng, reached = np.random.default_rng(8), []
+    for _ in range(N_KILLS):
+        process = start(place, pause_s=0.1)
+        part, before = place.with_name("circle.liex.part"), reached[-1] if reached else 0
+        deadline = time.monotonic() + 60
+        while _frames_in(part) <= before and process.is_alive() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0.0, 0.15)))
+        process.kill()
+        process.join()
+        assert not place.exists() or process.exitcode == 0
+        reached.append(_frames_in(part))
+    process = start(place)
+    process.join()
+    assert process.exitcode == 0
+    return place, reached
+
+
+def _frames_in(part: Path) -> int:
+    try:
+        return int(json.loads((part / "checkpoint.json").read_text())["n_frames"])
+    except OSError:
+        return 0
+
+
+def test_a_killed_session_goes_on_where_it_was(disturbed: tuple[Path, list[int]]) -> None:
+    place, reached = disturbed
+    assert reached[0] > 0
+    assert reached == sorted(reached)
+    assert Session.open(place).metadata["interruptions"] >= 5
+    assert [entry.name for entry in place.parent.iterdir()] == ["circle.liex"]
+
+
+def test_its_files_are_those_of_an_undisturbed_one(disturbed: tuple[Path, list[int]], undisturbed: Path) -> None:
+    place, _ = disturbed
+    assert tables_of(place) == tables_of(undisturbed)
+    assert {path.name for path in place.iterdir()} == {path.name for path in undisturbed.iterdir()}
+    for picture in (undisturbed / "thumbnails").iterdir():
+        assert (place / "thumbnails" / picture.name).read_bytes() == picture.read_bytes()
+
+
+def test_its_logs_are_whole_and_hold_every_frame_once(disturbed: tuple[Path, list[int]], undisturbed: Path) -> None:
+    place, _ = disturbed
+    assert depth_messages(place) == depth_messages(undisturbed)
+    with (place / "session.mcap").open("rb") as file:
+        summary = make_reader(file, validate_crcs=True).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        n_messages = sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages())
+    assert summary.statistics.message_count == n_messages
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # what was joined is read as a whole
+def test_its_replay_holds_the_rows_of_an_undisturbed_one(disturbed: tuple[Path, list[int]], undisturbed: Path) -> None:
+    for entity in (rrd.DEPTH, f"{rrd.SKELETON}/joints", rrd.ACTIONS):
+        rows = [columns_of(Session.open(place), entity) for place in (disturbed[0], undisturbed)]
+        assert rows[0]["frame"] == rows[1]["frame"], entity
+        for name in rows[1]:
+            if name != "rerun.controls.RowId":
+                assert repr(rows[0][name]) == repr(rows[1][name]), (entity, name)
+
+
+def test_two_processes_do_not_write_one_session(tmp_path: Path) -> None:
+    place = tmp_path / "circle.liex"
+    with Session.create(place, MOUSE.provenance()) as writer:
+        with pytest.raises(SessionError, match="another process is writing the session"):
+            Session.create(place, MOUSE.provenance())
+        writer.add(*next(MOUSE.chunks(10)))
+        writer.close()
+    assert len(Session.open(place).frames) == 10
+
+
+def broken_at(place: Path, monkeypatch: pytest.MonkeyPatch, n: int, error: Exception) -> None:
+    """Write until a log breaks at its n-th batch."""
+    from liex_lab.sessions.mcap import McapWriter
+
+    add, calls = McapWriter.add, []
+
+    def breaks(self: McapWriter, *batch: object) -> None:
+        calls.append(1)
+        if len(calls) == n:
+            raise error
+        add(self, *batch)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(McapWriter, "add", breaks)
+    with pytest.raises(type(error)):
+        write_session(str(place))
+    monkeypatch.undo()
+
+
+def test_a_full_disk_is_told_and_after_making_room_the_work_goes_on(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "circle.liex"
+    broken_at(place, monkeypatch, 6, OSError(errno.ENOSPC, "No space left on device"))
+    assert not place.exists()
+    assert _frames_in(tmp_path / "circle.liex.part") == 5 * CHUNK
+    write_session(str(place))
+    assert tables_of(place) == tables_of(undisturbed)
+
+
+def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    monkeypatch.setattr(time, "time", lambda: float(rng.uniform(-1e9, 1e10)))
+    write_session(str(tmp_path / "circle.liex"))
+    assert tables_of(tmp_path / "circle.liex") == tables_of(undisturbed)
+
+
+@pytest.mark.parametrize("damage", ["other facts", "short log", "short column", "no state", "no JSON", "empty"])
+def test_what_cannot_be_gone_on_with_is_begun_anew(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    place, part = tmp_path / "circle.liex", tmp_path / "circle.liex.part"
+    broken_at(place, monkeypatch, 4, RuntimeError("the power went out"))
+    state = part / "checkpoint.json"
+    if damage == "other facts":
+        state.write_text(json.dumps({**json.loads(state.read_text()), "key": "0"}))
+    elif damage == "short log":
+        (part / "session.mcap").write_bytes(b"")
+    elif damage == "short column":
+        (part / "seen" / "root_mm.bin").write_bytes(b"")
+    elif damage == "no state":
+        state.unlink()
+    else:
+        state.write_text("{" if damage == "no JSON" else "{}")
+    write_session(str(place))
+    assert tables_of(place) == tables_of(undisturbed)
+    assert Session.open(place).metadata["interruptions"] == 0
+
+
+def test_an_accident_before_the_first_checkpoint_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError):  # noqa: SIM117
+        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+            writer.add([MOUSE.frame(1 // 0)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_columns_grow_and_are_cut_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    blocks = [
+        {"a": rng.normal(size=(n, 2, 3)), "b": rng.integers(0, 9, n), "c": np.array(["x"] * n)} for n in (3, 5, 1)
+    ]
+    columns = Columns(tmp_path)
+    for block in blocks:
+        columns.append(block)
+    assert len(columns) == 9
+    for name, values in columns.read().items():
+        np.testing.assert_array_equal(values, np.concatenate([block[name] for block in blocks]))
+    columns.close()
+    assert Columns.cut(tmp_path, 4)
+    assert not Columns.cut(tmp_path, 5)
+    again = Columns(tmp_path)
+    again.append(blocks[2])
+    assert len(again) == 5
+    with pytest.raises(ValueError, match="appended"):
+        again.append({"a": np.zeros(1)})
+    again.close()
+
+
+def test_checkpoints_are_taken_by_a_clock_that_never_jumps(tmp_path: Path) -> None:
+    now = [5.0]
+    held = Checkpoint(tmp_path / "x.part", {}, lambda: now[0])
+    assert not held.due
+    now[0] += checkpoint.EVERY_S
+    assert held.due
+    held.save(0, 1.0, {})
+    assert not held.due
+    held.leave(keep=False)
+    assert not (tmp_path / "x.part").exists()
+
+
+def test_a_replay_that_is_cut_is_not_taken_for_whole(undisturbed: Path, tmp_path: Path) -> None:
+    data = (undisturbed / "session.rrd").read_bytes()
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes(data[: len(data) // 2])
+    with cut.open("rb") as file, pytest.raises(SessionError, match="not written whole"):
+        list(rrd_messages(file, len(data) // 2))
