@@ -21,8 +21,8 @@ TRACKING_PROTOCOL = (
     "ratio_to_single and p95_ratio_to_single: over the frames in which this row and the single frames both have a "
     "pose. longest_flip_frames: most frames in a row whose base-to-tip direction is more than 90 degrees from the "
     "true one. interval90_coverage: share of joint coordinates within 1.645 sd of the truth. recovery_frames: after "
-    "the end of an occlusion that hid more than half of the animal, frames until the error is below 0.12 of its "
-    "length, the worst of them. frames_per_s: on this machine, reading excluded."
+    "the end of an occlusion (the bar has passed, or less than half of the animal is hidden again), frames until the "
+    "error is below 0.12 of its length, the worst of them. frames_per_s: on this machine, reading excluded."
 )
 _NEAR = 0.12
 _Z90 = 1.645
@@ -63,10 +63,10 @@ class Followed:
         return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)[..., None]]
 
     def recovery(self, events: Sequence[Event], length_mm: float) -> list[int]:
-        """After each time that the animal was hidden, how many frames it took to find it again."""
+        """After each time that something passed over the animal, or hid it, how many frames until it is found again."""
         near, found = self.error_mm < _NEAR * length_mm, []
         for event in events:
-            if event.kind == "hidden" and event.stop < len(near):
+            if event.kind in ("hidden", "occluder") and event.stop < len(near):
                 again = np.flatnonzero(near[event.stop :])
                 found.append(int(again[0]) if len(again) else len(near) - event.stop)
         return found

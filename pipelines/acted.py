@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from liex_lab.pipelines.train import cache_folder
@@ -156,14 +157,16 @@ def _generator(animal: str) -> bytes:
 
 def _save(path: Path, tracks: list[LabelledTrack]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    columns = {f.name: np.concatenate([getattr(t.track, f.name) for t in tracks]) for f in fields(Track)[1:]}
+    columns: dict[str, Any] = {
+        f.name: np.concatenate([getattr(t.track, f.name) for t in tracks]) for f in fields(Track)[1:]
+    }
+    columns["truth"] = np.concatenate([np.asarray(t.truth) for t in tracks])
     small = {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in columns.items()}
-    lengths = np.array([len(t) for t in tracks])
-    truth, wall = (np.concatenate([getattr(t, name) for t in tracks]) for name in ("truth", "wall_mm"))
-    words = np.concatenate([t.words for t in tracks])
+    small |= {"lengths": np.array([len(t) for t in tracks]), "animals": np.array([t.animal for t in tracks]),
+              "words": np.concatenate([t.words for t in tracks]),
+              "wall_mm": np.concatenate([np.asarray(t.wall_mm) for t in tracks])}  # fmt: skip
     unfinished = path.with_suffix(".part.npz")
-    np.savez(unfinished, lengths=lengths, words=words, animals=[t.animal for t in tracks],
-             truth=truth.astype(np.float32), wall_mm=wall, **small)  # fmt: skip
+    np.savez(unfinished, **small)
     unfinished.replace(path)
 
 

@@ -116,8 +116,11 @@ def _client(
     import dask
     from distributed import Client
 
-    settings = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.logging.distributed": "critical",
-                "distributed.admin.tick.limit": "1h", "distributed.worker.memory.terminate": False}  # fmt: skip
+    # one session at a worker at a time: what waits there is held to have killed it, too
+    settings = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.scheduler.worker-saturation": 1.0,
+                "distributed.logging.distributed": "critical", "distributed.worker.memory.terminate": False,
+                # a machine that is busy or was put to sleep is not a dead one
+                "distributed.scheduler.worker-ttl": "3600s", "distributed.comm.timeouts.connect": "120s"}  # fmt: skip
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         if scheduler is not None:

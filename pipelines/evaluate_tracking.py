@@ -99,6 +99,8 @@ def follow_sequence(
         seconds["single"] += between - began
         seconds["observe"] += time.perf_counter() - between
     seen = Observations.join(parts)
+    tracker.track(parts[0])  # compiled before the clock runs
+    _online(tracker, parts[0])
     found: dict[str, Followed] = {}
     tip = estimator.skeleton.tip
     n = len(recording)

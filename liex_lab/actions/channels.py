@@ -43,7 +43,7 @@ def channel_names(skeleton: Skeleton) -> list[str]:
 
 def stretches_of(track: Track, rate_hz: float, wall_mm: Array | None = None) -> list[Stretch]:
     """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal from a wall."""
-    time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
+    time_s = (track.times_ns - track.times_ns[:1]).astype(np.float64) * 1e-9
     good = np.flatnonzero(track.observed)
     if not len(good):
         return []
@@ -84,8 +84,8 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
     axis = track.joints_mm[good, front] - track.joints_mm[good, rear]
     axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(axis, axis=0)])
-    low, high = (np.searchsorted(time_s[good], time_s[good] + side * _FLIP_S, which)
-                 for side, which in ((-1, "left"), (1, "right")))  # fmt: skip
+    times = time_s[good]
+    low, high = np.searchsorted(times, times - _FLIP_S, "left"), np.searchsorted(times, times + _FLIP_S, "right")
     around = total[high] - total[low] - axis
     return np.asarray(np.sum(axis * around, axis=1) < -0.5 * (high - low - 1).clip(1))
 

@@ -24,6 +24,7 @@ _LEAST_STEPS, _MOST_EPOCHS = 1500, 200  # of few labels
 _WEIGHT_DECAY = 2e-3
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
+_USUAL = (0.005, 0.99)  # quantiles of the speeds of a word
 _NEVER = -30.0  # what a network says of a word that it has not seen
 
 
@@ -39,9 +40,10 @@ def learn(
     progress(1, 3, "learning what each action looks like")
     networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
+    speeds = speeds_of(examples, len(words))
     chain = ActionChain.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
-        tracks[0].track.skeleton.name, clock_hz, words, share, networks, chain, _SHARPNESS, definitions or {}
+        tracks[0].track.skeleton.name, clock_hz, words, share, networks, chain, _SHARPNESS, speeds, definitions or {}
     )
 
 
@@ -53,6 +55,16 @@ def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
             f"labels of at least two actions, or of one and stretches without it, are needed; got {found or 'none'}"
         )
     return (UNLABELLED, *found)
+
+
+def speeds_of(examples: Examples, n_words: int) -> Array:
+    """(K, 2) lengths a second: between which speeds nearly all ticks of each word lie; what has no name has any."""
+    limits = np.tile([0.0, np.inf], (n_words, 1))
+    for k in range(1, n_words):  # 0 is UNLABELLED
+        speed = examples.speed[examples.code == k]
+        if len(speed):
+            limits[k] = np.quantile(speed, _USUAL)
+    return limits
 
 
 def train_network(examples: Examples, n_words: int, seed: int) -> Network:

@@ -25,7 +25,8 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     document: dict[str, Any] = {
         "format": _FORMAT, "skeleton": model.skeleton, "clock_hz": model.clock_hz, "words": list(model.words),
-        "share": model.share, "sharpness": model.sharpness, "definitions": dict(model.definitions),
+        "share": model.share, "sharpness": model.sharpness, "speeds": model.speeds,
+        "definitions": dict(model.definitions),
         "card": dict(model.card),
         "chain": {name: getattr(model.chain, name) for name in ActionChain.__dataclass_fields__},
         "networks": [
@@ -54,7 +55,8 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
         )
         return TimelineModel(
             document["skeleton"], float(document["clock_hz"]), tuple(document["words"]), document["share"], networks,
-            chain, float(document["sharpness"]), document["definitions"], {**document["card"], "sha256": sha256(path)},
+            chain, float(document["sharpness"]), document["speeds"], document["definitions"],
+            {**document["card"], "sha256": sha256(path)},
         )  # fmt: skip
     except ModelError:
         raise

@@ -27,7 +27,9 @@ def doubtful_stretches(found: Recognised, times_ns: NDArray[np.int64], n: int, l
     low, high = np.searchsorted(time_s, starts), np.searchsorted(time_s, starts + least_s)
     total = np.concatenate([[0.0], np.cumsum(entropy)])
     mean = (total[high] - total[low]) / np.maximum(high - low, 1)
-    taken, pairs, rows = np.zeros(len(time_s), bool), {}, []
+    taken = np.zeros(len(time_s), bool)
+    pairs: dict[tuple[int, ...], int] = {}
+    rows: list[tuple[int, float, int, dict[str, Any]]] = []
     for k in np.argsort(-mean, kind="stable"):
         a, b = int(low[k]), int(high[k])
         if b <= a or taken[a:b].any() or mean[k] <= 0:

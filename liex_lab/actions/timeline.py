@@ -27,6 +27,7 @@ CLOCKS_HZ = {"fish": 50.0}
 _CLOCK_HZ = 30.0
 _PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
 _LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
+_SPEED_S, _SLACK, _STILL, _UNSEEN = 0.2, 1.25, 0.1, 6.0  # half window; how far beyond is meant, and what it costs
 _TICKS_NEEDED = 3.0  # frames within a bout for its shape to be seen
 
 
@@ -51,7 +52,8 @@ class Network:
 @dataclass(frozen=True)
 class TimelineModel:
     """A trained recogniser. words (K): its vocabulary, UNLABELLED among them; share (K,): of the training time;
-    sharpness: how much one tick counts in the chain, as ticks beside each other tell much the same.
+    sharpness: how much one tick counts in the chain, as ticks beside each other tell much the same; speeds (K, 2):
+    between which speeds, lengths a second, each word was seen, for a network says anything of what it has not seen.
     """
 
     skeleton: str
@@ -61,6 +63,7 @@ class TimelineModel:
     networks: tuple[Network, ...]
     chain: ActionChain
     sharpness: float
+    speeds: Array
     definitions: dict[str, str] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
@@ -75,7 +78,9 @@ class TimelineModel:
             features = features[start - low : stop - low]
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
             out[start:stop] = np.log(np.maximum(p, 1e-6))
-        return out
+        speed = steady_speed(stretch, names)[:, None]
+        beyond = (speed < self.speeds[:, 0] / _SLACK) | (speed > self.speeds[:, 1] * _SLACK + _STILL)
+        return out - _UNSEEN * beyond
 
     def scores(self, log_probabilities: Array) -> Array:
         """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is."""
@@ -144,15 +149,25 @@ class Recognised:
 
 @dataclass(frozen=True)
 class Examples:
-    """What a recogniser learns from: features (m, F) and word codes (m,) of ticks, the animal's number (m,) and which
-    recording's (m,) they are; and the bouts (word, s) of every recording.
+    """What a recogniser learns from: features (m, F), word codes (m,) and steady speeds (m,) of ticks, the animal's
+    number (m,) and which recording's (m,) they are; and the bouts (word, s) of every recording.
     """
 
     features: NDArray[np.float32]
     code: NDArray[np.int64]
+    speed: Array
     animal: NDArray[np.int64]
     recording: NDArray[np.int64]
     runs: list[list[tuple[int, float]]]
+
+
+def steady_speed(stretch: Stretch, names: Sequence[str]) -> Array:
+    """(m,) lengths a second around each tick of a stretch, without regard to the direction."""
+    from scipy.ndimage import uniform_filter1d
+
+    step = stretch.times_s[1] - stretch.times_s[0]
+    width = 2 * max(1, round(_SPEED_S / step)) + 1
+    return np.asarray(uniform_filter1d(stretch.values[:, names.index("speed")], width, mode="nearest"))
 
 
 def clock_of(skeleton: Skeleton) -> float:
@@ -162,7 +177,7 @@ def clock_of(skeleton: Skeleton) -> float:
 
 def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: float) -> Examples:
     """The examples of labelled tracks."""
-    features, codes, animals, recordings, runs = [], [], [], [], []
+    features, codes, speeds, animals, recordings, runs = [], [], [], [], [], []
     number = {name: k for k, name in enumerate(sorted({one.animal for one in tracks}))}
     place = {word: k for k, word in enumerate(words)}
     for k, one in enumerate(tracks):
@@ -173,10 +188,14 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
             row = np.clip(np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz), 0, len(time_s) - 1)
             features.append(window_features(stretch, names))
             codes.append(code[row])
+            speeds.append(steady_speed(stretch, names))
             animals.append(np.full(len(row), number[one.animal]))
             recordings.append(np.full(len(row), k))
         runs.append(_runs(one.words, one.track.times_ns, place))
-    return Examples(*(np.concatenate(some) for some in (features, codes, animals, recordings)), runs)
+    return Examples(
+        np.concatenate(features), np.concatenate(codes), np.concatenate(speeds), np.concatenate(animals),
+        np.concatenate(recordings), runs,
+    )  # fmt: skip
 
 
 def _runs(words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str, int]) -> list[tuple[int, float]]:

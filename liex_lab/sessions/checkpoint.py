@@ -172,7 +172,7 @@ class Columns:
 
     def append(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """The next rows (n, ...) of every column."""
-        kinds = {name: [values.dtype.str, list(values.shape[1:])] for name, values in columns.items()}
+        kinds = {name: (values.dtype.str, list(values.shape[1:])) for name, values in columns.items()}
         if not self._kinds:
             write_whole(self._folder / "columns.json", json.dumps(kinds))
             self._kinds = kinds
@@ -267,7 +267,10 @@ def _read_state(path: Path) -> State | None:
 
 def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
     try:
-        found: dict[str, tuple[str, list[int]]] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
+        found: dict[str, Any] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return found if isinstance(found, dict) else None
+    try:
+        return {name: (str(kind), [int(n) for n in shape]) for name, (kind, shape) in found.items()}
+    except (AttributeError, ValueError, TypeError):
+        return None

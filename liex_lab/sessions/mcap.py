@@ -58,7 +58,7 @@ class McapWriter:
             profile="liex_lab",
         )  # fmt: skip
         self._file = _WatchedFile(path)
-        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)  # type: ignore[call-overload]
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
         self._depth = channels.RawImageChannel("/camera/depth", context=self._context)
         self._calibration = channels.CameraCalibrationChannel("/camera/calibration", context=self._context)
         self._transforms = channels.FrameTransformsChannel("/tf", context=self._context)
@@ -199,7 +199,7 @@ class _WatchedFile:
         """Bytes so far."""
         return os.fstat(self._file.fileno()).st_size
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes | bytearray) -> int:
         """As a file does."""
         try:
             return self._file.write(data)

