@@ -20,6 +20,7 @@ _THICK_MM = 25.0  # readings of one block this far behind its nearest belong to 
 _JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
 _STICKS_OUT_MM = 90.0  # of a home-sized hand: an end of a surface stands out by this, which an elbow does not
 _WORTH_MM, _MOST_OUT = 60.0, 3.0  # sticking out once more as far is worth being nearer by this, up to so often
+_APART = 0.6  # of that radius: ends that lie nearer to each other show the same hand
 _MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
 
 
@@ -121,8 +122,20 @@ def walk(blocks, labels, slot, position, order, hops):
                 order[n, 0], order[n, 1], hops[n], position[i, j] = i, j, 0, n
                 n += 1
     if n == 0:
-        order[0, 0], order[0, 1], hops[0], position[far_i, far_j] = far_i, far_j, 0, 0
-        n = 1
+        return walk_from(blocks, labels, slot, far_i, far_j, position, order, hops)
+    return _spread(blocks, labels, slot, n, position, order, hops)
+
+
+@njit(cache=True)
+def walk_from(blocks, labels, slot, i, j, position, order, hops):
+    """`walk` from one block of the surface."""
+    order[0, 0], order[0, 1], hops[0], position[i, j] = i, j, 0, 0
+    return _spread(blocks, labels, slot, 1, position, order, hops)
+
+
+@njit(cache=True)
+def _spread(blocks, labels, slot, n, position, order, hops):
+    """Go on with a walk from its first n blocks. Returns how many there are in the end."""
     at = 0
     while at < n:
         i, j = order[at, 0], order[at, 1]
@@ -186,7 +199,11 @@ def _note(tips, n_tips, z, out, block):
 
 @njit(cache=True)
 def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
-    """Up to `len(chosen)` ends of surfaces, the nearest first, no two of one hand; rows as in `ends`. How many."""
+    """Up to `len(chosen)` places where a hand may be, the nearest first, no two alike; rows as in `ends`. How many.
+
+    A surface is walked twice: from where it leaves the picture, and from the end that lies farthest from there, as it
+    may be the hand that lies at the border. What of it is nearest may be a hand before a body that it touches.
+    """
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
     n_blocks = blocks.size
     position = np.full(blocks.shape, -1, np.int32)
@@ -195,8 +212,15 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
     for slot in range(n_surfaces):
         n = walk(blocks, labels, slot, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
-        if n == 1 or hops[1] > 0:  # it does not leave the picture: where the walk began is an end as well
-            n_tips = _note(tips, n_tips, blocks[order[0, 0], order[0, 1]], _MOST_OUT, order[0])
+        last_i, last_j, nearest = order[n - 1, 0], order[n - 1, 1], 0
+        for k in range(n):
+            if blocks[order[k, 0], order[k, 1]] < blocks[order[nearest, 0], order[nearest, 1]]:
+                nearest = k
+            position[order[k, 0], order[k, 1]] = -1
+        i, j = order[nearest, 0], order[nearest, 1]
+        n_tips = _note(tips, n_tips, blocks[i, j], 0.5, order[nearest])
+        n = walk_from(blocks, labels, slot, last_i, last_j, position, order, hops)
+        n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
     ranked = np.argsort(tips[:n_tips, 0])
     p, q, n_chosen = np.empty(3), np.empty(3), 0
     for t in ranked:
@@ -207,7 +231,7 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
         for c in range(n_chosen):
             point_of_block(blocks, int(chosen[c, 1]), int(chosen[c, 2]), intrinsics, q)
             off = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
-            own &= off > AROUND_MM * size
+            own &= off > _APART * AROUND_MM * size
         if own:
             chosen[n_chosen] = tips[t]
             n_chosen += 1

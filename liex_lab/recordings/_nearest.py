@@ -17,10 +17,13 @@ from liex_lab.recordings._ends import (
     nearest_ends,
     point_of_block,
 )
+from liex_lab.recordings._likeness import unlikeness
 from liex_lab.recordings._segment import BLOCK
 
 _TIP_MM = 60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
-_AS_NEAR_MM = 150.0  # a second end is worth a look while it is not farther behind the first
+_MOST_ENDS = 8  # that are looked at
+_PER_MM_BEHIND, _MOST_BEHIND_MM = 0.012, 800.0  # what it counts to be farther away than another end, in `unlikeness`
+_AS_LIKE = 1.0  # a second end is worth a look while it is not more unlike a hand than the first by this
 _LEAST_MM2 = 2500.0  # no hand is smaller
 _LENGTH_MM = 185.0  # of a home-sized hand
 _SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
@@ -150,6 +153,23 @@ def _settle(blocks, labels, slot, radius, intrinsics, middle):
 
 
 @njit(cache=True)
+def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
+    """How unlike a hand what would be cut at each of the ends is, into unlike (n,)."""
+    depth, found, nearest = np.empty(len(unlike)), np.empty(FIELDS), 1e9
+    for k in range(len(unlike)):
+        slot = labels[int(ends[k, 1]), int(ends[k, 2])]
+        locate(blocks, labels, ends[k], size, intrinsics, found)
+        depth[k], unlike[k] = unlikeness(blocks, labels, slot, MAX_SURFACES, found, size, intrinsics)
+        nearest = min(nearest, depth[k])
+        for i in range(labels.shape[0]):
+            for j in range(labels.shape[1]):
+                if labels[i, j] == MAX_SURFACES:
+                    labels[i, j] = slot
+    for k in range(len(unlike)):
+        unlike[k] += _PER_MM_BEHIND * min(depth[k] - nearest, _MOST_BEHIND_MM)
+
+
+@njit(cache=True)
 def box_of(labels, mark, box):
     """First and last row and column of the blocks labelled `mark` into box (4,)."""
     box[0], box[1], box[2], box[3] = labels.shape[0], -1, labels.shape[1], -1
@@ -220,18 +240,21 @@ def extract_one(
     """Find the hand in one frame (H, W) mm and fill row k of the batch; see `NearestScene.extract`."""
     blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
     labels = np.empty(blocks.shape, np.int32)
-    areas, chosen = np.empty(MAX_SURFACES), np.empty((2, 4))
+    areas, ends = np.empty(MAX_SURFACES), np.empty((_MOST_ENDS, 4))
     focal2 = intrinsics[0] * intrinsics[1]
     block_depths(depth, near, far, blocks)
     n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
     found, box = np.empty(FIELDS), np.empty(4, np.int64)
-    n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen)
-    if n_ends == 2 and chosen[1, 3] > chosen[0, 3] + _AS_NEAR_MM * size:
-        n_ends = 1
-    n_blobs[k] = n_ends
-    if rank >= n_ends:
+    n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, ends)
+    unlike = np.empty(n_ends)
+    compare_ends(blocks, labels, ends, size, intrinsics, unlike)
+    ranked = np.argsort(unlike)
+    n_blobs[k] = min(n_ends, 2)
+    if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
+        n_blobs[k] = 1
+    if rank >= n_blobs[k]:
         return
-    locate(blocks, labels, chosen[rank], size, intrinsics, found)
+    locate(blocks, labels, ends[ranked[rank]], size, intrinsics, found)
     box_of(labels, MAX_SURFACES, box)
     if box[1] < 0:
         return

@@ -49,8 +49,55 @@ def test_the_hand_is_what_is_cut_out() -> None:
     assert crops.found.all()
     joints = joints_in_view(session, scene.looks(crops))
     off = np.linalg.norm(crops.moments[:, 3:5] - joints.mean(axis=1)[:, :2], axis=1)
-    assert (off < 70.0).mean() > 0.9
+    assert (off < 70.0).mean() >= 0.95
     assert np.median(off) < 40.0
+
+
+def drawn_arm(wrist: tuple[int, int], elbow: tuple[int, int], hand_mm: float, body: bool) -> np.ndarray:
+    """A picture (480, 640) mm: four fingers and a palm beyond the wrist, a forearm that ends at the elbow, a chest."""
+    depth = np.zeros((480, 640), np.float32)
+    if body:
+        cv2.ellipse(depth, (320, 330), (150, 200), 0.0, 0.0, 360.0, hand_mm + 120.0, -1)
+    cv2.line(depth, elbow, wrist, hand_mm + 25.0, 44)
+    along = np.subtract(wrist, elbow) / np.linalg.norm(np.subtract(wrist, elbow))
+    palm = np.array(wrist) + 35.0 * along
+    cv2.circle(depth, tuple(palm.astype(int).tolist()), 34, hand_mm, -1)
+    for turn in np.linspace(-0.6, 0.6, 4):
+        way = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ along
+        cv2.line(depth, palm.astype(int).tolist(), (palm + 85.0 * way).astype(int).tolist(), hand_mm, 11)
+    return depth
+
+
+@pytest.mark.parametrize(
+    ("wrist", "elbow", "body"),
+    [
+        ((320, 100), (330, 320), False),  # the fingers touch the border of the picture, the elbow hangs free
+        ((540, 240), (330, 250), False),
+        ((100, 200), (320, 330), False),
+        ((320, 260), (400, 479), True),  # before the chest
+        ((250, 300), (640, 340), True),
+    ],
+)
+def test_it_is_the_hand_and_no_elbow_and_no_chest(wrist: tuple[int, int], elbow: tuple[int, int], body: bool) -> None:
+    depth = drawn_arm(wrist, elbow, 700.0, body)
+    scene = scene_of(NYU_CAMERA)
+    crops = scene.extract(depth[None], 1.0)
+    rows, columns = np.nonzero(crops.heights[0])
+    u, v = (crops.origin[0] + crops.step[0] * np.stack([columns, rows], axis=-1)).T
+    along = np.subtract(wrist, elbow) / np.linalg.norm(np.subtract(wrist, elbow))
+    beyond = (u - wrist[0]) * along[0] + (v - wrist[1]) * along[1]
+    assert beyond.mean() > 20.0  # px: the palm and the fingers
+    assert (depth[v, u] <= 725.0).mean() > 0.97
+
+
+def test_the_hand_is_found_at_a_size_that_is_off() -> None:
+    """The size of a person's hand is found later: what is cut meanwhile must be the hand as well."""
+    session, depths = people()
+    scene = scene_of(session.camera)
+    true = session.spine_mm / HAND.length
+    middles = [scene.middles(scene.extract(depths, size)) for size in (0.88 * true, true, 1.12 * true)]
+    for other in (middles[0], middles[2]):
+        assert (np.linalg.norm(other - middles[1], axis=1) < 60.0).mean() >= 0.95
 
 
 def test_the_long_axis_points_to_the_fingers() -> None:
