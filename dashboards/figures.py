@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-WIDTH, LEFT, RIGHT = 920, 64, 22  # shared by all figures over time, so that their axes stand below each other
+WIDTH, LEFT, RIGHT = 920, 116, 22  # shared by all figures over time, so that their axes stand below each other
 ARENA = "the arena"  # the outline that needs no name
 _MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page

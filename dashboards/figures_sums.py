@@ -16,13 +16,14 @@ def matrix(words: Sequence[str], probability: Array, chance: Array, significant:
 
     All (k, k), NaN on the diagonal and where nothing followed.
     """
-    cell, left, top = 58.0, 92.0, 44.0
+    cell, left, top = 58.0, 124.0, 104.0  # room for words as long as 'rear unsupported'
     size = cell * len(words)
     parts = []
     for k, word in enumerate(words):
         label, at = escape(word.replace("_", " ")), (k + 0.5) * cell
         parts.append(f'<text class="label" x="{left - 8}" y="{top + at + 4:.1f}" text-anchor="end">{label}</text>')
-        parts.append(f'<text class="label" x="{left + at:.1f}" y="{top - 8}" text-anchor="middle">{label}</text>')
+        x, y = left + at, top - 8
+        parts.append(f'<text class="label" x="{x:.1f}" y="{y}" transform="rotate(-40 {x:.1f} {y})">{label}</text>')
     for i, word in enumerate(words):
         for j, other in enumerate(words):
             x, y, p = left + j * cell, top + i * cell, probability[i, j]
@@ -35,8 +36,8 @@ def matrix(words: Sequence[str], probability: Array, chance: Array, significant:
             parts.append(f'<rect class="cell" fill-opacity="{0.06 + 0.94 * p:.3f}" {box}><title>{escape(title)}</title>'
                          f'</rect><text class="{"inside" if p > 0.45 else "tick"}" x="{x + cell / 2:.1f}" '
                          f'y="{y + cell / 2 + 4:.1f}" text-anchor="middle">{p:.0%}{mark}</text>')  # fmt: skip
-    parts.append(f'<text class="tick" x="{left}" y="{top - 28}">followed by</text>')
-    return svg(max(left + size + 6, 400.0), top + size + 6, parts)  # few words are not blown up
+    parts.append(f'<text class="tick" x="{left - 8}" y="14" text-anchor="end">followed by</text>')
+    return svg(max(left + size + 70, 400.0), top + size + 6, parts)  # few words are not blown up
 
 
 def around(
