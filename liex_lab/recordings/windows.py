@@ -87,7 +87,7 @@ class TrainingWindows:
                 columns.append(
                     SE3(np.concatenate([v.rotation for v in values]), np.concatenate([v.translation for v in values]))
                 )
-            elif isinstance(values[0], float):
+            elif isinstance(values[0], float | bool):  # of all images alike
                 columns.append(values[0])
             else:
                 columns.append(np.concatenate(values))

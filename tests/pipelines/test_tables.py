@@ -136,7 +136,7 @@ def test_numbers_of_the_json_are_those_of_the_frames_and_the_way_of_the_candidat
     shown = results["illustration"]
     assert shown["ranked"]["score_mm"] == sorted(shown["ranked"]["score_mm"])
     assert shown["steps"]["example_mm"][-1] == pytest.approx(shown["ranked"]["error_mm"][0])
-    assert shown["steps"]["best_mm"][-1] < 0.6 * shown["steps"]["median_mm"][0]
+    assert shown["steps"]["best_mm"][-1] < 0.75 * shown["steps"]["median_mm"][0]  # a model of next to no trees
     curves = results["sensitivity"]["paper"]["curves"]
     assert [p["value"] for p in curves["initial poses"]] == [1, 40]
     assert curves["initial poses"][-1] == curves["metric trees"][-1] | {"value": 40}  # the method itself, both times

@@ -167,7 +167,7 @@ def test_a_header_that_promises_two_thousand_million_frames_is_refused(form: For
 
 def test_the_limits_of_this_test_hold(tmp_path: Path) -> None:
     with little_memory(50_000_000), pytest.raises(MemoryError):
-        np.ones(100_000_000, np.uint8)
+        np.ones(4_000_000_000, np.uint8)  # more than a process that has run many tests may hold unused
     with little_time():
         signal.setitimer(signal.ITIMER_REAL, 0.01)
         with pytest.raises(TimeoutError):
