@@ -15,13 +15,14 @@ from liex_lab.dashboards.report import TEMPLATES
 
 from liex_lab.sessions import Session
 
-WIDTH, HEIGHT = 860, 610
+WIDTH, HEIGHT = 860, 690
 _STYLE = f"""
 :root {{ color-scheme: light; }}
 main {{ width: {WIDTH}px; padding: 18px 22px; }}
 .strip {{ grid-template-columns: repeat(4, 1fr); }}
 .title {{ margin: 8px 0 0; font-size: 13px; font-weight: 600; }}
-.pair div svg .tick, .pair div svg .label {{ font-size: 15px; }}
+.pair div svg .tick {{ font-size: 15px; }}
+.pair div svg .label {{ font-size: 12px; }}
 svg image {{ image-rendering: pixelated; }}
 .pair {{ display: grid; grid-template-columns: 310px 1fr; gap: 22px; margin-top: 8px; }}
 """
