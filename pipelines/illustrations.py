@@ -88,7 +88,6 @@ def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
 def _follow(cascade: Cascade, data: TrainingSet, candidates: Candidates) -> tuple[list[str], list[Array], list[Array]]:
     """Move the candidates as Algorithm 1 does, and keep errors (n K,) mm at home size and positions after each step."""
     from liex_lab.estimation.training import joint_error
-    from liex_lab.forests.forest import predict
 
     skeleton = cascade.skeleton
     names, errors, positions = ["start"], [], []
@@ -102,16 +101,10 @@ def _follow(cascade: Cascade, data: TrainingSet, candidates: Candidates) -> tupl
         positions.append(candidates.positions.copy())
 
     note()
-    for joint, rounds in zip(skeleton.solved, cascade.forests, strict=True):
-        if joint:
-            cascade.place(candidates, joint)
-            solved.add(joint)
-        for c, forest in enumerate(rounds):
-            samples = cascade.samples(data.images, candidates, [joint])
-            cascade.apply(candidates, joint, predict(forest, samples))
-            names.append(f"{skeleton.names[joint]} {c + 1}")
-            note()
-    cascade.place_ends(candidates)
+    for joint, c in cascade.steps(data.images, candidates):
+        solved.add(joint)
+        names.append(f"{skeleton.names[joint]} {c + 1}")
+        note()
     return names, errors, positions
 
 
@@ -119,7 +112,7 @@ def _scores(model: Model, data: TrainingSet, candidates: Candidates) -> Array:
     """What the learned metric says of finished candidates (n K,), mm at home size."""
     from liex_lab.forests.forest import predict
 
-    samples = model.cascade.samples(data.images, candidates, list(range(model.skeleton.n_joints)))
+    samples = model.cascade.metric_samples(data.images, candidates)
     return predict(model.metric, samples)[:, 0].astype(float)
 
 

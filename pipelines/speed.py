@@ -145,19 +145,15 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
     n, k = len(crops.heights), method.n_candidates
     rotation, position, scale = start_poses(
         crops.moments, draw_starts(np.random.default_rng(0), 1, k), np.ones((n, k)), skeleton.length,
-        base_at_front(skeleton), method.axis_start, method.camera_view,
+        base_at_front(skeleton), method.axis_start, method.camera_view, method.home_turn,
     )  # fmt: skip
     image = np.repeat(np.arange(n, dtype=np.int32), k)
     poses = Candidates.start(
         skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), np.ones(n * k)
     )
-    for joint, rounds in zip(skeleton.solved, cascade.forests, strict=True):
-        if joint:
-            cascade.place(poses, joint)
-        for forest in rounds:
-            cascade.apply(poses, joint, predict(forest, cascade.samples(images, poses, [joint])))
-    cascade.place_ends(poses)
-    return predict(paper.model.metric, cascade.samples(images, poses, list(range(skeleton.n_joints))))
+    for _ in cascade.steps(images, poses):
+        pass
+    return predict(paper.model.metric, cascade.metric_samples(images, poses))
 
 
 def _ms(job: Callable[[], Any]) -> float:

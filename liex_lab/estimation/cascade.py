@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from liex_lab.estimation import _explain as explaining
 from liex_lab.estimation import _kernels as kernels
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
-from liex_lab.forests.forest import Forest, Samples
+from liex_lab.forests.forest import Forest, Samples, predict
 from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
@@ -58,6 +59,11 @@ class ImageSet:
     moments: Array
 
 
+def mm_per_px(looks: Array) -> Array:
+    """How many mm (m,) a pixel of each height map covers at the distance of its view's origin; looks (m, 17)."""
+    return looks[:, 16] * looks[:, 13] / looks[:, 0]
+
+
 @dataclass(frozen=True)
 class Cascade:
     """A skeleton, a method, and one forest per solved joint and round, in order; proposals say where to start."""
@@ -78,6 +84,18 @@ class Cascade:
         s = self.skeleton
         kernels.place_all(joint, s.parents, s.offsets, s.rest, candidates.scale, candidates.rotations,
                           candidates.positions)  # fmt: skip
+
+    def steps(self, images: ImageSet, candidates: Candidates) -> Iterator[tuple[int, int]]:
+        """Algorithm 1 as it is written: move the candidates, each by itself, by one forest after the other; yields the
+        joint and the round of each.
+        """
+        for joint, rounds in zip(self.skeleton.solved, self.forests, strict=True):
+            if joint:
+                self.place(candidates, joint)
+            for c, forest in enumerate(rounds):
+                self.apply(candidates, joint, predict(forest, self.samples(images, candidates, [joint])))
+                yield joint, c
+        self.place_ends(candidates)
 
     def place_ends(self, candidates: Candidates) -> None:
         """Put every joint that no regressor moves where its parent carries it."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.estimation.cascade import Candidates, ImageSet
+from liex_lab.estimation.cascade import Candidates, ImageSet, mm_per_px
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen
 from liex_lab.forests.forest import Samples, predict
@@ -43,9 +43,8 @@ def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Sam
         np.arange(n, dtype=np.int32), frames.rotation, frames.translation, pose.scale, np.full(n, size)
     )
     samples = model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
-    looks = images.looks
-    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / size
-    scalars = np.column_stack([samples.scalars, _LOG_UNIT * np.log(mm_per_px)]).astype(np.float32)
+    pixel = mm_per_px(images.looks) / size
+    scalars = np.column_stack([samples.scalars, _LOG_UNIT * np.log(pixel)]).astype(np.float32)
     return replace(samples, scalars=scalars)
 
 

@@ -206,8 +206,7 @@ class PoseEstimator:
         unsure = np.flatnonzero(first.crops.n_blobs > 1)
         if len(unsure):
             other = self._sight(depths[unsure], scene, size, parallel, 1)
-            best, next_best = first.scores[unsure].min(axis=1), other.scores.min(axis=1)
-            better = self._is_animal(depths[unsure], scene, size, best, next_best)
+            better = self._is_animal(depths[unsure], scene, size, first[unsure], other)
             second.put(unsure, other)
             rows = unsure[better]
             kept = first[rows]
@@ -255,17 +254,20 @@ class PoseEstimator:
         return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
 
     def _is_animal(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, first: Array, second: Array
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, first: _Sight, second: _Sight
     ) -> NDArray[np.bool_]:
         """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
 
-        Told by area and volume and, where the metric has learned what is no animal, by its scores first, second (n,).
+        Told by area and volume and, where the metric has learned what is no animal, by its scores.
         """
         weight = _MM_PER_MISFIT * self.skeleton.relative_size
-        likeness = [weight * scene.misfit(scene.extract(depths, size, rank=rank)) for rank in (0, 1)]
+        crops = [first.crops, second.crops]
+        if self.model.method.camera_view:  # likeness is told by what the scene's own view shows
+            crops = [scene.extract(depths, size, rank=rank) for rank in (0, 1)]
+        likeness = [weight * scene.misfit(crop) for crop in crops]
         if not self.model.method.metric_on_own:
             return likeness[1] < likeness[0]
-        return second + likeness[1] < first + likeness[0]
+        return second.scores.min(axis=1) + likeness[1] < first.scores.min(axis=1) + likeness[0]
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm of the recording.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.estimation.cascade import mm_per_px
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.forests._kernels import VIEW
@@ -152,13 +153,12 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
     """
     pose = chosen.pose
     unit, whole = skeleton.relative_size, size * skeleton.relative_size
-    mm_per_px = looks[:, 16] * looks[:, 13] / looks[:, 0] / whole
     clues = np.stack(
         [
             chosen.score / unit, chosen.spread / unit, *chosen.doubts.T / unit, 10 * pose.root.rotation[:, 2, 0],
             10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
             5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
-            moments[:, 6] / whole, moments[:, 7] / whole, 10 * mm_per_px, *chosen.sd_root.T[:3] * 10,
+            moments[:, 6] / whole, moments[:, 7] / whole, 10 * (mm_per_px(looks) / whole), *chosen.sd_root.T[:3] * 10,
             *chosen.sd_root.T[3:] / whole, 10 * chosen.sd_angles.sum(axis=(1, 2)), *chosen.fit.T / 50,
         ],
         axis=1,

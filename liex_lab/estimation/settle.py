@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _settle as kernels
-from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.cascade import ImageSet, mm_per_px
 
 Array = NDArray[np.float64]
 
@@ -124,8 +124,8 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     ends = seen[:, 2 * j :] / length[:, None]
     rise, roll = pose.root.rotation[:, 2, 0], pose.root.rotation[:, 2, 1]
     bent = np.abs(pose.angles[..., 2]).sum(axis=1)
-    mm_per_px = images.looks[:, 16] * images.looks[:, 13] / images.looks[:, 0] / length
+    pixel = mm_per_px(images.looks) / length
     return np.column_stack(
-        [np.ones(n), back, share, ends, ends**2, rise, np.abs(rise), rise**2, np.abs(roll), roll**2, bent, mm_per_px,
-         ends * mm_per_px[:, None], np.log(pose.scale / size)]
+        [np.ones(n), back, share, ends, ends**2, rise, np.abs(rise), rise**2, np.abs(roll), roll**2, bent, pixel,
+         ends * pixel[:, None], np.log(pose.scale / size)]
     )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from liex_lab.recordings import _segment as segment
-from liex_lab.recordings._segment import BLOCK
+from liex_lab.recordings._segment import BLOCK, find_root
 
 MAX_SURFACES = 24
 MAX_TIPS = 256
@@ -150,14 +150,6 @@ def _spread(blocks, labels, slot, n, position, order, hops):
 
 
 @njit(cache=True)
-def _root(parent, k):
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
-
-
-@njit(cache=True)
 def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
     """The ends of a walked surface, where it stops after having stuck out by `least_mm`: rows of tips (MAX_TIPS, 4).
 
@@ -173,7 +165,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
                 other = position[a, b]
                 if other <= k or other >= n or order[other, 0] != a or order[other, 1] != b:
                     continue
-                mine, theirs = _root(parent, k), _root(parent, other)
+                mine, theirs = find_root(parent, k), find_root(parent, other)
                 if mine == theirs:
                     continue
                 # an island is known by its outermost block, which comes last in the order

@@ -194,7 +194,7 @@ def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
 
 
 @njit(cache=True)
-def _find(parent, k):
+def find_root(parent, k):
     """The root of k, halving the way there."""
     while parent[k] != k:
         parent[k] = parent[parent[k]]
@@ -226,19 +226,19 @@ def keep_largest(raw, runs):
         for k in range(begin, n):
             for other in range(higher, begin):
                 if runs[other, 1] <= runs[k, 2] + 2 and runs[k, 1] <= runs[other, 2] + 2:
-                    a, b = _find(parent, other), _find(parent, k)
+                    a, b = find_root(parent, other), find_root(parent, k)
                     parent[max(a, b)] = min(a, b)
         higher, above = above, begin
     best, best_count = -1, 0
     for k in range(n):
-        root = _find(parent, k)
+        root = find_root(parent, k)
         if root != k:
             runs[root, 3] += runs[k, 3]
     for k in range(n):
         if parent[k] == k and runs[k, 3] > best_count:
             best, best_count = k, runs[k, 3]
     for k in range(n):
-        if _find(parent, k) != best:
+        if find_root(parent, k) != best:
             for c in range(runs[k, 1], runs[k, 2] + 1):
                 raw[runs[k, 0], c] = -1.0
 
