@@ -18,6 +18,7 @@ from liex_lab.pipelines.build import (
 from liex_lab.pipelines.crew import Crew
 from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
 
+from liex_lab.memory import give_back
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
+    from liex_lab.tracking.tracker import FrameTracker
 
 
 
@@ -51,7 +53,6 @@ def measure_session(
     from liex_lab.sessions import Session
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.place import check_place, part_folder
-    from liex_lab.tracking.observations import Observations
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
@@ -76,21 +77,30 @@ def measure_session(
                 writer.add(frames, seen=seen)
                 progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
-            whole = writer.seen(Observations)
-            writer.take(tracker.track(whole), whole, tracker.subject)
+            make_track(writer, tracker)
             timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
 
 
+def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
+    """The track of a session whose frames have all been looked at."""
+    from liex_lab.tracking.observations import Observations
+
+    whole = writer.seen(Observations)
+    writer.take(tracker.track(whole), whole, tracker.subject)
+
+
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
     from liex_lab.behaviour.summary import measure
 
+    give_back()  # hours of recording leave much behind
     around = build_surroundings(writer.origin)
     recogniser = build_recogniser(plan, writer.origin.skeleton)
     named = {} if recogniser is None else name_actions(recogniser, writer)
+    give_back()
     behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
     return writer.close(timings_s=timings, **behaviour.for_session())
 

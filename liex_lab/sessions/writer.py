@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.memory import peak_memory_mb
+from liex_lab.memory import give_back, peak_memory_mb
 from liex_lab.sessions import tables
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
@@ -262,6 +262,7 @@ class SessionWriter:
             results["bouts"] = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
         bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
         self._write_tables(rows, results, columns)
+        give_back()
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems)
