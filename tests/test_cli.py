@@ -21,7 +21,7 @@ from liex_lab import api, cli
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
-VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "flip", "show", "info"]
+VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "correct", "show", "info"]
 MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking"]
 
 

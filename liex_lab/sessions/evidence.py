@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
-_HUMAN = "human"
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
@@ -34,6 +33,18 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     }  # fmt: skip
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     np.savez_compressed(folder / FILE, subject=told, **{name: getattr(seen, name) for name in COLUMNS})
+
+
+def read_skeleton(session: Session) -> Skeleton | None:
+    """The skeleton that a session was made with; None for one that does not hold it."""
+    path = session.path / FILE
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            return Skeleton.from_table(json.loads(kept["subject"].tobytes())["skeleton"], str(path))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(f"{path} is damaged ({error}); run `liex run` on the recording again") from None
 
 
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
@@ -58,16 +69,15 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
     return seen, subject
 
 
-def read_corrections(session: Session) -> list[Flip]:
-    """The flips that a human has stated, with frames counted by row."""
+def read_flips(session: Session) -> list[Flip]:
+    """The table `flips`, with frames counted by row."""
     index = session.frames["frame_index"].to_numpy()
-    table = session.flips[session.flips["source"] == _HUMAN]
     return [
         Flip(
             int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
-            float(row["p_flip"]), bool(row["applied"]), _HUMAN, str(row["undone_at"]),
+            float(row["p_flip"]), bool(row["applied"]), str(row["source"]), str(row.get("undone_at", "")),
         )
-        for row in _rows_of(table)
+        for row in _rows_of(session.flips)
     ]  # fmt: skip
 
 
