@@ -105,7 +105,8 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
     bouts = session.bouts
     inside = bouts[(bouts["start_s"] <= at_s + _ROUNDED_S) & (bouts["stop_s"] > at_s + _ROUNDED_S)]
     if len(inside) == 0:
-        off = np.maximum(bouts["start_s"] - at_s, at_s - bouts["stop_s"]).to_numpy(float)
+        starts, stops = (bouts[name].to_numpy(float) for name in ("start_s", "stop_s"))
+        off = np.maximum(starts - at_s, at_s - stops)
         near = bouts.iloc[np.sort(np.argsort(off)[:2])]
         told = " and ".join(f"{b.action} from {b.start_s:.3f} to {b.stop_s:.3f} s" for b in near.itertuples())
         raise SessionError(f"no bout holds {at_s:g} s; {f'the nearest are {told}' if told else 'there are none'}")

@@ -20,6 +20,7 @@ from liex_lab.errors import SessionError
 
 FOLDER, LOG = "corrected", "corrections.json"
 SCHEMA_VERSION = 1
+FACTS = {"frames", "actions", "action_model", "unresolved_actions", "corrections"}  # sections that may change
 EDITS = ("add", "rename", "recut", "delete")
 
 
@@ -210,8 +211,10 @@ def read_log(session: Path) -> Log:
             )
         entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
         files, facts = document.get("files", {}), document.get("facts", {})
-        if not (isinstance(files, dict) and isinstance(facts, dict)):
-            raise TypeError("files and facts are tables")
+        if not all(isinstance(one, dict) for one in (files, facts, *files.values(), *facts.values())):
+            raise TypeError("files and facts are tables of tables")
+        if not set(facts) <= FACTS:
+            raise ValueError(f"facts of {', '.join(sorted(set(facts) - FACTS))}")
         return Log(str(document["made_of"]), entries, files, facts)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise SessionError(
