@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +22,17 @@ from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look
 from liex_lab.memory import give_back
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
+from liex_lab.threads import ahead
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
+    from liex_lab.behaviour.summary import Behaviour
+    from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Session
+    from liex_lab.sessions import Provenance, Session
+    from liex_lab.sessions.rows import Rows
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
     from liex_lab.tracking.tracker import FrameTracker
-
 
 
 def measure_session(
@@ -70,18 +74,27 @@ def measure_session(
             look_side_by_side(crew, whole, folder, progress)
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
             writer.go_on(lambda row: opened.frame(row).depth)
-            for frames in opened.chunks(CHUNK, writer.n_frames):
-                began = time.perf_counter()
-                seen = tracker.observe(frames)
-                timings["track"] += time.perf_counter() - began
-                writer.add(frames, seen=seen)
-                progress(frames[-1].index + 1, len(opened), MEASURING)
+            with closing(_read_ahead(opened, writer.n_frames)) as chunks:
+                for frames in chunks:
+                    began = time.perf_counter()
+                    seen = tracker.observe(frames)
+                    timings["track"] += time.perf_counter() - began
+                    writer.add(frames, seen=seen)
+                    progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
             make_track(writer, tracker)
             timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
+
+
+def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
+    """The frames from `first` on in chunks; while one is looked at the next is read, but for those that are rendered,
+    which takes all cores.
+    """
+    chunks = opened.chunks(CHUNK, first)
+    yield from chunks if opened.format == "synthetic" else ahead(chunks)
 
 
 def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
@@ -94,28 +107,35 @@ def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
-    from liex_lab.behaviour.summary import measure
-
     give_back()  # hours of recording leave much behind
-    around = build_surroundings(writer.origin)
-    recogniser = build_recogniser(plan, writer.origin.skeleton)
-    named = {} if recogniser is None else name_actions(recogniser, writer)
+    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin)
+    writer.note(**notes)
     give_back()
-    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
-def name_actions(recogniser: TimelineModel, writer: SessionWriter) -> dict[str, Any]:
-    """The ethogram of a session's track by a recogniser, as `behaviour.measure` takes it; what the frame rate cannot
-    tell is noted in the session.
+def measure_behaviour(rows: Rows, plan: Plan, origin: Provenance) -> tuple[Behaviour, dict[str, Any]]:
+    """The behaviour of a track as the plan names it, and what session.json is to hold of the recogniser."""
+    from liex_lab.behaviour.summary import measure_rows
+
+    recogniser = build_recogniser(plan, origin.skeleton)
+    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows)
+    return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
+
+
+def name_actions(recogniser: TimelineModel, rows: Rows) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which recogniser it was,
+    and what the frame rate cannot tell.
     """
     from liex_lab.actions.tables import bout_rows
+    from liex_lab.sessions.tables import FRAMES, to_pandas
 
-    frames = writer.frames
-    found = recogniser.recognise(writer.track, frames["wall_distance_mm"].to_numpy(float))
-    writer.note(
-        action_model={"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
-        unresolved_actions=found.unresolved,
-    )
+    frames = to_pandas(FRAMES, rows.frames())
+    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float))
+    notes = {
+        "action_model": {"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
+        "unresolved_actions": found.unresolved,
+    }
     actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
-    return {"bouts": bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", ""))), "actions": actions}
+    bouts = bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", "")))
+    return {"bouts": bouts, "actions": actions}, notes
