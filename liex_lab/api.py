@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.errors import MissingPackageError
 from liex_lab.plan import Plan
 from liex_lab.progress import Board, Progress, progress_board, silent
 from liex_lab.study import Study
@@ -113,6 +114,41 @@ def run_study(
 
     return job(Study.load(study), run_session, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry,
                again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
+
+
+def serve_dashboard(
+    study: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8050,
+    told: Callable[[str], None] = print,
+    progress: Progress = silent,
+) -> None:
+    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears the address.
+
+    On a host other than this machine alone, every visitor has to know a token, which is part of the address. Raises
+    MissingPackageError where the extra `dashboard` is not installed.
+    """
+    import secrets
+
+    from liex_lab.pipelines.listing import list_sessions
+
+    try:
+        from liex_lab.dashboards.app import LOOPBACK, address, make_app, serve
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(
+            f"the dashboard needs {error.name}, which is not installed; pip install 'liex_lab[dashboard]'"
+        ) from None
+    from liex_lab.dashboards.app_data import StudyData
+    from liex_lab.sessions.viewer import show_replay
+
+    name, look = list_sessions(study)
+    data = StudyData(name, look)
+    data.warm(progress)
+    alone = host in LOOPBACK
+    token = "" if alone else secrets.token_urlsafe(24)
+    app = make_app(data, token=token, show_replay=show_replay if alone else None)
+    serve(app, host, port, lambda found: told(address(host, found, token)))
 
 
 def verify_session(
