@@ -176,8 +176,8 @@ def number(value: Any) -> str:
     if isinstance(value, float | np.floating):
         if not np.isfinite(value):
             return "–"
-        value = 0.0 if abs(value) < 1e-12 else value  # what is left of a sum that is none
-        return f"{value:,.0f}" if abs(value) >= 1000 or value == int(value) else f"{value:.3g}"
+        shown = 0.0 if abs(float(value)) < 1e-12 else float(value)  # what is left of a sum that is none
+        return f"{shown:,.0f}" if abs(shown) >= 1000 or shown == int(shown) else f"{shown:.3g}"
     return str(value)
 
 
@@ -206,7 +206,7 @@ def _cell(table: Table, row: dict[str, Any], column: str) -> html.Td:
 
 
 def _finite(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(float(value)))
 
 
 def _numeric(rows: pd.DataFrame, column: str) -> bool:

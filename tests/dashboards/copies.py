@@ -41,8 +41,8 @@ def study(folder: Path, n_sessions: int) -> Path:
             failure = {"stage": "measuring poses", "reason": "frame 33 cannot be read", "remedy": "copy it again"}
             write_failure(place, failure)
         elif k != WAITING:
-            slower = summary.assign(mean_speed_mm_s=lambda t, k=k: t["mean_speed_mm_s"] - 40.0 * (k // 2 % 2)
-                                    + 10.0 * rng.standard_normal())  # fmt: skip
+            speed = summary["mean_speed_mm_s"] - 40.0 * (k // 2 % 2) + 10.0 * rng.standard_normal()
+            slower = summary.assign(mean_speed_mm_s=speed)
             _copy(first, place, f"sub-{animal}_ses-{name}", animal, slower)
     (folder / "study.toml").write_text("\n".join(lines), encoding="utf-8")
     _as_planned(folder / "study.toml")
