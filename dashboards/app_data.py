@@ -16,6 +16,7 @@ from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.progress import Progress, silent
 from liex_lab.sessions import Session
+from liex_lab.sessions.corrections import LOG, corrected_folder
 from liex_lab.sessions.listed import WHO, Entry
 
 if TYPE_CHECKING:
@@ -204,12 +205,15 @@ def raster(one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n
 
 
 def _stamp(folder: Path) -> Any:
-    """Changes whenever the session is written again."""
-    try:
-        found = (folder / "session.json").stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size, found.st_ino
+    """Changes whenever the session is written again or corrected."""
+    stamps: list[tuple[int, int, int] | None] = []
+    for path in (folder / "session.json", corrected_folder(folder) / LOG):
+        try:
+            found = path.stat()
+            stamps.append((found.st_mtime_ns, found.st_size, found.st_ino))
+        except OSError:
+            stamps.append(None)
+    return tuple(stamps)
 
 
 def _quality(session: Session) -> dict[str, Any]:
@@ -237,6 +241,6 @@ def _ethogram(session: Session) -> Ethogram:
 
 
 def _summary(session: Session) -> pd.DataFrame | None:
-    if not (session.path / "summary.csv").is_file():
+    if not session.has("summary.csv"):
         return None
     return cohort.collect([session])

@@ -143,7 +143,7 @@ def facts(session: Session, row: int) -> list[Any]:
     """The numbers of one frame, as a list of what and how much."""
     frame = session.frames.iloc[row]
     known = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
-    if (session.path / "kinematics.parquet").is_file():
+    if session.has("kinematics.parquet"):
         moved = session.kinematics.iloc[row]
         known += [(title, moved[name], unit) for name, title, unit in _MOVED if name in moved]
     bouts = session.bouts

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -157,9 +156,9 @@ def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
 
 def session_tables(data: StudyData, key: str) -> list[str]:
     """The names of a session's tables."""
-    folder: Path = data.session(key).path
-    names = sorted(path.stem for path in folder.glob("*.parquet"))
-    return [*(["summary"] if (folder / "summary.csv").is_file() else []), *names]
+    session = data.session(key)
+    names = sorted(path.stem for path in session.path.glob("*.parquet"))
+    return [*(["summary"] if session.has("summary.csv") else []), *names]
 
 
 def session_address(key: str, at_s: float | None = None) -> str:
