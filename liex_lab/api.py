@@ -15,6 +15,7 @@ from liex_lab.progress import Board, Progress, progress_board, silent
 from liex_lab.study import Study
 
 if TYPE_CHECKING:
+    from liex_lab.pipelines.crew import Crew
     from liex_lab.pipelines.study_state import Standing
     from liex_lab.pipelines.verify import Finding
     from liex_lab.recordings.recording import Recording
@@ -30,22 +31,28 @@ def run_session(
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    crew: Crew | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording and write the session folder `out/<recording's name>.liex`; returns it.
 
     recording: a path, or a recording that is open already; plan: None takes the mouse's; folder: the session folder
-    itself, where it should have another name; notes: what session.json is to hold besides. Raises a LiexError that says
-    what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
+    itself, where it should have another name; notes: what session.json is to hold besides; workers: processes that look
+    at stretches of a long recording side by side, or a crew of others; the tables are the same. Raises a LiexError that
+    says what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
     from liex_lab.dashboards.blueprint import replay_blueprint
     from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.crew import Processes
     from liex_lab.pipelines.session import measure_session
 
     plan = plan or Plan.load("mouse")
+    if workers > 1 and crew is None:
+        crew = Processes(workers)
     return measure_session(
         recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
-        report=write_report, progress=progress,
+        report=write_report, crew=crew, progress=progress,
     )  # fmt: skip
 
 

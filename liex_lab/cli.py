@@ -87,6 +87,9 @@ def run(
     topic: TopicName = None,
     settings: Settings = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, help="Processes that share a long recording; the tables are the same.")
+    ] = 1,
 ) -> None:
     """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
     from liex_lab.plan import Plan
@@ -96,7 +99,7 @@ def run(
     from liex_lab.api import run_session
 
     with progress_bar() as progress:
-        session = run_session(recording, chosen, out, overwrite=overwrite, progress=progress)
+        session = run_session(recording, chosen, out, overwrite=overwrite, workers=workers, progress=progress)
     _tell_session(session)
 
 

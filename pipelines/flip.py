@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from liex_lab.pipelines.session import CHUNK, conclude
+from liex_lab.pipelines.session import conclude
+from liex_lab.pipelines.stretches import CHUNK
 
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan

@@ -15,6 +15,8 @@ from liex_lab.pipelines.build import (
     build_surroundings,
     build_tracker,
 )
+from liex_lab.pipelines.crew import Crew
+from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Session
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
-CHUNK = 32  # frames in memory at a time
 
 
 def measure_session(
@@ -38,12 +39,14 @@ def measure_session(
     notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
+    crew: Crew | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
 
     notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
-    lie in the folder, see `Session.create`.
+    lie in the folder, see `Session.create`. crew: looks at stretches of a long recording side by side, where the
+    recording is given by its path; the tables are the same.
     """
     from liex_lab.sessions import Session
     from liex_lab.sessions.checkpoint import check_free, hash_once
@@ -61,6 +64,9 @@ def measure_session(
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
+        if crew is not None and isinstance(recording, str | Path) and len(opened) > LENGTH:
+            whole = Stretch(str(recording), plan, tracker, provenance, folder, 0, len(opened))
+            look_side_by_side(crew, whole, folder, progress)
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
             writer.go_on(lambda row: opened.frame(row).depth)
             for frames in opened.chunks(CHUNK, writer.n_frames):
@@ -68,7 +74,7 @@ def measure_session(
                 seen = tracker.observe(frames)
                 timings["track"] += time.perf_counter() - began
                 writer.add(frames, seen=seen)
-                progress(frames[-1].index + 1, len(opened), "measuring poses")
+                progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
             whole = writer.seen(Observations)
             writer.take(tracker.track(whole), whole, tracker.subject)

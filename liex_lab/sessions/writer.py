@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.curve import Subject
     from liex_lab.tracking.observations import Observations
 
-_INDEX, _TIMES = "frame_index", "frame_time_ns"
+INDEX, TIMES = "frame_index", "frame_time_ns"
 Kept = TypeVar("Kept")
 
 BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json as known so far -> a Rerun blueprint
@@ -71,10 +71,10 @@ class SessionWriter:
         self._keepsakes = Keepsakes()
         self._done = False
         self._folder = part_folder(path)
-        self._checkpoint = Checkpoint(self._folder, {"n_frames": origin.n_frames, **self._document})
+        self._checkpoint = unfinished(path, origin)
         before = self._checkpoint.seen.read()
-        self._index: list[int] = before.get(_INDEX, np.zeros(0, np.int64)).tolist()
-        self._times_ns: list[int] = before.get(_TIMES, np.zeros(0, np.int64)).tolist()
+        self._index: list[int] = before.get(INDEX, np.zeros(0, np.int64)).tolist()
+        self._times_ns: list[int] = before.get(TIMES, np.zeros(0, np.int64)).tolist()
         self._logging: list[Future[None]] = []
         self._loggers = ThreadPoolExecutor(len(LOGS))
         try:
@@ -146,8 +146,7 @@ class SessionWriter:
         self._index += index
         self._times_ns += times
         if seen is not None:
-            stamps = {_INDEX: np.array(index, np.int64), _TIMES: np.array(times, np.int64)}
-            self._checkpoint.seen.append({**columns_of(seen), **stamps})
+            self._checkpoint.seen.append(seen_rows(frames, seen))
         if self._checkpoint.due:
             self._take_down()
         self._seconds += time.perf_counter() - began
@@ -155,7 +154,7 @@ class SessionWriter:
     def seen(self, kind: Callable[..., Kept]) -> Kept:
         """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its columns in order."""
         kept = self._checkpoint.seen.read()
-        return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (_INDEX, _TIMES)))
+        return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (INDEX, TIMES)))
 
     def _settle(self) -> None:
         """Wait until the logs have written what they were given; what went wrong is raised here."""
@@ -341,7 +340,7 @@ class SessionWriter:
             "frames_per_s": round(track.n_frames / elapsed, 2),
             "peak_memory_mb": peak_memory_mb(),
             "machine": {"name": platform.node(), "system": platform.platform(), "cores": os.cpu_count()},
-            "interruptions": self._checkpoint.n_parts - 1,
+            "interruptions": self._checkpoint.n_interruptions,
         }  # fmt: skip
 
     def _publish(self) -> None:
@@ -372,6 +371,17 @@ class SessionWriter:
             except Exception:  # an error is under way already; it is the one to tell
                 continue
         self._checkpoint.leave(keep)
+
+
+def seen_rows(frames: Sequence[DepthFrame], seen: Columnar) -> dict[str, NDArray[Any]]:
+    """What is kept on disk of consecutive frames: what was seen in them, their count and their time."""
+    index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
+    return {**columns_of(seen), INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
+
+
+def unfinished(path: Path, origin: Provenance) -> Checkpoint:
+    """The unfinished session that will be at `path`, begun or gone on with."""
+    return Checkpoint(part_folder(path), {"n_frames": origin.n_frames, **origin.document()})
 
 
 def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:
