@@ -47,8 +47,8 @@ _CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
 @dataclass(frozen=True)
 class Scenario:
     """One recording to be acted. seed: of everything in it; individual: the animal's own seed; novel: an animal whose
-    traits no other has; seconds long, or (word) one cut-out action; filmed_s: only so much of its beginning is filmed, 0
-    all of it.
+    traits no other has; seconds long, or (word) one cut-out action; filmed_s: only so much of its beginning is
+    filmed, 0 all of it.
     """
 
     animal: str
@@ -115,7 +115,7 @@ def acted(scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Pro
         path = cache_folder() / "acted" / f"{animal}-seen-{key}.npz"
         if not path.is_file():
             sizes: dict[int, float] = {}
-            measured = []
+            measured: list[Acted] = []
             for one in group:
                 progress(len(found) + len(measured), len(scenarios), "acting, rendering and measuring")
                 measured.append(act(one, estimator, sizes))

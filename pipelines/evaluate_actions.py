@@ -170,7 +170,7 @@ def _timelines(
 
 def track_error_mm(tracks: Sequence[LabelledTrack]) -> float:
     """Mean distance of the tracked joints from the true ones."""
-    off = [np.linalg.norm(one.track.joints_mm - one.truth, axis=-1)[one.track.observed].ravel() for one in tracks]
+    off = [np.linalg.norm(one.track.joints_mm - np.asarray(one.truth), axis=-1)[one.track.observed] for one in tracks]
     return float(np.concatenate(off).mean())
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from liex_lab.dashboards.confusion_figure import draw_confusions
 from liex_lab.pipelines import acted as module
 from liex_lab.pipelines.acted import Acted, Scenario, acted, thinned
 from liex_lab.pipelines.evaluate_actions import one_hour, track_error_mm
 
 from liex_lab.actions.storage import load_action_model
-from liex_lab.dashboards.confusion_figure import draw_confusions
 from liex_lab.estimation.estimator import PoseEstimator
 
 CUT = Scenario("fish", 91, 5, 50.0, word="c_turn")
