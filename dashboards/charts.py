@@ -42,24 +42,24 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
         drawn["lanes"] = figures.lanes(spans, words, lost, time)
     drawn["error"] = figures.curve(time_s, _across_gaps(error, frames), time, "mm", _RED, last=True)
     drawn["errors"] = figures.histogram(error.to_numpy(float), "mm", _RED)
-    if has(session, "kinematics.parquet"):
+    if session.has("kinematics.parquet"):
         place = (_across_gaps(session.kinematics[name], frames) for name in ("x_mm", "y_mm"))
         drawn["way"] = figures.trajectory(*place, time_s, outlines(session))
-    if has(session, "summary.csv"):
+    if session.has("summary.csv"):
         row = session.summary.iloc[0]
         shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
                   if f"{word}_share" in row]  # fmt: skip
         drawn["budget"] = figures.budget(shares)
-    if has(session, "transitions.parquet"):
+    if session.has("transitions.parquet"):
         drawn["matrix"] = _matrix(session.table("transitions"), words)
-    if has(session, "activity.parquet"):
+    if session.has("activity.parquet"):
         drawn["activity"] = _activity(session.table("activity"), words)
     return drawn
 
 
 def curves(session: Session) -> list[tuple[str, str, str]]:
     """What the body did over time: (title, what it is, SVG)."""
-    if not has(session, "kinematics.parquet"):
+    if not session.has("kinematics.parquet"):
         return []
     frames, moved, bouts = session.frames, session.kinematics, session.bouts
     time_s, time = frames["time_s"].to_numpy(float), figures.time_scale(session.metadata["frames"]["duration_s"])
@@ -76,7 +76,7 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
 
 def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
     """A measure around the onsets of the actions: (title, SVG), all of a measure on the same scale."""
-    if not has(session, "kinematics.parquet"):
+    if not session.has("kinematics.parquet"):
         return []
     moved, made = session.kinematics, []
     for name, title, _, unit, colour, _ in _CURVES:
@@ -136,11 +136,6 @@ def outlines(session: Session) -> list[tuple[str, Array]]:
     walls = session.arena.outline_mm()
     known = [(figures.ARENA, walls)] if len(walls) else []
     return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
-
-
-def has(session: Session, file: str) -> bool:
-    """Whether the session holds a file that not every session has."""
-    return (session.path / file).is_file()
 
 
 def _matrix(table: pd.DataFrame, words: list[str]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from liex_lab.dashboards import figures
-from liex_lab.dashboards.charts import around_actions, charts, curves, has, pictures
+from liex_lab.dashboards.charts import around_actions, charts, curves, pictures
 from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 
 from liex_lab.sessions import Session
@@ -87,7 +87,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
     error = session.frames["predicted_error_mm"].median()
     if np.isfinite(error):
         good.append((f"{error:.1f}", "mm", "predicted joint error, median"))
-    if not has(session, "summary.csv"):
+    if not session.has("summary.csv"):
         return good
     row = session.summary.iloc[0]
     shown = [(f"{row['distance_m']:.2f}", "m", "distance"), (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed")]
@@ -100,7 +100,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
     """The summary as (column, value, unit, meaning), but for the columns of the actions and zones."""
-    if not has(session, "summary.csv"):
+    if not session.has("summary.csv"):
         return []
     described = session.columns[session.columns["table"] == "summary"].set_index("name")
     row = session.summary.iloc[0]
@@ -119,7 +119,7 @@ _BUDGET = (("count", "bouts"), ("s", "time, s"), ("share", "share"), ("mean_s", 
 
 def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
     """A row per action: name, colour, and the numbers that `_BUDGET` names."""
-    if not has(session, "summary.csv"):
+    if not session.has("summary.csv"):
         return []
     row = session.summary.iloc[0]
     rows = []
@@ -134,7 +134,7 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
 
 def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
     """A row per zone: name; time, share, visits, first after, mean visit, distance."""
-    if not has(session, "zones.parquet"):
+    if not session.has("zones.parquet"):
         return []
     table = session.table("zones")
     numbers = table[["time_s", "n_visits", "latency_s", "mean_visit_s", "distance_mm"]].to_numpy(float)
@@ -242,7 +242,7 @@ def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
     columns = session.columns.astype(object).where(session.columns.notna(), "")
     return [
         (file, columns[columns["table"] == table].to_dict("records"))
-        for table, file in _TABLES.items() if (session.path / file).is_file()
+        for table, file in _TABLES.items() if session.has(file)
     ]  # fmt: skip
 
 

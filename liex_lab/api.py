@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.study_state import Standing
     from liex_lab.pipelines.verify import Finding
     from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions.corrections import Correction
 
 DEMO = "mouse_walk.mcap"
 
@@ -56,20 +57,23 @@ def run_session(
     )  # fmt: skip
 
 
-def flip_session(
-    session: str | Path, start_s: float, stop_s: float, *, undo: bool = False, progress: Progress = silent
+def correct_session(
+    session: str | Path,
+    what: Sequence[Correction] = (),
+    *,
+    undo: Sequence[int] = (),
+    author: str = "",
+    progress: Progress = silent,
 ) -> Path:
-    """Exchange head and tail in a span of a session, or take that back; everything in the folder follows.
+    """Add corrections to a session, or take some back by their numbers; tables and report follow.
 
-    start_s, stop_s: seconds since the first frame, stop_s exclusive. The tables as they were tracked stay beside.
+    what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`, everything is made
+    again. author: "" takes who is logged in. What was measured stays as it is; see `liex_lab.sessions.corrections`.
     """
-    from liex_lab.dashboards.blueprint import replay_blueprint
     from liex_lab.dashboards.report import write_report
-    from liex_lab.pipelines.flip import flip_span
+    from liex_lab.pipelines.correct import correct_session as job
 
-    return flip_span(
-        session, start_s, stop_s, undo=undo, blueprint=replay_blueprint, report=write_report, progress=progress
-    )
+    return job(session, what, undo=undo, author=author, report=write_report, progress=progress)
 
 
 def follow_live(

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
+from liex_lab.cli_correct import correct
 from liex_lab.cli_results import compare, export
 from liex_lab.cli_study import cohort, scale, verify
 from liex_lab.errors import LiexError
@@ -34,6 +35,7 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
+app.add_typer(correct, name="correct")
 app.command()(cohort)
 app.command()(verify)
 evaluate.command("scale")(scale)
@@ -411,21 +413,6 @@ def live(
     with progress_bar() as progress:
         result = follow_live(source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress)
     _tell_numbers(result, json_file)
-
-
-@app.command()
-def flip(
-    session: SessionPath,
-    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
-    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
-    undo: Annotated[bool, typer.Option("--undo", help="Take back corrections within this span.")] = False,
-) -> None:
-    """Say that head and tail are exchanged in a span of a session; tables, replay and report follow."""
-    from liex_lab.api import flip_session
-
-    with progress_bar() as progress:
-        done = flip_session(session, start_s, stop_s, undo=undo, progress=progress)
-    _tell_session(done)
 
 
 @app.command()

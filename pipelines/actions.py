@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.session_tracks import track_of, wall_of
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
 from liex_lab.progress import Progress, silent
+from liex_lab.sessions.tracks import track_of, wall_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,19 +150,3 @@ def _session_and_model(session: str | Path, model: str | Path | None) -> tuple[S
     if recogniser.skeleton != skeleton:
         raise LiexError(f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use another")
     return opened, recogniser
-
-
-def human_bouts(session: str | Path, labels: str | Path) -> pd.DataFrame:
-    """The bouts of a session as a person corrected them: the columns of `bouts`, source human, score 1."""
-    from liex_lab.actions.ethogram import Ethogram
-    from liex_lab.actions.labels import HUMAN, words_of
-    from liex_lab.actions.tables import bout_rows
-    from liex_lab.sessions import Session
-
-    opened = Session.open(session)
-    table = read_any_labels(labels)
-    frames = opened.frames
-    named = opened.name if opened.name in _sessions_named(table) else ""
-    words = words_of(table, frames["time_s"].to_numpy(float), named)
-    ethogram = Ethogram.of_words(words, frames["time_ns"].to_numpy(), source=HUMAN)
-    return bout_rows(ethogram, frames, "")

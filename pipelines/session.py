@@ -23,8 +23,10 @@ from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
+    from liex_lab.behaviour.summary import Behaviour
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Session
+    from liex_lab.sessions import Provenance, Session
+    from liex_lab.sessions.rows import Rows
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
 
@@ -86,26 +88,33 @@ def measure_session(
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
-    from liex_lab.behaviour.summary import measure
-
-    around = build_surroundings(writer.origin)
-    recogniser = build_recogniser(plan, writer.origin.skeleton)
-    named = {} if recogniser is None else name_actions(recogniser, writer)
-    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
+    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin)
+    writer.note(**notes)
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
-def name_actions(recogniser: TimelineModel, writer: SessionWriter) -> dict[str, Any]:
-    """The ethogram of a session's track by a recogniser, as `behaviour.measure` takes it; what the frame rate cannot
-    tell is noted in the session.
+def measure_behaviour(rows: Rows, plan: Plan, origin: Provenance) -> tuple[Behaviour, dict[str, Any]]:
+    """The behaviour of a track as the plan names it, and what session.json is to hold of the recogniser."""
+    from liex_lab.behaviour.summary import measure_rows
+
+    recogniser = build_recogniser(plan, origin.skeleton)
+    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows)
+    return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
+
+
+def name_actions(recogniser: TimelineModel, rows: Rows) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which recogniser it was,
+    and what the frame rate cannot tell.
     """
     from liex_lab.actions.tables import bout_rows
+    from liex_lab.sessions.tables import FRAMES, to_pandas
 
-    frames = writer.frames
-    found = recogniser.recognise(writer.track, frames["wall_distance_mm"].to_numpy(float))
-    writer.note(
-        action_model={"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
-        unresolved_actions=found.unresolved,
-    )
+    frames = to_pandas(FRAMES, rows.frames())
+    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float))
+    notes = {
+        "action_model": {"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
+        "unresolved_actions": found.unresolved,
+    }
     actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
-    return {"bouts": bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", ""))), "actions": actions}
+    bouts = bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", "")))
+    return {"bouts": bouts, "actions": actions}, notes

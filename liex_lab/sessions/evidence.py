@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
-_HUMAN = "human"
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
@@ -35,6 +34,15 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     }  # fmt: skip
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     np.savez_compressed(folder / FILE, subject=told, **{name: getattr(seen, name) for name in COLUMNS})
+
+
+def read_skeleton(session: Session) -> Skeleton | None:
+    """The skeleton that a session was made with; None for one that does not hold it."""
+    path = session.path / FILE
+    if not path.is_file():
+        return None
+    with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+        return Skeleton.from_table(json.loads(kept["subject"].tobytes())["skeleton"], str(path))
 
 
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
@@ -66,17 +74,16 @@ def _check_shapes(seen: Observations, n_frames: int) -> None:
             raise ValueError(f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}")
 
 
-def read_corrections(session: Session) -> list[Flip]:
-    """The flips that a human has stated, with frames counted by row."""
+def read_flips(session: Session) -> list[Flip]:
+    """The table `flips`, with frames counted by row."""
     index = session.frames["frame_index"].to_numpy()
     with reading_from(session.path / "flips.parquet"):
-        table = session.flips[session.flips["source"] == _HUMAN]
         return [
             Flip(
                 int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
-                float(row["p_flip"]), bool(row["applied"]), _HUMAN, str(row["undone_at"]),
+                float(row["p_flip"]), bool(row["applied"]), str(row["source"]), str(row.get("undone_at", "")),
             )
-            for row in _rows_of(table)
+            for row in _rows_of(session.flips)
         ]  # fmt: skip
 
 

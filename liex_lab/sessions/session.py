@@ -14,6 +14,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
+from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
 from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
 from liex_lab.sessions.reading import reading_from
 from liex_lab.sessions.tables import as_it_was
@@ -36,8 +37,10 @@ _OPTIONAL = {
 class Session:
     """The results of one recording, read from its folder when asked for. Tables are pandas data frames."""
 
-    def __init__(self, path: Path, metadata: dict[str, Any]) -> None:
-        self.path, self.metadata = path, metadata
+    def __init__(self, path: Path, metadata: dict[str, Any], log: Log | None = None) -> None:
+        self.path = path
+        self.log = log or Log("")  # of corrections; none where they do not apply, or are not wanted
+        self.metadata = {**metadata, **self.log.facts}
 
     @staticmethod
     def create(
@@ -55,8 +58,11 @@ class Session:
         return SessionWriter(Path(path), origin, overwrite=overwrite, blueprint=blueprint, report=report)
 
     @staticmethod
-    def open(path: str | Path) -> Session:
-        """The session in the folder `path`, checked for its version and for missing files."""
+    def open(path: str | Path, *, raw: bool = False) -> Session:
+        """The session in the folder `path`, checked for its version and for missing files.
+
+        raw: as it was measured, without what people corrected (see `liex_lab.sessions.corrections`).
+        """
         folder = Path(path)
         document = folder / "session.json"
         if not document.is_file():
@@ -78,12 +84,21 @@ class Session:
         for name in FILES:
             if name not in _OPTIONAL and not (folder / name).is_file():
                 raise SessionError(f"the session {folder} lacks {name}; run `liex run` on the recording again")
-        return Session(folder, metadata)
+        log = Log("") if raw else read_log(folder)
+        return Session(folder, metadata, log if applies(log, folder, metadata) else None)
 
     @property
     def name(self) -> str:
         """The session's id."""
         return str(self.metadata["session_id"])
+
+    def file(self, name: str) -> Path:
+        """Where a file of the session lies: the corrected one where there is one, else the session's own."""
+        return corrected_folder(self.path) / name if name in self.log.files else self.path / name
+
+    def has(self, name: str) -> bool:
+        """Whether the session holds a file."""
+        return self.file(name).is_file()
 
     @cached_property
     def frames(self) -> pd.DataFrame:
@@ -125,7 +140,7 @@ class Session:
         """The behaviour summary, one row per animal."""
         import pandas as pd
 
-        path = self.path / "summary.csv"
+        path = self.file("summary.csv")
         if not path.is_file():
             raise SessionError(f"the session {self.path} has no summary.csv; it was written without behaviour measures")
         with reading_from(path):
@@ -137,7 +152,7 @@ class Session:
         """The column dictionary: one row per column of every table."""
         import pandas as pd
 
-        with reading_from(self.path / "columns.json") as path:
+        with reading_from(self.file("columns.json")) as path:
             return pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
 
     @cached_property
@@ -174,7 +189,7 @@ class Session:
         """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
         import pandas as pd
 
-        path = self.path / f"{name}.parquet"
+        path = self.file(f"{name}.parquet")
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")

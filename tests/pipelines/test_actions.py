@@ -8,13 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.pipelines.actions import (
-    human_bouts,
     labelled_sessions,
     read_any_labels,
     suggest,
     train_actions,
 )
-from liex_lab.pipelines.session_tracks import track_of, wall_of
 
 from liex_lab.actions.storage import bundled_action_models, find_action_model, load_action_model
 from liex_lab.errors import LiexError
@@ -22,6 +20,9 @@ from liex_lab.exchange import export
 from liex_lab.exchange.boris_labels import read_boris_project
 from liex_lab.recordings import fish_acts, mouse_acts
 from liex_lab.sessions import Session
+from liex_lab.sessions.applying import edited_bouts
+from liex_lab.sessions.correcting import labelled_bouts
+from liex_lab.sessions.tracks import track_of, wall_of
 from tests.sessions.walking_mouse import WalkingMouse, write
 
 LABELS = pd.DataFrame({"action": ["stroll", "tower", "stroll"], "start_s": [0.0, 2.0, 3.5], "stop_s": [2.0, 3.5, 6.0]})
@@ -50,13 +51,16 @@ def test_a_session_gives_back_the_track_it_was_made_from(session: Session, mouse
     np.testing.assert_allclose(track.joints_mm, true.joints_mm, atol=1e-9)
     np.testing.assert_allclose(track.root_rotation, true.root_rotation, atol=1e-9)
     np.testing.assert_allclose(track.angles_rad, true.angles_rad, atol=1e-9)
+    told = ("uv_px", "sd_mm", "sd_root", "sd_angles_rad", "centroid_mm", "residual_mm", "p_flip", "bridged", "flag")
+    for name in told:
+        np.testing.assert_array_equal(getattr(track, name), getattr(true, name), err_msg=name)
     assert wall_of(session).shape == (180,)
 
 
 def test_an_ethogram_goes_to_boris_and_comes_back_as_a_humans(session: Session, tmp_path: Path) -> None:
     project = export(session, "boris", tmp_path / "walk.boris")
     assert session.name in read_boris_project(project)["observations"]
-    back = human_bouts(session.path, project)
+    back = edited_bouts(session.bouts, labelled_bouts(session, read_any_labels(project)), session.frames)
     own = session.bouts
     assert list(back["action"]) == list(own["action"])
     assert np.abs(back["start_s"].to_numpy() - own["start_s"].to_numpy()).max() < 0.034

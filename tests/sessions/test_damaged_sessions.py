@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
-from liex_lab.sessions.evidence import read_corrections, read_evidence, write_evidence
+from liex_lab.sessions.evidence import read_evidence, read_flips, write_evidence
 from liex_lab.sessions.failure import read_failure
 from liex_lab.tracking.curve import Subject
 from liex_lab.tracking.observations import Observations
@@ -28,7 +28,7 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 READS: list[Callable[[Session], Any]] = [
     lambda s: s.name, lambda s: s.frames, lambda s: s.poses, lambda s: s.bouts, lambda s: s.summary,
     lambda s: s.columns, lambda s: s.camera, lambda s: s.T_arena_camera, lambda s: s.arena, lambda s: s.zones,
-    lambda s: s.plan, read_evidence, read_corrections,
+    lambda s: s.plan, read_evidence, read_flips,
 ]  # fmt: skip
 
 
