@@ -199,6 +199,25 @@ def evaluate_tracking(
     return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
 
 
+def evaluate_actions(
+    animal: str = "fish",
+    *,
+    model: str | Path | None = None,
+    pose_model: str | Path | None = None,
+    minutes: float = 30.0,
+    figure: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion matrices."""
+    from functools import partial
+
+    from liex_lab.dashboards.confusion_figure import draw_confusions
+    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+
+    draw = None if figure is None else partial(draw_confusions, path=figure)
+    return measure(animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress)
+
+
 def run_tables(
     out: str | Path,
     animals: Sequence[str] = (),

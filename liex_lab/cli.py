@@ -295,13 +295,21 @@ def evaluate_actions(
         str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
     ] = None,
     minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings."""
-    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
 
+    The recordings are rendered and measured first, which takes about half an hour for all 30 minutes on two cores. What
+    has been measured is kept in the cache folder (LIEX_CACHE), so that a job that was stopped goes on where it was.
+    """
+    from liex_lab.api import evaluate_actions as measure
+
+    figure = None if out is None else out / f"{animal}_confusion.png"
     with progress_bar() as progress:
-        result = measure(animal, model=model, pose_model=pose_model, minutes=minutes, progress=progress)
+        result = measure(
+            animal, model=model, pose_model=pose_model, minutes=minutes, figure=figure, progress=progress
+        )
     _tell_numbers(result, json_file)
 
 
