@@ -20,7 +20,7 @@ from liex_lab.tracking.tuning import Tuning
 
 Array = NDArray[np.float64]
 
-_BLOCK, _MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
+_BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
 _ADMIT = 2.0  # predicted errors: nearer to the curve, a hypothesis that was passed by is a measurement after all
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
@@ -93,7 +93,7 @@ def _smoothed(subject: Subject, seen: Observations, pose: Pose, error: Array, mo
     parts: list[Curve] = []
     n = len(seen)
     for start in range(0, n, _BLOCK):
-        first, last = max(0, start - _MARGIN), min(n, start + _BLOCK + _MARGIN)
+        first, last = max(0, start - MARGIN), min(n, start + _BLOCK + MARGIN)
         rows = slice(first, last)
         curve = smooth(subject.skeleton, seen.seconds[rows], pose[rows], error[rows], subject.length_mm, motion)
         parts.append(curve[start - first : min(start + _BLOCK, n) - first])
