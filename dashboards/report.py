@@ -52,7 +52,7 @@ def render(session: Session) -> str:
         charts=charts(session, words),
         curves=curves(session),
         around=around_actions(session, words),
-        actions=[(word, figures.action_colour(k), session.metadata["actions"][word]) for k, word in enumerate(words)],
+        actions=action_rows(session, words),
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
         zones=zone_rows(session),
@@ -61,6 +61,13 @@ def render(session: Session) -> str:
         methods=methods(session),
         glossary=glossary(session),
     )
+
+
+def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
+    """The vocabulary: word, colour, meaning, and what the recording's frame rate cannot tell of it."""
+    unresolved = session.metadata.get("unresolved_actions") or {}
+    return [(word, figures.action_colour(k), session.metadata["actions"][word], str(unresolved.get(word, "")))
+            for k, word in enumerate(words)]  # fmt: skip
 
 
 def headline(session: Session) -> str:

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.errors import MissingPackageError
 from liex_lab.plan import Plan
 from liex_lab.progress import Board, Progress, progress_board, silent
 from liex_lab.study import Study
@@ -126,6 +127,41 @@ def run_study(
                again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
 
 
+def serve_dashboard(
+    study: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8050,
+    told: Callable[[str], None] = print,
+    progress: Progress = silent,
+) -> None:
+    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears the address.
+
+    On a host other than this machine alone, every visitor has to know a token, which is part of the address. Raises
+    MissingPackageError where the extra `dashboard` is not installed.
+    """
+    import secrets
+
+    from liex_lab.pipelines.listing import list_sessions
+
+    try:
+        from liex_lab.dashboards.app import LOOPBACK, address, make_app, serve
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(
+            f"the dashboard needs {error.name}, which is not installed; pip install 'liex_lab[dashboard]'"
+        ) from None
+    from liex_lab.dashboards.app_data import StudyData
+    from liex_lab.sessions.viewer import show_replay
+
+    name, look = list_sessions(study)
+    data = StudyData(name, look)
+    data.warm(progress)
+    alone = host in LOOPBACK
+    token = "" if alone else secrets.token_urlsafe(24)
+    app = make_app(data, token=token, show_replay=show_replay if alone else None)
+    serve(app, host, port, lambda found: told(address(host, found, token)))
+
+
 def verify_session(
     session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
@@ -161,6 +197,25 @@ def evaluate_tracking(
 
     draw = None if figure is None else partial(draw_tracking, path=figure)
     return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
+
+
+def evaluate_actions(
+    animal: str = "fish",
+    *,
+    model: str | Path | None = None,
+    pose_model: str | Path | None = None,
+    minutes: float = 30.0,
+    figure: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion matrices."""
+    from functools import partial
+
+    from liex_lab.dashboards.confusion_figure import draw_confusions
+    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+
+    draw = None if figure is None else partial(draw_confusions, path=figure)
+    return measure(animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress)
 
 
 def run_tables(

@@ -31,16 +31,16 @@ def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
-    from liex_lab.pipelines.acted import acted_tracks
+    from liex_lab.pipelines.acted import acted, acted_tracks
     from liex_lab.pipelines.action_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
 
     if animal not in WORDS:
         raise LiexError(f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions")
-    tracks = acted_tracks(training_recordings(animal), estimator, progress)
-    usual = by_usual_camera(tracks)
-    slower = [one.at_rate(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
+    recordings = acted(training_recordings(animal), estimator, progress)
+    usual = by_usual_camera(recordings)
+    slower = [one.tracked(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
     cuts = acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
-    return [*tracks, *slower], cuts
+    return [*(one.tracked() for one in recordings), *slower], cuts
 
 
 def train_actions(

@@ -94,7 +94,16 @@ def test_the_bundled_models_know_their_words_and_are_small(animal: str, words: t
     model = load_action_model(animal)
     assert model.skeleton == animal
     assert set(model.words) == {"", *words} == {"", *model.definitions}
-    assert set(model.unresolved((np.arange(9) / 15.0 * 1e9).astype(np.int64))) <= set(words)
+    told = {rate: model.unresolved((np.arange(9) / rate * 1e9).astype(np.int64)) for rate in (15.0, 30.0, 300.0)}
+    quick = {"fish": "c_turn", "mouse": "sniff"}[animal]
+    assert {quick} <= set(told[30.0]) <= set(told[15.0]) <= set(words)
+    assert "at 30 per second" in told[30.0][quick]
+    assert told[300.0] == {}
+
+
+def test_a_c_start_at_30_frames_a_second_is_said_to_be_less_than_a_frame() -> None:
+    told = load_action_model("fish").unresolved((np.arange(9) / 30.0 * 1e9).astype(np.int64))
+    assert "0.02 s, 0.6 frames at 30 per second" in told["c_turn"]
 
 
 def test_an_hour_is_recognised_in_seconds() -> None:
