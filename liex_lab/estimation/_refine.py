@@ -147,7 +147,7 @@ def turning_axes(free, angles, rotations, axes):
 
 @njit(cache=True)
 def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
-    """Derivative (3, 7 + M) of ball b's middle `ball` (3,) by base twist, log scale and the free angles that move it."""
+    """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles."""
     slope[:] = 0.0
     x0, y0, z0 = ball[0] - positions[0, 0], ball[1] - positions[0, 1], ball[2] - positions[0, 2]
     for k in range(3):
@@ -172,24 +172,22 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
                 a = tree.free[f, 0]
                 x, y, z = ex - positions[a, 0], ey - positions[a, 1], ez - positions[a, 2]
                 ax, ay, az = axes[f, 0], axes[f, 1], axes[f, 2]
-                slope[0, _ROOT + m] += share * (ay * z - az * y)
-                slope[1, _ROOT + m] += share * (az * x - ax * z)
-                slope[2, _ROOT + m] += share * (ax * y - ay * x)
+                slope[0, _ROOT + f] += share * (ay * z - az * y)
+                slope[1, _ROOT + f] += share * (az * x - ax * z)
+                slope[2, _ROOT + f] += share * (ax * y - ay * x)
 
 
 @njit(cache=True)
-def _add(row, turns, residual, weight, gradient, curvature):
-    """One residual into the normal equations. row (7 + M,) by base, scale and the free angles `turns` (M,)."""
-    for i in range(row.size):
-        at = i if i < _ROOT else _ROOT + turns[i - _ROOT]
-        if at < _ROOT and i >= _ROOT:
-            break
+def _add(row, residual, weight, gradient, curvature):
+    """One residual into the normal equations."""
+    n = row.size
+    for i in range(n):
+        if row[i] == 0.0:
+            continue
         wi = weight * row[i]
-        gradient[at] += wi * residual
-        for k in range(min(i + 1, _ROOT)):
-            curvature[at, k] += wi * row[k]
-        for k in range(_ROOT, i + 1):
-            curvature[at, _ROOT + turns[k - _ROOT]] += wi * row[k]
+        gradient[i] += wi * residual
+        for k in range(i + 1):
+            curvature[i, k] += wi * row[k]
 
 
 @njit(cache=True)
@@ -221,11 +219,11 @@ def _solve(curvature, gradient, step):
 
 
 @njit(cache=True)
-def _pull(points, balls, radius, tree, slopes, robust, gradient, curvature):
+def _pull(points, balls, radius, slopes, robust, gradient, curvature):
     """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B, 3) passes through
-    it. slopes (n, 3, 7 + M) of the first n balls, which are the body's own.
+    it. slopes (n, 3, P) of the first n balls, which are the body's own.
     """
-    row, which = np.empty(slopes.shape[2]), 0
+    row, which = np.empty(gradient.size), 0
     for i in range(len(points)):
         best, which = nearest_ball(points[i, 0], points[i, 1], points[i, 2], balls, radius, which)
         if which >= len(slopes):
@@ -238,13 +236,13 @@ def _pull(points, balls, radius, tree, slopes, robust, gradient, curvature):
             for p in range(row.size):
                 row[p] -= direction * slopes[which, a, p]
         row[6] -= radius[which]
-        _add(row, tree.turns[which], best, weight, gradient, curvature)
+        _add(row, best, weight, gradient, curvature)
 
 
 @njit(cache=True)
-def _push(heights, look, known, balls, radius, tree, slopes, robust, beside, gradient, curvature):
+def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient, curvature):
     """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal; slopes as in `_pull`."""
-    row, target = np.empty(slopes.shape[2]), np.empty(3)
+    row, target = np.empty(gradient.size), np.empty(3)
     last = heights.shape[0] - 1
     for b in range(len(slopes)):
         r, c = crop_pixel(look, balls[b])
@@ -255,7 +253,7 @@ def _push(heights, look, known, balls, radius, tree, slopes, robust, beside, gra
                 weight = 1.0 / (1.0 + (out / robust) ** 2) ** 2
                 row[:] = slopes[b, 2]
                 row[6] += radius[b]
-                _add(row, tree.turns[b], out, weight, gradient, curvature)
+                _add(row, out, weight, gradient, curvature)
             continue
         nearest_reading(heights, r, c, known)
         a, d = known[r, c, 0], known[r, c, 1]
@@ -266,7 +264,7 @@ def _push(heights, look, known, balls, radius, tree, slopes, robust, beside, gra
             off = balls[b, axis] - target[axis]
             weight = beside / (1.0 + (off / (2.0 * robust)) ** 2)
             row[:] = slopes[b, axis]
-            _add(row, tree.turns[b], off, weight, gradient, curvature)
+            _add(row, off, weight, gradient, curvature)
 
 
 @njit(cache=True)
@@ -325,7 +323,7 @@ def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_r
     n_values, n_joints = _ROOT + len(tree.free), tree.parents.size
     rotations, positions = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3))
     balls, axes = np.empty((len(body.joints), 3)), np.empty((len(tree.free), 3))
-    slopes, step = np.empty((body.n_own, 3, _ROOT + tree.turns.shape[1])), np.empty(n_values)
+    slopes, step = np.empty((body.n_own, 3, n_values)), np.empty(n_values)
     first_angles, first_scale = angles.copy(), scale
     moved = np.zeros(6)  # of the base since the start, step by step
     for _ in range(n_steps):
@@ -335,8 +333,8 @@ def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_r
         for b in range(body.n_own):
             ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
         gradient, curvature, radius = np.zeros(n_values), np.zeros((n_values, n_values)), body.radius * scale
-        _pull(points, balls, radius, tree, slopes, wishes.robust, gradient, curvature)
-        _push(heights, look, known, balls, radius, tree, slopes, wishes.robust, wishes.beside, gradient, curvature)
+        _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
+        _push(heights, look, known, balls, radius, slopes, wishes.robust, wishes.beside, gradient, curvature)
         _hold(tree, wishes.prior, moved, np.log(scale / first_scale), angles - first_angles, gradient, curvature)
         for i in range(n_values):
             curvature[i, i] *= 1.0 + _DAMPING
