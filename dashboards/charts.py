@@ -42,24 +42,24 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
         drawn["lanes"] = figures.lanes(spans, words, lost, time)
     drawn["error"] = figures.curve(time_s, _across_gaps(error, frames), time, "mm", _RED, last=True)
     drawn["errors"] = figures.histogram(error.to_numpy(float), "mm", _RED)
-    if has(session, "kinematics.parquet"):
+    if session.has("kinematics.parquet"):
         place = (_across_gaps(session.kinematics[name], frames) for name in ("x_mm", "y_mm"))
         drawn["way"] = figures.trajectory(*place, time_s, outlines(session))
-    if has(session, "summary.csv"):
+    if session.has("summary.csv"):
         row = session.summary.iloc[0]
         shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
                   if f"{word}_share" in row]  # fmt: skip
         drawn["budget"] = figures.budget(shares)
-    if has(session, "transitions.parquet"):
+    if session.has("transitions.parquet"):
         drawn["matrix"] = _matrix(session.table("transitions"), words)
-    if has(session, "activity.parquet"):
+    if session.has("activity.parquet"):
         drawn["activity"] = _activity(session.table("activity"), words)
     return drawn
 
 
 def curves(session: Session) -> list[tuple[str, str, str]]:
     """What the body did over time: (title, what it is, SVG)."""
-    if not has(session, "kinematics.parquet"):
+    if not session.has("kinematics.parquet"):
         return []
     frames, moved, bouts = session.frames, session.kinematics, session.bouts
     time_s, time = frames["time_s"].to_numpy(float), figures.time_scale(session.metadata["frames"]["duration_s"])
@@ -74,9 +74,22 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
     return made
 
 
+def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
+    """What can be looked at over time: (name with its unit, time s (n,), values (n,), colour), broken at gaps."""
+    frames = session.frames
+    time_s = frames["time_s"].to_numpy(float)
+    made = []
+    if session.has("kinematics.parquet"):
+        moved = session.kinematics
+        shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+        made = [(f"{title}, {unit}", time_s, _across_gaps(moved[name], frames), colour)
+                for name, title, _, unit, colour, _ in _CURVES if name in shown and name in moved]  # fmt: skip
+    return [*made, ("Predicted error, mm", time_s, _across_gaps(frames["predicted_error_mm"], frames), _RED)]
+
+
 def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
     """A measure around the onsets of the actions: (title, SVG), all of a measure on the same scale."""
-    if not has(session, "kinematics.parquet"):
+    if not session.has("kinematics.parquet"):
         return []
     moved, made = session.kinematics, []
     for name, title, _, unit, colour, _ in _CURVES:
@@ -97,8 +110,11 @@ def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
     return made
 
 
-def pictures(session: Session) -> list[tuple[str, str]]:
-    """The kept depth pictures with the skeleton over them: (SVG, caption)."""
+def pictures(session: Session) -> list[tuple[str, str, str, str]]:
+    """The contact sheet: the kept depth pictures with the skeleton over them, in order of time.
+
+    (SVG, when, the action that the ethogram names there or an empty text, its colour).
+    """
     import cv2
 
     made = []
@@ -106,6 +122,7 @@ def pictures(session: Session) -> list[tuple[str, str]]:
     frames = session.frames.set_index("frame_index")
     poses = session.table("poses", ["frame_index", "u_px", "v_px"], [entry["frame_index"] for entry in kept])
     bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
+    words = list(session.metadata.get("actions", {}))
     for entry in kept:
         depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
         if depth is None:
@@ -114,8 +131,17 @@ def pictures(session: Session) -> list[tuple[str, str]]:
         uv = poses.loc[poses["frame_index"] == index, ["u_px", "v_px"]].to_numpy(float)
         reach_mm = 0.9 * float(frames["spine_mm"].median())  # an animal on its feet is about half its length high
         drawn = figures.picture(np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm)
-        made.append((drawn, f"frame {index}, {frames.loc[index, 'time_s']:.2f} s"))
+        time_s = float(frames.loc[index, "time_s"])
+        word = _word_at(session.bouts, time_s)
+        colour = figures.action_colour(words.index(word)) if word in words else ""
+        made.append((drawn, f"{time_s:.2f} s", word, colour))
     return made
+
+
+def _word_at(bouts: pd.DataFrame, time_s: float) -> str:
+    """The action at a moment, empty where none is named."""
+    here = bouts.loc[(bouts["start_s"] <= time_s + 1e-6) & (bouts["stop_s"] > time_s + 1e-6), "action"]
+    return str(here.iloc[0]) if len(here) else ""
 
 
 def outlines(session: Session) -> list[tuple[str, Array]]:
@@ -123,11 +149,6 @@ def outlines(session: Session) -> list[tuple[str, Array]]:
     walls = session.arena.outline_mm()
     known = [(figures.ARENA, walls)] if len(walls) else []
     return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
-
-
-def has(session: Session, file: str) -> bool:
-    """Whether the session holds a file that not every session has."""
-    return (session.path / file).is_file()
 
 
 def _matrix(table: pd.DataFrame, words: list[str]) -> str:

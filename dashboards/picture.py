@@ -16,6 +16,7 @@ from liex_lab.dashboards.report import TEMPLATES
 from liex_lab.sessions import Session
 
 WIDTH, HEIGHT = 860, 690
+_SHOWN = 4  # of the contact sheet
 _STYLE = f"""
 :root {{ color-scheme: light; }}
 main {{ width: {WIDTH}px; padding: 18px 22px; }}
@@ -33,8 +34,11 @@ def page(session: Session) -> str:
     template = (TEMPLATES / "report.html.j2").read_text(encoding="utf-8")
     style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
     drawn = charts(session, list(session.metadata["actions"]))
+    sheet = pictures(session)
+    some = sorted({round(k * (len(sheet) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)} if sheet else ())
     strip = "".join(
-        f"<figure>{svg}<figcaption>{caption}</figcaption></figure>" for svg, caption in pictures(session)
+        f"<figure>{svg}<figcaption><b>{word.replace('_', ' ') or '–'}</b> · {when}</figcaption></figure>"
+        for svg, when, word, _ in (sheet[k] for k in some)
     )
     titled = [("Actions", drawn["lanes"]), *((title, svg) for title, _, svg in curves(session)),
               ("Joint error to be expected", drawn["error"])]  # fmt: skip

@@ -48,7 +48,7 @@ def _of_flips(session: Session) -> list[str]:
 
 
 def _of_measures(session: Session) -> list[str]:
-    if not (session.path / "summary.csv").is_file():
+    if not session.has("summary.csv"):
         return []
     found, row = [], session.summary.iloc[0]
     rules = session.metadata.get("rules") or {}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from liex_lab.dashboards import figures
-from liex_lab.dashboards.charts import around_actions, charts, curves, has, pictures
+from liex_lab.dashboards.charts import around_actions, charts, curves, pictures
 from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 
 from liex_lab.sessions import Session
@@ -51,7 +51,7 @@ def render(session: Session) -> str:
         charts=charts(session, words),
         curves=curves(session),
         around=around_actions(session, words),
-        actions=[(word, figures.action_colour(k), session.metadata["actions"][word]) for k, word in enumerate(words)],
+        actions=action_rows(session, words),
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
         zones=zone_rows(session),
@@ -60,6 +60,13 @@ def render(session: Session) -> str:
         methods=methods(session),
         glossary=glossary(session),
     )
+
+
+def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
+    """The vocabulary: word, colour, meaning, and what the recording's frame rate cannot tell of it."""
+    unresolved = session.metadata.get("unresolved_actions") or {}
+    return [(word, figures.action_colour(k), session.metadata["actions"][word], str(unresolved.get(word, "")))
+            for k, word in enumerate(words)]  # fmt: skip
 
 
 def headline(session: Session) -> str:
@@ -80,7 +87,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
     error = session.frames["predicted_error_mm"].median()
     if np.isfinite(error):
         good.append((f"{error:.1f}", "mm", "predicted joint error, median"))
-    if not has(session, "summary.csv"):
+    if not session.has("summary.csv"):
         return good
     row = session.summary.iloc[0]
     shown = [(f"{row['distance_m']:.2f}", "m", "distance"), (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed")]
@@ -93,7 +100,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
     """The summary as (column, value, unit, meaning), but for the columns of the actions and zones."""
-    if not has(session, "summary.csv"):
+    if not session.has("summary.csv"):
         return []
     described = session.columns[session.columns["table"] == "summary"].set_index("name")
     row = session.summary.iloc[0]
@@ -112,7 +119,7 @@ _BUDGET = (("count", "bouts"), ("s", "time, s"), ("share", "share"), ("mean_s", 
 
 def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
     """A row per action: name, colour, and the numbers that `_BUDGET` names."""
-    if not has(session, "summary.csv"):
+    if not session.has("summary.csv"):
         return []
     row = session.summary.iloc[0]
     rows = []
@@ -127,7 +134,7 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
 
 def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
     """A row per zone: name; time, share, visits, first after, mean visit, distance."""
-    if not has(session, "zones.parquet"):
+    if not session.has("zones.parquet"):
         return []
     table = session.table("zones")
     numbers = table[["time_s", "n_visits", "latency_s", "mean_visit_s", "distance_mm"]].to_numpy(float)
@@ -235,7 +242,7 @@ def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
     columns = session.columns.astype(object).where(session.columns.notna(), "")
     return [
         (file, columns[columns["table"] == table].to_dict("records"))
-        for table, file in _TABLES.items() if (session.path / file).is_file()
+        for table, file in _TABLES.items() if session.has(file)
     ]  # fmt: skip
 
 

@@ -10,14 +10,17 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.errors import MissingPackageError
 from liex_lab.plan import Plan
 from liex_lab.progress import Board, Progress, progress_board, silent
 from liex_lab.study import Study
 
 if TYPE_CHECKING:
+    from liex_lab.pipelines.crew import Crew
     from liex_lab.pipelines.study_state import Standing
     from liex_lab.pipelines.verify import Finding
     from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions.corrections import Correction
 
 DEMO = "mouse_walk.mcap"
 
@@ -30,39 +33,48 @@ def run_session(
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    crew: Crew | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording and write the session folder `out/<recording's name>.liex`; returns it.
 
     recording: a path, or a recording that is open already; plan: None takes the mouse's; folder: the session folder
-    itself, where it should have another name; notes: what session.json is to hold besides. Raises a LiexError that says
-    what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
+    itself, where it should have another name; notes: what session.json is to hold besides; workers: processes that look
+    at stretches of a long recording side by side, or a crew of others; the tables are the same. Raises a LiexError that
+    says what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
     from liex_lab.dashboards.blueprint import replay_blueprint
     from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.crew import Processes
     from liex_lab.pipelines.session import measure_session
 
     plan = plan or Plan.load("mouse")
+    if workers > 1 and crew is None:
+        crew = Processes(workers)
     return measure_session(
         recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
-        report=write_report, progress=progress,
+        report=write_report, crew=crew, progress=progress,
     )  # fmt: skip
 
 
-def flip_session(
-    session: str | Path, start_s: float, stop_s: float, *, undo: bool = False, progress: Progress = silent
+def correct_session(
+    session: str | Path,
+    what: Sequence[Correction] = (),
+    *,
+    undo: Sequence[int] = (),
+    author: str = "",
+    progress: Progress = silent,
 ) -> Path:
-    """Exchange head and tail in a span of a session, or take that back; everything in the folder follows.
+    """Add corrections to a session, or take some back by their numbers; tables and report follow.
 
-    start_s, stop_s: seconds since the first frame, stop_s exclusive. The tables as they were tracked stay beside.
+    what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`, everything is made
+    again. author: "" takes who is logged in. What was measured stays as it is; see `liex_lab.sessions.corrections`.
     """
-    from liex_lab.dashboards.blueprint import replay_blueprint
     from liex_lab.dashboards.report import write_report
-    from liex_lab.pipelines.flip import flip_span
+    from liex_lab.pipelines.correct import correct_session as job
 
-    return flip_span(
-        session, start_s, stop_s, undo=undo, blueprint=replay_blueprint, report=write_report, progress=progress
-    )
+    return job(session, what, undo=undo, author=author, report=write_report, progress=progress)
 
 
 def follow_live(
@@ -115,6 +127,41 @@ def run_study(
                again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
 
 
+def serve_dashboard(
+    study: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8050,
+    told: Callable[[str], None] = print,
+    progress: Progress = silent,
+) -> None:
+    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears the address.
+
+    On a host other than this machine alone, every visitor has to know a token, which is part of the address. Raises
+    MissingPackageError where the extra `dashboard` is not installed.
+    """
+    import secrets
+
+    from liex_lab.pipelines.listing import list_sessions
+
+    try:
+        from liex_lab.dashboards.app import LOOPBACK, address, make_app, serve
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(
+            f"the dashboard needs {error.name}, which is not installed; pip install 'liex_lab[dashboard]'"
+        ) from None
+    from liex_lab.dashboards.app_data import StudyData
+    from liex_lab.sessions.viewer import show_replay
+
+    name, look = list_sessions(study)
+    data = StudyData(name, look)
+    data.warm(progress)
+    alone = host in LOOPBACK
+    token = "" if alone else secrets.token_urlsafe(24)
+    app = make_app(data, token=token, show_replay=show_replay if alone else None)
+    serve(app, host, port, lambda found: told(address(host, found, token)))
+
+
 def verify_session(
     session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
@@ -150,6 +197,25 @@ def evaluate_tracking(
 
     draw = None if figure is None else partial(draw_tracking, path=figure)
     return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
+
+
+def evaluate_actions(
+    animal: str = "fish",
+    *,
+    model: str | Path | None = None,
+    pose_model: str | Path | None = None,
+    minutes: float = 30.0,
+    figure: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion matrices."""
+    from functools import partial
+
+    from liex_lab.dashboards.confusion_figure import draw_confusions
+    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+
+    draw = None if figure is None else partial(draw_confusions, path=figure)
+    return measure(animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress)
 
 
 def run_tables(

@@ -17,8 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 import liex_lab
+from liex_lab.cli_correct import correct
 from liex_lab.cli_results import compare, export
-from liex_lab.cli_study import cohort, scale, verify
+from liex_lab.cli_study import cohort, dashboard, scale, verify
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -34,7 +35,9 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
+app.add_typer(correct, name="correct")
 app.command()(cohort)
+app.command()(dashboard)
 app.command()(verify)
 evaluate.command("scale")(scale)
 app.command()(compare)
@@ -87,6 +90,9 @@ def run(
     topic: TopicName = None,
     settings: Settings = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, help="Processes that share a long recording; the tables are the same.")
+    ] = 1,
 ) -> None:
     """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
     from liex_lab.plan import Plan
@@ -96,7 +102,7 @@ def run(
     from liex_lab.api import run_session
 
     with progress_bar() as progress:
-        session = run_session(recording, chosen, out, overwrite=overwrite, progress=progress)
+        session = run_session(recording, chosen, out, overwrite=overwrite, workers=workers, progress=progress)
     _tell_session(session)
 
 
@@ -289,13 +295,21 @@ def evaluate_actions(
         str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
     ] = None,
     minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings."""
-    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
 
+    The recordings are rendered and measured first, which takes about half an hour for all 30 minutes on two cores. What
+    has been measured is kept in the cache folder (LIEX_CACHE), so that a job that was stopped goes on where it was.
+    """
+    from liex_lab.api import evaluate_actions as measure
+
+    figure = None if out is None else out / f"{animal}_confusion.png"
     with progress_bar() as progress:
-        result = measure(animal, model=model, pose_model=pose_model, minutes=minutes, progress=progress)
+        result = measure(
+            animal, model=model, pose_model=pose_model, minutes=minutes, figure=figure, progress=progress
+        )
     _tell_numbers(result, json_file)
 
 
@@ -403,30 +417,22 @@ def live(
 
 
 @app.command()
-def flip(
-    session: SessionPath,
-    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
-    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
-    undo: Annotated[bool, typer.Option("--undo", help="Take back corrections within this span.")] = False,
-) -> None:
-    """Say that head and tail are exchanged in a span of a session; tables, replay and report follow."""
-    from liex_lab.api import flip_session
-
-    with progress_bar() as progress:
-        done = flip_session(session, start_s, stop_s, undo=undo, progress=progress)
-    _tell_session(done)
-
-
-@app.command()
 def show(
     session: SessionPath,
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser instead of a window.")] = False,
+    at_s: Annotated[float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")] = None,
 ) -> None:
     """Open a session's replay in Rerun."""
     from liex_lab.sessions import Session
+    from liex_lab.sessions.viewer import has_screen, show_replay
 
     replay = Session.open(session).path / "session.rrd"
-    if not web and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if at_s is not None:
+        if web:
+            raise typer.BadParameter("a moment can be shown in a window only; leave out --web or --at")
+        show_replay(replay, at_s).wait()
+        return
+    if not web and not has_screen():
         raise LiexError(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )

@@ -6,6 +6,10 @@ from __future__ import annotations
 class LiexError(Exception):
     """Something the user can put right; the command line prints its message alone, without a traceback."""
 
+    def __str__(self) -> str:
+        """The message on one line, whatever it quotes of the user's own."""
+        return " ".join(super().__str__().splitlines())
+
 
 class RecordingError(LiexError):
     """A recording that cannot be opened or read."""
@@ -33,3 +37,8 @@ class EstimationError(LiexError):
 
 class MissingPackageError(LiexError):
     """An optional package that is needed for what was asked and not installed."""
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of what an error of another package says, as a part of a sentence."""
+    return str(error).strip().partition("\n")[0][:200] or type(error).__name__

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.session_tracks import track_of, wall_of
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
 from liex_lab.progress import Progress, silent
+from liex_lab.sessions.tracks import track_of, wall_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,16 +31,16 @@ def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
-    from liex_lab.pipelines.acted import acted_tracks
+    from liex_lab.pipelines.acted import acted, acted_tracks
     from liex_lab.pipelines.action_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
 
     if animal not in WORDS:
         raise LiexError(f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions")
-    tracks = acted_tracks(training_recordings(animal), estimator, progress)
-    usual = by_usual_camera(tracks)
-    slower = [one.at_rate(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
+    recordings = acted(training_recordings(animal), estimator, progress)
+    usual = by_usual_camera(recordings)
+    slower = [one.tracked(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
     cuts = acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
-    return [*tracks, *slower], cuts
+    return [*(one.tracked() for one in recordings), *slower], cuts
 
 
 def train_actions(
@@ -150,19 +150,3 @@ def _session_and_model(session: str | Path, model: str | Path | None) -> tuple[S
     if recogniser.skeleton != skeleton:
         raise LiexError(f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use another")
     return opened, recogniser
-
-
-def human_bouts(session: str | Path, labels: str | Path) -> pd.DataFrame:
-    """The bouts of a session as a person corrected them: the columns of `bouts`, source human, score 1."""
-    from liex_lab.actions.ethogram import Ethogram
-    from liex_lab.actions.labels import HUMAN, words_of
-    from liex_lab.actions.tables import bout_rows
-    from liex_lab.sessions import Session
-
-    opened = Session.open(session)
-    table = read_any_labels(labels)
-    frames = opened.frames
-    named = opened.name if opened.name in _sessions_named(table) else ""
-    words = words_of(table, frames["time_s"].to_numpy(float), named)
-    ethogram = Ethogram.of_words(words, frames["time_ns"].to_numpy(), source=HUMAN)
-    return bout_rows(ethogram, frames, "")

@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.pipelines.crew import Done, Work, n_cores, worker_environment
 from liex_lab.pipelines.slurm import SlurmTable
 from liex_lab.pipelines.study_one import RunSession, measure_one, quarantine
 from liex_lab.pipelines.study_state import Standing
@@ -105,7 +106,21 @@ def _on_worker(session: PlannedSession, run: RunSession, run_id: str) -> dict[st
             last = now
             worker.log_event(TOPIC, [session.id, done, total, what])
 
-    return measure_one(session, run, tell, run_id)
+    return measure_one(session, run, tell, run_id, Workers())
+
+
+class Workers:
+    """All workers of the cluster that this task runs on, as a crew for the stretches of its session."""
+
+    def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
+        """See `crew.Crew`. The task steps aside meanwhile, and its worker looks at stretches like the others."""
+        from distributed import as_completed, worker_client
+
+        with worker_client() as client:
+            # before any other session, or all of them would be begun at once
+            futures = [client.submit(do, work, priority=10, pure=False) for work in works]
+            for future in as_completed(futures, loop=client.loop):
+                yield future.result()
 
 
 @contextmanager
@@ -144,18 +159,13 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
     """Worker processes on this machine, reached through this machine alone and with keys made for this run."""
     from distributed import LocalCluster, Security
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = n_cores()
     count = max(1, min(workers or (cores + 1) // 2, n_tasks))
     return LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
         memory_limit=0, local_directory=scratch, silence_logs=50, security=Security.temporary(),
         env=worker_environment(threads or max(1, cores // count)),
     )  # fmt: skip
-
-
-def worker_environment(n_threads: int) -> dict[str, str]:
-    """So that workers share the cores instead of each taking all of them."""
-    return {name: str(n_threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
 
 
 def slurm_cluster(table: SlurmTable, scratch: str) -> Any:

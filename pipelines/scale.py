@@ -10,15 +10,18 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from liex_lab.pipelines.build import build_recording
-from liex_lab.pipelines.session import CHUNK
+from liex_lab.pipelines.stretches import CHUNK
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.study import Study
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.recording import Recording
 
 RunSession = Callable[..., Path]
 _VIRTUAL = "synthetic:walk?seed=5&frames={n}&sensor=primesense"
@@ -177,6 +180,20 @@ def _memory(minutes: float, folder: Path) -> float:
     return float(json.loads(done.stdout.splitlines()[-1])["peak_memory_mb"])
 
 
+def looped(short: Recording, n_frames: int) -> Recording:
+    """A recording of any length: the frames of a short one, held in memory, to and fro, at times that run on."""
+    from liex_lab.recordings.recording import Recording
+
+    depth = [short.frame(row).depth for row in range(len(short))]
+    there = [*range(len(depth)), *range(len(depth) - 2, 0, -1)]
+    long = Recording(
+        name="long", format="synthetic", camera=short.camera,
+        times_ns=np.arange(n_frames, dtype=np.int64) * int(1e9 / _FPS), read=lambda row: depth[there[row % len(there)]],
+    )  # fmt: skip
+    long.take_digest("0" * 64)
+    return long
+
+
 def write_long(minutes: float, out: str) -> dict[str, Any]:
     """A session of any length from the frames of a short recording, over and over; returns its cost.
 
@@ -186,17 +203,9 @@ def write_long(minutes: float, out: str) -> dict[str, Any]:
     from liex_lab.pipelines.session import measure_session
 
     from liex_lab.recordings import open_recording
-    from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
 
     with open_recording("synthetic:walk?seed=5&frames=300&sensor=primesense-qvga") as short:
-        depth = [short.frame(row).depth for row in range(len(short))]
-        n, there = int(minutes * 60 * _FPS), [*range(len(depth)), *range(len(depth) - 2, 0, -1)]
-        step = int(1e9 / _FPS)
-        long = Recording(
-            name="long", format="synthetic", camera=short.camera, times_ns=np.arange(n, dtype=np.int64) * step,
-            read=lambda row: depth[there[row % len(there)]],
-        )  # fmt: skip
-        long.take_digest("0" * 64)
+        long = looped(short, int(minutes * 60 * _FPS))
         metadata = Session.open(measure_session(long, Plan.load("mouse"), out)).metadata
     return {name: metadata[name] for name in ("peak_memory_mb", "frames_per_s")}

@@ -15,17 +15,20 @@ from liex_lab.pipelines.build import (
     build_surroundings,
     build_tracker,
 )
+from liex_lab.pipelines.crew import Crew
+from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
+    from liex_lab.behaviour.summary import Behaviour
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Session
+    from liex_lab.sessions import Provenance, Session
+    from liex_lab.sessions.rows import Rows
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
 
-CHUNK = 32  # frames in memory at a time
 
 
 def measure_session(
@@ -38,12 +41,14 @@ def measure_session(
     notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
+    crew: Crew | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
 
     notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
-    lie in the folder, see `Session.create`.
+    lie in the folder, see `Session.create`. crew: looks at stretches of a long recording side by side, where the
+    recording is given by its path; the tables are the same.
     """
     from liex_lab.sessions import Session
     from liex_lab.sessions.checkpoint import check_free, hash_once
@@ -61,6 +66,9 @@ def measure_session(
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
+        if crew is not None and isinstance(recording, str | Path) and len(opened) > LENGTH:
+            whole = Stretch(str(recording), plan, tracker, provenance, folder, 0, len(opened))
+            look_side_by_side(crew, whole, folder, progress)
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
             writer.go_on(lambda row: opened.frame(row).depth)
             for frames in opened.chunks(CHUNK, writer.n_frames):
@@ -68,7 +76,7 @@ def measure_session(
                 seen = tracker.observe(frames)
                 timings["track"] += time.perf_counter() - began
                 writer.add(frames, seen=seen)
-                progress(frames[-1].index + 1, len(opened), "measuring poses")
+                progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
             whole = writer.seen(Observations)
             writer.take(tracker.track(whole), whole, tracker.subject)
@@ -80,26 +88,33 @@ def measure_session(
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
-    from liex_lab.behaviour.summary import measure
-
-    around = build_surroundings(writer.origin)
-    recogniser = build_recogniser(plan, writer.origin.skeleton)
-    named = {} if recogniser is None else name_actions(recogniser, writer)
-    behaviour = measure(writer.frames, writer.poses, build_rules(plan), around, writer.gaps, **named)
+    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin)
+    writer.note(**notes)
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
-def name_actions(recogniser: TimelineModel, writer: SessionWriter) -> dict[str, Any]:
-    """The ethogram of a session's track by a recogniser, as `behaviour.measure` takes it; what the frame rate cannot
-    tell is noted in the session.
+def measure_behaviour(rows: Rows, plan: Plan, origin: Provenance) -> tuple[Behaviour, dict[str, Any]]:
+    """The behaviour of a track as the plan names it, and what session.json is to hold of the recogniser."""
+    from liex_lab.behaviour.summary import measure_rows
+
+    recogniser = build_recogniser(plan, origin.skeleton)
+    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows)
+    return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
+
+
+def name_actions(recogniser: TimelineModel, rows: Rows) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which recogniser it was,
+    and what the frame rate cannot tell.
     """
     from liex_lab.actions.tables import bout_rows
+    from liex_lab.sessions.tables import FRAMES, to_pandas
 
-    frames = writer.frames
-    found = recogniser.recognise(writer.track, frames["wall_distance_mm"].to_numpy(float))
-    writer.note(
-        action_model={"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
-        unresolved_actions=found.unresolved,
-    )
+    frames = to_pandas(FRAMES, rows.frames())
+    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float))
+    notes = {
+        "action_model": {"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
+        "unresolved_actions": found.unresolved,
+    }
     actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
-    return {"bouts": bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", ""))), "actions": actions}
+    bouts = bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", "")))
+    return {"bouts": bouts, "actions": actions}, notes

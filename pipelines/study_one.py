@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
+from liex_lab.pipelines.crew import Crew
+from liex_lab.pipelines.stretches import MEASURING
 from liex_lab.pipelines.study_state import input_stamp, set_aside
 
 from liex_lab.errors import RecordingError
@@ -15,25 +17,24 @@ from liex_lab.progress import Progress, silent
 from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
 from liex_lab.study import PlannedSession
 
-MEASURING = "measuring poses"
-
 
 class RunSession(Protocol):
     """What measures a recording: `liex_lab.api.run_session`, which knows the views as well."""
 
     def __call__(
-        self, recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], progress: Progress
+        self, recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], crew: Crew | None,
+        progress: Progress,
     ) -> Path:
         """Write the session folder `folder`."""
 
 
 def measure_one(
-    session: PlannedSession, run: RunSession, progress: Progress = silent, run_id: str = ""
+    session: PlannedSession, run: RunSession, progress: Progress = silent, run_id: str = "", crew: Crew | None = None
 ) -> dict[str, Any]:
     """Measure a session; returns how it went: id, state 'done' or 'failed', seconds, and the failure.
 
     Done twice it does the same: what was interrupted goes on, what is there is replaced when the new one is whole.
-    run_id: of the study's run; what that has ended already is not done again.
+    run_id: of the study's run; what that has ended already is not done again. crew: looks at stretches of it.
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
@@ -50,7 +51,7 @@ def measure_one(
             raise RecordingError(f"there is no recording {session.recording}; correct its path, or copy it there")
         stamp = input_stamp(session.recording)
         run(session.recording, session.plan, folder=session.folder, overwrite=True,
-            notes={"input": {"stamp": stamp}, "run_id": run_id}, progress=watch)  # fmt: skip
+            notes={"input": {"stamp": stamp}, "run_id": run_id}, crew=crew, progress=watch)  # fmt: skip
     except Exception as error:
         failure = describe_failure(error, stage, frame) | {"run_id": run_id}
         quarantine(session, failure)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +40,8 @@ def verify_session(
     """
     from liex_lab.sessions import Session
 
-    session = Session.open(path)
-    found = [*_provenance(session), *_files(session), *_logs(session), *_model(session)]
+    session = Session.open(path, raw=True)
+    found = [*_provenance(session), *_files(session), *_logs(session), *_model(session), *_corrections(session)]
     return [*found, *_again(session, run, recording, progress)] if recording else found
 
 
@@ -58,21 +58,49 @@ def _provenance(session: Session) -> Iterator[Finding]:
 
 def _files(session: Session) -> Iterator[Finding]:
     """Every file against its bytes and its hash."""
-    from liex_lab.catalog import sha256
-
     stated = session.metadata.get("files")
     if not isinstance(stated, dict):
         return
+    wrong = _changed(session.path, stated)
+    yield from (Finding("wrong", sentence) for sentence in wrong)
+    if not wrong:
+        yield Finding("ok", f"{len(stated)} files are as they were written")
+
+
+def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
+    """What is wrong with files of a folder whose bytes and hashes are stated."""
+    from liex_lab.catalog import sha256
+
     wrong = []
     for name, facts in stated.items():
-        file = session.path / Path(name).name
+        file = folder / Path(name).name
         if not file.is_file():
             wrong.append(f"{name} is missing")
         elif file.stat().st_size != facts.get("bytes") or ("sha256" in facts and sha256(file) != facts["sha256"]):
             wrong.append(f"{name} was changed")
-    yield from (Finding("wrong", sentence) for sentence in wrong)
+    return wrong
+
+
+def _corrections(session: Session) -> Iterator[Finding]:
+    """What people corrected: whether the log can be read, and its tables are those that were made with it."""
+    from liex_lab.sessions.corrections import applies, corrected_folder, read_log
+
+    try:
+        log = read_log(session.path)
+    except SessionError as error:
+        yield Finding("wrong", str(error))
+        return
+    if not log.standing:
+        return
+    if not applies(log, session.path, session.metadata):
+        yield Finding("note", "its corrections were made on another measurement; `liex correct redo` applies them")
+        return
+    wrong = _changed(corrected_folder(session.path), log.files)
+    yield from (Finding("wrong", f"of the corrected tables, {sentence}; see `liex correct redo`") for sentence in wrong)
     if not wrong:
-        yield Finding("ok", f"{len(stated)} files are as they were written")
+        authors = ", ".join(sorted({entry.author for entry in log.standing}))
+        told = f"{len(log.standing)} corrections ({authors}) stand beside it"
+        yield Finding("ok", f"{told}, and their {len(log.files)} tables are as they were written")
 
 
 def _logs(session: Session) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ from liex_lab import api, cli
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
-VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "flip", "show", "info"]
+VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "correct", "show", "info"]
 MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking"]
 
 
@@ -123,7 +123,7 @@ def test_interrupting_leaves_without_a_traceback() -> None:
 def test_run_hands_the_plan_with_its_settings_to_the_job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: dict[str, Any] = {}
 
-    def run_session(recording: Path, plan: Plan, out: Path, *, overwrite: bool, progress: Any) -> Path:
+    def run_session(recording: Path, plan: Plan, out: Path, *, overwrite: bool, workers: int, progress: Any) -> Path:
         progress(1, 2, "working")
         progress(2, 2, "working")
         progress(0, None, "closing")

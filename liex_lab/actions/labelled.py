@@ -38,14 +38,6 @@ class LabelledTrack:
         truth = None if self.truth is None else self.truth[rows]
         return LabelledTrack(some_rows(self.track, rows), self.words[rows], self.animal, self.wall_mm[rows], truth)
 
-    def at_rate(self, rate_hz: float) -> LabelledTrack:
-        """What a slower camera would have seen: the frames nearest to its times."""
-        times = (self.track.times_ns - self.track.times_ns[:1]) * 1e-9
-        wanted = np.arange(0.0, times[-1] + 1e-9, 1.0 / rate_hz)
-        after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-        rows = np.where(wanted - times[after - 1] < times[after] - wanted, after - 1, after)
-        return self[np.unique(rows)]
-
 
 def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:
     """Some frames of a track."""

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, one_line
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
@@ -24,7 +24,7 @@ def read_labels(path: str | Path) -> pd.DataFrame:
     try:
         table = pd.read_parquet(source) if source.suffix == ".parquet" else pd.read_csv(source)
     except (OSError, ValueError) as error:
-        raise LiexError(f"{source} should be a table of bouts, as CSV or parquet, but: {error}") from None
+        raise LiexError(f"{source} should be a table of bouts, as CSV or parquet, but: {one_line(error)}") from None
     lacking = [name for name in _NEEDED if name not in table]
     if lacking:
         raise LiexError(
@@ -36,16 +36,23 @@ def read_labels(path: str | Path) -> pd.DataFrame:
 
 def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
     """A table of bouts that can be used, in order of time."""
-    times = table[["start_s", "stop_s"]].apply(pd.to_numeric, errors="coerce")
-    wrong = np.flatnonzero(~np.isfinite(times).all(axis=1) | (times["stop_s"] <= times["start_s"]))
+    times = pd.DataFrame({name: _numbers(table[name]) for name in ("start_s", "stop_s")})
+    start, stop = (times[name].to_numpy() for name in ("start_s", "stop_s"))
+    wrong = np.flatnonzero(~np.isfinite(start) | ~np.isfinite(stop) | (stop <= start))
     if len(wrong):
-        row = table.iloc[wrong[0]]
+        row = {name: " ".join(str(table[name].iloc[wrong[0]]).split())[:80] for name in _NEEDED}
         raise LiexError(
             f"{origin}: each bout starts before it stops, in seconds; the one of {row['action']} in row {wrong[0] + 1} "
             f"has start_s={row['start_s']} and stop_s={row['stop_s']}"
         )
-    out = table.assign(start_s=times["start_s"], stop_s=times["stop_s"], action=table["action"].astype(str))
+    out = table.reset_index(drop=True).assign(action=table["action"].to_numpy().astype(str), **times)
     return out.sort_values("start_s", kind="stable").reset_index(drop=True)
+
+
+def _numbers(column: pd.Series) -> NDArray[np.float64]:
+    """A column (n,) as numbers, NaN where there is none."""
+    plain = column.dtype.kind in "iuf"
+    return np.asarray(pd.to_numeric(column if plain else column.astype(str), errors="coerce").to_numpy(np.float64))
 
 
 def words_of(table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str = "") -> NDArray[np.str_]:

@@ -17,6 +17,7 @@ from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.channels import Stretch, channel_names, stretches_of
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops
 from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.windows import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.tracking.track import Track
@@ -28,7 +29,8 @@ _CLOCK_HZ = 30.0
 _PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
 _LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
 _SPEED_S, _SLACK, _STILL, _UNSEEN = 0.2, 1.25, 0.1, 6.0  # half window; how far beyond is meant, and what it costs
-_TICKS_NEEDED = 3.0  # frames within a bout for its shape to be seen
+_FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
+_RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
 
 
 @dataclass(frozen=True)
@@ -108,18 +110,25 @@ class TimelineModel:
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
-        """Per word, what this frame rate cannot tell: actions whose shortest bouts hold fewer than three frames."""
+        """Per word, what this frame rate cannot tell: bouts that hold fewer than four frames, and parts of an action
+        that are over before a camera can follow them (`vocabulary.FASTEST`).
+        """
         if len(times_ns) < 2:
             return {}
         rate = 1e9 / float(np.median(np.diff(times_ns)))
-        found = {}
+        fastest, found = FASTEST.get(self.skeleton, {}), {}
         for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):
-            if word != UNLABELLED and shortest * rate < _TICKS_NEEDED:
-                found[word] = (
-                    f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at {rate:.0f} per second: "
-                    f"they may be missed, and their latency and peak speed cannot be told below "
-                    f"{_TICKS_NEEDED / shortest:.0f} frames per second"
-                )
+            told = []
+            if word != UNLABELLED and shortest * rate < _FRAMES_NEEDED:
+                told.append(f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at {rate:.0f} per "
+                            "second, and may be missed")  # fmt: skip
+            part = fastest.get(word)
+            if part is not None and rate < part.least_hz - _RATE_SLACK_HZ:
+                told.append(f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} frames at "
+                            f"{rate:.0f} per second: that it happened may be told, but not how fast, how often or when "
+                            f"exactly, which wants {part.least_hz:.0f} per second")  # fmt: skip
+            if told:
+                found[word] = "; ".join(told)
         return found
 
     def name(self, track: Track, wall_mm: Array | None = None) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 DEFINITIONS: dict[str, dict[str, str]] = {
     "fish": {
         "scoot": "forward swim with tail beats, 0.7 to 4 lengths/s, bends below about 32 degrees in all, no turn",
@@ -31,3 +33,26 @@ DEFINITIONS: dict[str, dict[str, str]] = {
         "stretch_attend": "body long, low and straight, below 5 cm/s",
     },
 }
+
+
+class Fastest(NamedTuple):
+    """The fastest part of an action: what it is, how long it takes, and from which frame rate on it can be followed."""
+
+    what: str
+    seconds: float
+    least_hz: float
+
+
+_BEAT = Fastest("a beat of the tail", 0.1, 40.0)  # up to 10 Hz in adults; a frequency is told up to rate / 4
+FASTEST: dict[str, dict[str, Fastest]] = {
+    "fish": {
+        "c_turn": Fastest("its first bend", 0.02, 250.0),
+        "scoot": _BEAT, "surface": _BEAT, "dive": _BEAT, "thrash": _BEAT,
+        "zigzag": Fastest("one of its turns", 0.16, 20.0),
+    },
+    "mouse": {
+        "groom": Fastest("a stroke", 0.17, 30.0),
+        "sniff": Fastest("one movement of the head", 0.1, 40.0),
+        "dart": Fastest("its start", 0.12, 25.0),
+    },
+}  # fmt: skip

@@ -4,7 +4,7 @@ from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.kinematics import kinematics
 from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.places import Surroundings
-from liex_lab.behaviour.summary import Behaviour, measure, measure_session, summarise
+from liex_lab.behaviour.summary import Behaviour, measure, measure_rows, measure_session, summarise
 
 __all__ = [
     "ACTIONS",
@@ -15,6 +15,7 @@ __all__ = [
     "kinematics",
     "measure",
     "measure_bouts",
+    "measure_rows",
     "measure_session",
     "summarise",
 ]

@@ -28,10 +28,11 @@ from liex_lab.behaviour.places import (
 from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
 from liex_lab.behaviour.transitions import transitions
 from liex_lab.sessions.rows import stop_times
-from liex_lab.sessions.tables import GAPS, empty_table, to_pandas
+from liex_lab.sessions.tables import FRAMES, GAPS, empty_table, to_pandas
 
 if TYPE_CHECKING:
     from liex_lab.sessions import Session
+    from liex_lab.sessions.rows import Rows
 
 Array = NDArray[np.float64]
 
@@ -94,16 +95,29 @@ def measure(
     )  # fmt: skip
 
 
-def measure_session(session: Session, rules: MouseRules | None = None) -> Behaviour:
-    """The behaviour tables of a session made anew from its folder alone, with its own ethogram and thresholds."""
+def measure_rows(
+    rows: Rows, rules: MouseRules | None = None, around: Surroundings | None = None, **named: Any
+) -> Behaviour:  # fmt: skip
+    """`measure` of a track that is not in a session yet."""
+    frames, gaps = to_pandas(FRAMES, rows.frames()), to_pandas(GAPS, rows.gaps())
+    return measure(frames, rows.measured(), rules, around, gaps, **named)
+
+
+def stated_by(session: Session) -> tuple[MouseRules, Surroundings]:
+    """The thresholds and the surroundings that a session states."""
     about = session.metadata
     known = about.get("rules") or {}
     stated = {name: known[name] for name in MouseRules.__dataclass_fields__ if name in known}
     surface = surface_height_mm(about["camera"]["floor_distance_mm"], about["camera"].get("optics", {}))
-    around = Surroundings(session.arena, [zone.name for zone in session.zones], surface)
+    return MouseRules(**stated), Surroundings(session.arena, [zone.name for zone in session.zones], surface)
+
+
+def measure_session(session: Session, rules: MouseRules | None = None) -> Behaviour:
+    """The behaviour tables of a session made anew from its folder alone, with its own ethogram and thresholds."""
+    stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
-    return measure(session.frames, poses, rules or MouseRules(**stated), around, session.gaps,
-                   bouts=session.bouts, actions=about.get("actions", {}))  # fmt: skip
+    return measure(session.frames, poses, rules or stated, around, session.gaps,
+                   bouts=session.bouts, actions=session.metadata.get("actions", {}))  # fmt: skip
 
 
 def summarise(

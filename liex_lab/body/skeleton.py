@@ -29,6 +29,7 @@ FOREGROUNDS = ("background", "nearest")
 _BEHIND_MM, _SMOOTH_MM = 120.0, 2.0  # of an animal of the reference length
 _MIN_HEIGHT_MM = 7.0
 _AREA = (0.12, 1.3)
+_HUGE = 1e9  # no number of a skeleton is as large
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class View:
     def from_table(table: dict[str, Any], relative_size: float, origin: str) -> View:
         """The view that a TOML states; what it leaves out follows from the animal's size."""
         known = View.__annotations__
+        if not isinstance(table, dict):
+            raise LiexError(f"{origin}: [view] is a table, got {table!r}")
         for key in table:
             if key not in known:
                 raise LiexError(f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}")
@@ -123,9 +126,11 @@ class Skeleton:
     @staticmethod
     def from_table(table: dict[str, Any], origin: str) -> Skeleton:
         """A skeleton from the content of its TOML; `origin` names the file in errors."""
-        joints = table.get("joints")
+        joints, surface = table.get("joints"), table.get("surface", {})
         if not isinstance(table.get("name"), str) or not isinstance(joints, list) or not joints:
             raise LiexError(f"{origin}: a skeleton needs a name and at least one [[joints]] table")
+        if not isinstance(surface, dict):
+            raise LiexError(f"{origin}: [surface] is a table, got {surface!r}")
         rows = [_Joint.parse(joint, k, origin) for k, joint in enumerate(joints)]
         names = [row.name for row in rows]
         parents = []
@@ -141,7 +146,7 @@ class Skeleton:
         axes[0] = True
         offsets = np.array([row.offset for row in rows], float)
         relative_size = _relative_size(parents, offsets)
-        if relative_size <= 0.0:
+        if not 0.0 < relative_size < math.inf:
             raise LiexError(f"{origin}: a skeleton needs a second joint at some distance from the first one")
         return Skeleton(
             name=table["name"],
@@ -151,7 +156,7 @@ class Skeleton:
             rest=so3.exp(np.radians([row.rest for row in rows])),
             axes=axes,
             limits=np.radians([row.limits for row in rows]),
-            surface=table.get("surface", {}),
+            surface=surface,
             view=View.from_table(table.get("view", {}), relative_size, origin),
             table=table,
         )
@@ -235,7 +240,7 @@ def _relative_size(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _HUGE
 
 
 @dataclass(frozen=True)
@@ -251,7 +256,7 @@ class _Joint:
 
     @staticmethod
     def parse(table: dict[str, Any], index: int, origin: str) -> _Joint:
-        name = table.get("name")
+        name = table.get("name") if isinstance(table, dict) else None
         if not isinstance(name, str):
             raise LiexError(f"{origin}: joint {index} has no name")
         where = f"{origin}: joint '{name}'"
@@ -262,8 +267,9 @@ class _Joint:
         if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
             raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
         limits_deg = table.get("limits_deg", {})
-        limits = [limits_deg.get(axis, [-180.0, 180.0] if axis in axes else [0.0, 0.0]) for axis in AXES]
-        if any(len(pair) != 2 or not pair[0] <= pair[1] for pair in limits):
+        usual = {axis: [-180.0, 180.0] if axis in axes else [0.0, 0.0] for axis in AXES}
+        limits = [limits_deg.get(axis, usual[axis]) for axis in AXES] if isinstance(limits_deg, dict) else []
+        if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
             raise LiexError(f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}")
         return _Joint(
             name,
@@ -275,7 +281,11 @@ class _Joint:
         )
 
 
+def _is_range(pair: Any) -> bool:
+    return isinstance(pair, list) and [_is_number(x) for x in pair] == [True, True] and pair[0] <= pair[1]
+
+
 def _triple(value: Any, where: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != 3 or not all(isinstance(x, int | float) for x in value):
+    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value):
         raise LiexError(f"{where} is a list of three numbers, got {value}")
     return [float(x) for x in value]

@@ -19,6 +19,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
+from liex_lab.errors import LiexError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.threads import threads
 
@@ -44,7 +45,18 @@ class Surface:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Surface:
-        """The surface that the skeleton's TOML describes."""
+        """The surface that the skeleton's TOML describes. Raises LiexError where it describes none."""
+        try:
+            with np.errstate(all="raise", under="ignore"):
+                return Surface._of(skeleton)
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' cannot be read ({type(error).__name__}: {one_line(error)}); "
+                "compare it with that of a bundled skeleton"
+            ) from None
+
+    @staticmethod
+    def _of(skeleton: Skeleton) -> Surface:
         table = skeleton.surface
         if "stations" in table:
             shape = BodyShape.default(skeleton)

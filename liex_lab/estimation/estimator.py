@@ -181,7 +181,7 @@ class PoseEstimator:
     def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
         size = size if self.model.method.session_size else 1.0
-        return self._estimates(self._look(depths, scene, size, parallel)[0], scene, size, parallel)
+        return self._estimates(self._look(depths, scene, size, parallel)[0], size, parallel)
 
     def hypotheses(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
@@ -191,11 +191,26 @@ class PoseEstimator:
         are not found.
         """
         size = size if self.model.method.session_size else 1.0
-        found: list[Estimates] = []
-        for sight in self._look(depths, scene, size, parallel):
-            best = self._estimates(sight, scene, size, parallel)
-            found += [best, self._estimates(sight.opposite(best.found, self.skeleton.tip), scene, size, parallel)]
-        return tuple(found)
+        first, second = (self._ways(s, size, parallel) for s in self._look(depths, scene, size, parallel))
+        return (*first, *second)
+
+    def best_of(self, crops: Crops, looks: Array, size: float, parallel: bool = True) -> Estimates:
+        """The pose of each height map (n), camera frame; see `estimate`."""
+        size = size if self.model.method.session_size else 1.0
+        return self._estimates(self._sighted(crops, looks, size, parallel), size, parallel)
+
+    def both_ways(self, crops: Crops, looks: Array, size: float, parallel: bool = True) -> tuple[Estimates, Estimates]:
+        """The same, and the best pose that points the other way; see `hypotheses`."""
+        size = size if self.model.method.session_size else 1.0
+        return self._ways(self._sighted(crops, looks, size, parallel), size, parallel)
+
+    def _sighted(self, crops: Crops, looks: Array, size: float, parallel: bool) -> _Sight:
+        rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
+        return _Sight(crops, looks, rotations, positions, scores)
+
+    def _ways(self, sight: _Sight, size: float, parallel: bool) -> tuple[Estimates, Estimates]:
+        best = self._estimates(sight, size, parallel)
+        return best, self._estimates(sight.opposite(best.found, self.skeleton.tip), size, parallel)
 
     def _look(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
@@ -218,11 +233,9 @@ class PoseEstimator:
         """The thing of that rank in each frame, and its candidates."""
         camera_view = self.model.method.camera_view
         crops = scene.extract(depths, size, parallel, camera_view, rank=rank)
-        looks = scene.looks(crops, camera_view)
-        rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
-        return _Sight(crops, looks, rotations, positions, scores)
+        return self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
 
-    def _estimates(self, sight: _Sight, scene: Foreground, size: float, parallel: bool) -> Estimates:
+    def _estimates(self, sight: _Sight, size: float, parallel: bool) -> Estimates:
         """The chosen poses of what was seen, in the camera frame."""
         crops = sight.crops
         usable = crops.found & np.isfinite(sight.scores).any(axis=1)

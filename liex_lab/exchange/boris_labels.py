@@ -6,7 +6,9 @@ A project is JSON; state events are pairs of rows, start and stop. `liex export 
 from __future__ import annotations
 
 import gzip
+import io
 import json
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,10 @@ from typing import Any
 import pandas as pd
 
 from liex_lab.actions.labels import HUMAN, checked
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, one_line
 
 _STATE = "State event"
+_MOST_BYTES = 1 << 28  # unpacked
 
 
 def read_boris_project(path: str | Path) -> dict[str, Any]:
@@ -24,9 +27,9 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
     source = Path(path)
     try:
         raw = source.read_bytes()
-        document = json.loads(gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw)
-    except (OSError, EOFError, ValueError) as error:
-        raise LiexError(f"{source} should be a BORIS project (JSON), but: {error}") from None
+        document = json.loads(_unpacked(raw) if raw[:2] == b"\x1f\x8b" else raw)
+    except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
+        raise LiexError(f"{source} should be a BORIS project (JSON), but: {one_line(error)}") from None
     if not isinstance(document, dict) or not isinstance(document.get("observations"), dict):
         raise LiexError(f"{source} should be a BORIS project, but holds no observations; save it from BORIS again")
     return document
@@ -43,8 +46,10 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
               if str(b.get("type", _STATE)).lower().startswith("point")}  # fmt: skip
     rows: list[dict[str, Any]] = []
     for name, observation in document["observations"].items():
-        offset = float(observation.get("time offset") or 0.0)
-        rows += _pairs(observation.get("events", []), points, str(name), offset, path)
+        name = " ".join(str(name).split())
+        if not isinstance(observation, dict):
+            raise LiexError(f"{path}: the observation {name} is none; save the project from BORIS again")
+        rows += _pairs(observation.get("events", []), points, name, _offset(observation, name, path), path)
     columns = ["session_id", "individual", "action", "start_s", "stop_s", "source"]
     return checked(pd.DataFrame(rows, columns=columns), str(path))
 
@@ -55,7 +60,7 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
     try:
         table = pd.read_csv(source, sep="\t" if source.suffix == ".tsv" else ",")
     except (OSError, ValueError) as error:
-        raise LiexError(f"{source} should be an export of BORIS, but: {error}") from None
+        raise LiexError(f"{source} should be an export of BORIS, but: {one_line(error)}") from None
     wanted = {"Observation id": "session_id", "Subject": "individual", "Behavior": "action", "Start (s)": "start_s",
               "Stop (s)": "stop_s"}  # fmt: skip
     lacking = [name for name in wanted if name not in table]
@@ -70,6 +75,23 @@ def is_boris_export(path: str | Path) -> bool:
     """Whether a table's first line is that of BORIS's exports."""
     with Path(path).open(encoding="utf-8", errors="replace") as file:
         return file.readline().lstrip("\ufeff").startswith(("Observation id", '"Observation id"'))
+
+
+def _unpacked(raw: bytes) -> bytes:
+    """What gzip packed, up to the size of any project."""
+    with gzip.open(io.BytesIO(raw)) as file:
+        text = file.read(_MOST_BYTES + 1)
+    if len(text) > _MOST_BYTES:
+        raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MB")
+    return text
+
+
+def _offset(observation: dict[str, Any], name: str, path: str | Path) -> float:
+    """The observation's time offset, s."""
+    try:
+        return float(observation.get("time offset") or 0.0)
+    except (TypeError, ValueError, OverflowError):
+        raise LiexError(f"{path}: the observation {name} has a time offset that is no number; correct it") from None
 
 
 def _pairs(
@@ -90,7 +112,7 @@ def _pairs(
             start = begun.pop(key)
             rows.append({"session_id": name, "individual": key[0], "action": key[1], "start_s": start - offset,
                          "stop_s": float(time) - offset, "source": HUMAN})  # fmt: skip
-    except (TypeError, ValueError, IndexError):
+    except (TypeError, ValueError, IndexError, OverflowError, KeyError):
         raise LiexError(f"{path}: the observation {name} has an event that cannot be read; check it in BORIS") from None
     if begun:
         (_, code, _), start = next(iter(begun.items()))

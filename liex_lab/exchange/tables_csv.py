@@ -11,8 +11,10 @@ from liex_lab.sessions import Session
 def write(session: Session, path: Path) -> None:
     """The folder `path` with one file per table, numbers in full precision, and columns.json."""
     path.mkdir()
-    for table in sorted(session.path.glob("*.parquet")):
-        session.table(table.stem).to_csv(path / f"{table.stem}.csv", index=False, lineterminator="\n")
+    for name in sorted({file.name for file in session.path.glob("*.parquet")} | set(session.log.files)):
+        if name.endswith(".parquet"):
+            table = name.removesuffix(".parquet")
+            session.table(table).to_csv(path / f"{table}.csv", index=False, lineterminator="\n")
     for name in ("summary.csv", "columns.json"):
-        if (session.path / name).is_file():
-            shutil.copyfile(session.path / name, path / name)
+        if session.has(name):
+            shutil.copyfile(session.file(name), path / name)

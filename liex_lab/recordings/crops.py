@@ -147,9 +147,10 @@ class Windows:
         intrinsics[:, 2:] -= self.origin
         plane[:, 2] += plane[:, 0] * self.origin[:, 0] + plane[:, 1] * self.origin[:, 1]
         margin = np.broadcast_to(np.asarray(min_height_mm, np.float32), (n,)).copy()
-        rotation = np.empty((n, 3, 3))
+        rotation, of_whom = np.empty((n, 3, 3)), np.hstack([self.inverse_depth, self.intrinsics])
         for k in range(n):
-            floor = self.floor(k)
+            if not k or (of_whom[k] != of_whom[k - 1]).any():  # many in a row are often before one camera
+                floor = self.floor(k)
             crops.distance[k] = floor.distance_mm
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
         kernels.extract_windows(

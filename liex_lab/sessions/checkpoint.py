@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -24,8 +25,9 @@ from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.lock import take_lock
 
 EVERY_S = 3.0  # between two checkpoints: as much work is lost at most, besides what it takes to begin
-_STATE, _LOCK, _SEEN, _INPUT = "checkpoint.json", "lock", "seen", "input.json"
-OWN = (_STATE, _LOCK, _SEEN, _INPUT)  # what is no part of the finished session
+_STATE, _LOCK, _SEEN, _INPUT, STRETCHES = "checkpoint.json", "lock", "seen", "input.json", "stretches"
+_MOST = 1 << 20  # values of one column that a frame may have
+OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES)  # what is no part of the finished session
 
 if TYPE_CHECKING:
     from liex_lab.progress import Progress
@@ -37,7 +39,8 @@ Clock = Callable[[], float]
 
 @dataclass
 class State:
-    """How far a session is. n_frames: written and seen; seconds: spent on them; runs: how often it was begun.
+    """How far a session is. n_frames: written and seen; seconds: spent on them; runs: parts that each log is in, one
+    for each time that the work was begun and for each of the stretches that others wrote.
 
     logs: for each part of each log its bytes, in the order of writing: "session.mcap" -> [1200, 5030].
     """
@@ -47,6 +50,7 @@ class State:
     seconds: float = 0.0
     runs: int = 1
     logs: dict[str, list[int]] = field(default_factory=dict)
+    stretches: int = 0
 
 
 class Checkpoint:
@@ -82,14 +86,37 @@ class Checkpoint:
         """Take down that everything up to a frame is on disk; logs: the bytes of each log's present part."""
         self.seen.flush()
         present = {name: [*self.state.logs.get(name, [])[: self.n_parts - 1], size] for name, size in logs.items()}
-        new = State(self.state.key, n_frames, round(seconds, 3), self.state.runs, present)
-        write_whole(self.folder / _STATE, json.dumps(vars(new)))
-        self.state, self._last = new, self._clock()
+        self._keep(State(self.state.key, n_frames, round(seconds, 3), self.state.runs, present, self.state.stretches))
+
+    def take(self, n_frames: int, seconds: float, logs: Mapping[str, Path]) -> None:
+        """Take over the next part of each log, written by another process; what was seen in it is in `seen` already."""
+        self.seen.flush()
+        sizes, k = {}, self.n_parts - 1
+        for log, path in logs.items():
+            sizes[log] = [*self.state.logs.get(log, [])[:k], path.stat().st_size]
+            path.replace(self.part(log, k))
+        self._keep(State(self.state.key, n_frames, round(seconds, 3), k + 1, sizes, self.state.stretches + 1))
+        self.state.runs += 1  # the next part, not begun yet
+
+    def _keep(self, state: State) -> None:
+        write_whole(self.folder / _STATE, json.dumps(vars(state)))
+        self.state, self._last = state, self._clock()
+
+    def begin_to_take(self) -> None:
+        """Take down that nothing is there yet, so that what others write meanwhile is kept."""
+        if not (self.folder / _STATE).is_file():
+            self._keep(State(self.state.key, runs=0))
+            self.state.runs = 1
 
     @property
     def n_parts(self) -> int:
-        """Parts of each log: one, and one more for each time the work went on."""
+        """Parts of each log: one, and one more for each time the work went on or a stretch was taken over."""
         return self.state.runs
+
+    @property
+    def n_interruptions(self) -> int:
+        """How often the work was interrupted."""
+        return max(0, self.n_parts - 1 - self.state.stretches)
 
     def part(self, log: str, number: int) -> Path:
         """Where a part of a log lies; the first one under the log's own name."""
@@ -258,19 +285,26 @@ def check_free(folder: Path) -> None:
 
 
 def _read_state(path: Path) -> State | None:
+    """The state in a file; None where there is none that could be gone on with."""
     try:
         state = State(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        sizes = [size for log in state.logs.values() for size in log]
+        counts = [state.n_frames, state.runs, state.stretches, *sizes]
+        sound = isinstance(state.key, str) and 0.0 <= state.seconds < math.inf
+        sound = sound and all(isinstance(n, int) and n >= 0 for n in counts)
+        sound = sound and all(log in LOGS and len(parts) == state.runs for log, parts in state.logs.items())
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return None
-    return state if isinstance(state.n_frames, int) and isinstance(state.logs, dict) else None
+    return state if sound else None
 
 
 def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
+    """What columns.json says of the columns: dtype and shape of a row by name; None where it makes no sense."""
     try:
         found: dict[str, Any] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        kinds = {name: (np.dtype(str(kind)), [int(n) for n in shape]) for name, (kind, shape) in found.items()}
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
         return None
-    try:
-        return {name: (str(kind), [int(n) for n in shape]) for name, (kind, shape) in found.items()}
-    except (AttributeError, ValueError, TypeError):
-        return None
+    sound = all(name.isidentifier() and dtype.kind in "biufU" for name, (dtype, _) in kinds.items())
+    sound = sound and all(0 <= n < _MOST for _, shape in kinds.values() for n in shape)
+    return {name: (dtype.str, shape) for name, (dtype, shape) in kinds.items()} if sound else None

@@ -12,6 +12,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.recordings.times import Gap
 from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.reading import reading_from
 from liex_lab.sessions.rows import LOST
 from liex_lab.tracking.curve import Subject
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
-_HUMAN = "human"
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
@@ -36,6 +36,15 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     np.savez_compressed(folder / FILE, subject=told, **{name: getattr(seen, name) for name in COLUMNS})
 
 
+def read_skeleton(session: Session) -> Skeleton | None:
+    """The skeleton that a session was made with; None for one that does not hold it."""
+    path = session.path / FILE
+    if not path.is_file():
+        return None
+    with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+        return Skeleton.from_table(json.loads(kept["subject"].tobytes())["skeleton"], str(path))
+
+
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
     """What `write_evidence` wrote. Raises SessionError for a session that has nothing of it."""
     path = session.path / FILE
@@ -44,31 +53,38 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             f"{session.path} does not hold what its single frames said ({FILE}), as sessions of earlier versions; "
             "run `liex run` on the recording again"
         )
-    try:
-        with np.load(path, allow_pickle=False) as kept:
-            facts = json.loads(kept["subject"].tobytes())
-            skeleton = Skeleton.from_table(facts["skeleton"], str(path))
-            seen = Observations(skeleton, *(kept[name] for name in COLUMNS))
+    with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+        facts = json.loads(kept["subject"].tobytes())
+        skeleton = Skeleton.from_table(facts["skeleton"], str(path))
+        seen = Observations(skeleton, *(kept[name] for name in COLUMNS))
+        _check_shapes(seen, len(session.frames))
         subject = Subject(
-            skeleton, session.camera, session.T_arena_camera, facts["length_mm"], facts["doubtful_mm"],
-            facts["bridge_s"], tuple(facts["joint_share"]),
+            skeleton, session.camera, session.T_arena_camera, float(facts["length_mm"]), float(facts["doubtful_mm"]),
+            float(facts["bridge_s"]), tuple(float(share) for share in facts["joint_share"]),
         )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SessionError(f"{path} is damaged ({error}); run `liex run` on the recording again") from None
     return seen, subject
 
 
-def read_corrections(session: Session) -> list[Flip]:
-    """The flips that a human has stated, with frames counted by row."""
+def _check_shapes(seen: Observations, n_frames: int) -> None:
+    """Raises ValueError where the arrays are not of so many frames."""
+    wanted = Observations.empty(seen.skeleton, np.zeros(n_frames, np.int64))
+    for name in COLUMNS:
+        found, expected = getattr(seen, name), getattr(wanted, name)
+        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+            raise ValueError(f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}")
+
+
+def read_flips(session: Session) -> list[Flip]:
+    """The table `flips`, with frames counted by row."""
     index = session.frames["frame_index"].to_numpy()
-    table = session.flips[session.flips["source"] == _HUMAN]
-    return [
-        Flip(
-            int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
-            float(row["p_flip"]), bool(row["applied"]), _HUMAN, str(row["undone_at"]),
-        )
-        for row in _rows_of(table)
-    ]  # fmt: skip
+    with reading_from(session.path / "flips.parquet"):
+        return [
+            Flip(
+                int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
+                float(row["p_flip"]), bool(row["applied"]), str(row["source"]), str(row.get("undone_at", "")),
+            )
+            for row in _rows_of(session.flips)
+        ]  # fmt: skip
 
 
 def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:

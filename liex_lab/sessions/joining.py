@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import IO
 
@@ -12,6 +13,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
+    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -20,11 +22,14 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from liex_lab.errors import SessionError
+from liex_lab.sessions.renumbering import Known, renumber
 
 Parts = Sequence[tuple[Path, int | None]]  # the bytes of each that count, None for all
+_FIRST_CHUNKS = 8  # within so many a part's channels of depth are named
 
 RRD_HEAD, _RRD_END = 12, 0  # magic, version and options; the kind of the message that ends a stream
 _CHUNK_HEAD = 8 + 8 + 8 + 4  # start and end time, size, check sum; then the name of the compression
@@ -64,17 +69,23 @@ def join_rrd(parts: Parts, out: Path) -> None:
 
 
 def join_mcap(parts: Parts, out: Path) -> None:
-    """One MCAP file with the chunks of all parts; the last one is whole and knows all channels and schemas."""
-    schemas, channels = _known_to(parts[-1][0])
+    """One MCAP file with the chunks of all parts; the last one is whole and gets its channels numbered as the first."""
+    last = parts[-1][0]
+    known = _known_to(last)
+    if not _numbered_alike(parts[0], known):
+        last = parts[-1][0].with_name(f"numbered-{out.name}")
+        known = renumber(parts[-1][0], _first_known(*parts[0]), known, last)
     indexes: list[ChunkIndex] = []
     counts: dict[int, int] = {}
     with out.open("wb") as whole:
-        for k, (path, size) in enumerate(parts):
+        for k, (path, size) in enumerate([*parts[:-1], (last, parts[-1][1])]):
             with path.open("rb") as file:
                 end = path.stat().st_size if size is None else size
                 start, stop = _chunks_of(file, end, whole.tell() if k else 0, indexes, counts)
                 _copy(file, start if k else 0, stop, whole)
-        _finish_mcap(whole, schemas, channels, indexes, counts)
+        _finish_mcap(whole, *known, indexes, counts)
+    if last != parts[-1][0]:
+        last.unlink()
 
 
 def _chunks_of(
@@ -115,7 +126,40 @@ def _chunk_index(file: IO[bytes], offset: int, length: int) -> ChunkIndex:
     )  # fmt: skip
 
 
-def _known_to(path: Path) -> tuple[list[Schema], list[Channel]]:
+def _numbered_alike(first: tuple[Path, int | None], known: Known) -> bool:
+    """Whether the channels of the first part have the same numbers in the last one."""
+    topics = {channel.topic: channel.id for channel in known[1]}
+    return all(topics.get(channel.topic) == channel.id for channel in _first_known(*first)[1])
+
+
+def _first_known(path: Path, size: int | None) -> Known:
+    """Schemas and channels that the first chunks of a part name, whole or not; a channel is named where it begins."""
+    end = path.stat().st_size if size is None else size
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    with path.open("rb") as file:
+        for content in islice(_chunk_contents(file, end), _FIRST_CHUNKS):
+            for record in breakup_chunk(content):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+    return list(schemas.values()), list(channels.values())
+
+
+def _chunk_contents(file: IO[bytes], end: int) -> Iterator[Chunk]:
+    at = len(MCAP0_MAGIC)
+    while at + 9 <= end:
+        file.seek(at)
+        opcode, length = struct.unpack("<BQ", file.read(9))
+        if opcode == Opcode.CHUNK:
+            yield Chunk.read(ReadDataStream(file))
+        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX):
+            return
+        at += 9 + length
+
+
+def _known_to(path: Path) -> Known:
     """Schemas and channels of a whole file."""
     from mcap.reader import make_reader
 

@@ -81,6 +81,20 @@ class Rows:
                 "sd_mm": sd.ravel(),
             }  # fmt: skip
 
+    def measured(self) -> pd.DataFrame:
+        """What measures of behaviour need of the table `poses`: frame, joint and its place; one row per joint."""
+        import pandas as pd
+
+        track, n_joints = self.track, self.track.skeleton.n_joints
+        codes = np.tile(np.arange(n_joints, dtype=np.int8), track.n_frames)
+        # what was bridged was not measured
+        place = np.where(track.bridged[:, None, None], np.nan, track.joints_mm).reshape(-1, 3)
+        return pd.DataFrame({
+            "frame_index": np.repeat(self.frame_index, n_joints),
+            "joint": pd.Categorical.from_codes(codes, pd.Index(track.skeleton.names)),
+            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2], "sd_mm": track.sd_mm.ravel(),
+        })  # fmt: skip
+
     def rotations(self) -> Iterator[Block]:
         """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
         track = self.track

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -12,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.camera import Camera
-from liex_lab.errors import LiexError, SessionError
+from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
+from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
 from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
+from liex_lab.sessions.reading import reading_from
 from liex_lab.sessions.tables import as_it_was
 from liex_lab.sessions.thumbnails import FOLDER
 from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
@@ -37,8 +37,10 @@ _OPTIONAL = {
 class Session:
     """The results of one recording, read from its folder when asked for. Tables are pandas data frames."""
 
-    def __init__(self, path: Path, metadata: dict[str, Any]) -> None:
-        self.path, self.metadata = path, metadata
+    def __init__(self, path: Path, metadata: dict[str, Any], log: Log | None = None) -> None:
+        self.path = path
+        self.log = log or Log("")  # of corrections; none where they do not apply, or are not wanted
+        self.metadata = {**metadata, **self.log.facts}
 
     @staticmethod
     def create(
@@ -56,8 +58,11 @@ class Session:
         return SessionWriter(Path(path), origin, overwrite=overwrite, blueprint=blueprint, report=report)
 
     @staticmethod
-    def open(path: str | Path) -> Session:
-        """The session in the folder `path`, checked for its version and for missing files."""
+    def open(path: str | Path, *, raw: bool = False) -> Session:
+        """The session in the folder `path`, checked for its version and for missing files.
+
+        raw: as it was measured, without what people corrected (see `liex_lab.sessions.corrections`).
+        """
         folder = Path(path)
         document = folder / "session.json"
         if not document.is_file():
@@ -79,12 +84,21 @@ class Session:
         for name in FILES:
             if name not in _OPTIONAL and not (folder / name).is_file():
                 raise SessionError(f"the session {folder} lacks {name}; run `liex run` on the recording again")
-        return Session(folder, metadata)
+        log = Log("") if raw else read_log(folder)
+        return Session(folder, metadata, log if applies(log, folder, metadata) else None)
 
     @property
     def name(self) -> str:
         """The session's id."""
         return str(self.metadata["session_id"])
+
+    def file(self, name: str) -> Path:
+        """Where a file of the session lies: the corrected one where there is one, else the session's own."""
+        return corrected_folder(self.path) / name if name in self.log.files else self.path / name
+
+    def has(self, name: str) -> bool:
+        """Whether the session holds a file."""
+        return self.file(name).is_file()
 
     @cached_property
     def frames(self) -> pd.DataFrame:
@@ -126,10 +140,10 @@ class Session:
         """The behaviour summary, one row per animal."""
         import pandas as pd
 
-        path = self.path / "summary.csv"
+        path = self.file("summary.csv")
         if not path.is_file():
             raise SessionError(f"the session {self.path} has no summary.csv; it was written without behaviour measures")
-        with _read_from(path):
+        with reading_from(path):
             table = pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
             return table.map(as_it_was)
 
@@ -138,65 +152,50 @@ class Session:
         """The column dictionary: one row per column of every table."""
         import pandas as pd
 
-        with _read_from(self.path / "columns.json") as path:
+        with reading_from(self.file("columns.json")) as path:
             return pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
 
     @cached_property
     def camera(self) -> Camera:
         """The depth camera, an ideal one in air; `metadata["camera"]["optics"]` says what was undone for that."""
-        with _read_from(self.path / "session.json"):
+        with reading_from(self.path / "session.json"):
             return Camera.from_dict(self.metadata["camera"])
 
     @cached_property
     def T_arena_camera(self) -> SE3:
         """Carries points of the camera frame into the arena frame."""
-        with _read_from(self.path / "session.json"):
+        with reading_from(self.path / "session.json"):
             return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
 
     @cached_property
     def arena(self) -> Arena:
         """The shape of the floor; open where it is not known."""
-        with _read_from(self.path / "session.json"):
+        with reading_from(self.path / "session.json"):
             return Arena.from_dict(self.metadata.get("arena", {"kind": "open"}))
 
     @cached_property
     def zones(self) -> list[Zone]:
         """The zones that were drawn."""
-        with _read_from(self.path / "session.json"):
+        with reading_from(self.path / "session.json"):
             return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
     @property
     def plan(self) -> str:
         """The plan as resolved, TOML text."""
-        with _read_from(self.path / "plan.toml") as path:
+        with reading_from(self.path / "plan.toml") as path:
             return path.read_text(encoding="utf-8")
 
     def table(self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None) -> pd.DataFrame:
         """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
         import pandas as pd
 
-        path = self.path / f"{name}.parquet"
+        path = self.file(f"{name}.parquet")
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
         rows = None if frame_index is None else [("frame_index", "in", frame_index)]
-        with _read_from(path):
+        with reading_from(path):
             return pd.read_parquet(path, columns=columns, filters=rows)
-
-
-@contextmanager
-def _read_from(path: Path) -> Iterator[Path]:
-    """Within the block, whatever goes wrong is a damaged file's fault."""
-    try:
-        yield path
-    except LiexError:
-        raise
-    except Exception as error:
-        what = str(error).partition("\n")[0][:200]
-        raise SessionError(
-            f"{path} is damaged and cannot be read ({type(error).__name__}: {what}); run `liex run` on the recording "
-            "again"
-        ) from None
 
 
 def _keep_inside(metadata: dict[str, Any]) -> None:

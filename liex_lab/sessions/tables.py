@@ -93,8 +93,9 @@ FRAMES = columns(
      "recording: what each frame says of either, and how fast animals turn", "tracker"),
     ("bridged", "bool", "", "nothing was measured; the pose is what lies between two measured ones that are no farther "
      "apart than tracking.bridge_s of the plan; measures of behaviour leave it out", "", "tracker"),
-    ("flag", "string", "", "empty when the pose is trusted; doubtful: its predicted error is large; not_found or "
-     "no_depth: nothing was measured, and there is no pose where it is not bridged", "", "tracker"),
+    ("flag", "string", "", "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
+     "person placed joints of it; not_found or no_depth: nothing was measured, and there is no pose where it is not "
+     "bridged", "", "tracker"),
 )  # fmt: skip
 
 POSES = columns(

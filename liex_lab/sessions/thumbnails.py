@@ -13,8 +13,8 @@ from liex_lab.camera import Camera
 from liex_lab.sessions.rows import Rows
 
 FOLDER = "thumbnails"
-_KEPT = 16  # at most this many whole frames are held while a recording of unknown length goes by
-_SHOWN = 4
+_KEPT = 32  # at most this many whole frames are held while a recording of unknown length goes by
+_SHOWN = 16
 _HALF_SPINES = 1.15  # half the side of the picture, in spine lengths
 
 
@@ -48,7 +48,7 @@ class Keepsakes:
         self._seen = n_frames
 
     def save(self, folder: Path, rows: Rows, camera: Camera) -> list[dict[str, Any]]:
-        """Write up to four 16-bit PNG pictures, mm, 0 unread, and say where in the frame each was cut."""
+        """Write up to sixteen 16-bit PNG pictures, mm, 0 unread, and say where in the frame each was cut."""
         import cv2
 
         observed = rows.track.observed

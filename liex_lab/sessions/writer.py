@@ -21,10 +21,12 @@ from liex_lab.memory import peak_memory_mb
 from liex_lab.sessions import tables
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
+from liex_lab.sessions.corrections import FOLDER, corrected_folder
 from liex_lab.sessions.evidence import write_evidence
 from liex_lab.sessions.place import check_place, file_facts, part_folder
-from liex_lab.sessions.provenance import Provenance, package_version
-from liex_lab.sessions.rows import Rows, median_step, rows_only, stop_times
+from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.results import Results
+from liex_lab.sessions.rows import Rows, rows_only
 from liex_lab.sessions.tables import Column
 from liex_lab.sessions.thumbnails import Keepsakes
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.curve import Subject
     from liex_lab.tracking.observations import Observations
 
-_INDEX, _TIMES = "frame_index", "frame_time_ns"
+INDEX, TIMES = "frame_index", "frame_time_ns"
 Kept = TypeVar("Kept")
 
 BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json as known so far -> a Rerun blueprint
@@ -71,10 +73,10 @@ class SessionWriter:
         self._keepsakes = Keepsakes()
         self._done = False
         self._folder = part_folder(path)
-        self._checkpoint = Checkpoint(self._folder, {"n_frames": origin.n_frames, **self._document})
+        self._checkpoint = unfinished(path, origin)
         before = self._checkpoint.seen.read()
-        self._index: list[int] = before.get(_INDEX, np.zeros(0, np.int64)).tolist()
-        self._times_ns: list[int] = before.get(_TIMES, np.zeros(0, np.int64)).tolist()
+        self._index: list[int] = before.get(INDEX, np.zeros(0, np.int64)).tolist()
+        self._times_ns: list[int] = before.get(TIMES, np.zeros(0, np.int64)).tolist()
         self._logging: list[Future[None]] = []
         self._loggers = ThreadPoolExecutor(len(LOGS))
         try:
@@ -146,8 +148,7 @@ class SessionWriter:
         self._index += index
         self._times_ns += times
         if seen is not None:
-            stamps = {_INDEX: np.array(index, np.int64), _TIMES: np.array(times, np.int64)}
-            self._checkpoint.seen.append({**columns_of(seen), **stamps})
+            self._checkpoint.seen.append(seen_rows(frames, seen))
         if self._checkpoint.due:
             self._take_down()
         self._seconds += time.perf_counter() - began
@@ -155,7 +156,7 @@ class SessionWriter:
     def seen(self, kind: Callable[..., Kept]) -> Kept:
         """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its columns in order."""
         kept = self._checkpoint.seen.read()
-        return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (_INDEX, _TIMES)))
+        return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (INDEX, TIMES)))
 
     def _settle(self) -> None:
         """Wait until the logs have written what they were given; what went wrong is raised here."""
@@ -186,41 +187,12 @@ class SessionWriter:
         self.track, self._flips = tracked.track, tracked.flips
         write_evidence(self._folder, seen, subject)
 
-    def keep(self, folder: Path) -> None:
-        """Put a copy of a folder into the session."""
-        shutil.copytree(folder, self._folder / folder.name)
-
     @property
     def rows(self) -> Rows:
         """The track as the tables see it."""
         origin = self.origin
         index = np.array(self._index, np.int64)
         return Rows(self.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones)
-
-    @property
-    def frames(self) -> pd.DataFrame:
-        """The table `frames` of the track so far."""
-        return tables.to_pandas(tables.FRAMES, self.rows.frames())
-
-    @property
-    def poses(self) -> pd.DataFrame:
-        """What measures of behaviour need of the table `poses`: frame, joint and its place; one row per joint."""
-        import pandas as pd
-
-        n_frames, n_joints = len(self._index), self.origin.skeleton.n_joints
-        codes = np.tile(np.arange(n_joints, dtype=np.int8), n_frames)
-        # what was bridged was not measured
-        place = np.where(self.track.bridged[:, None, None], np.nan, self.track.joints_mm).reshape(-1, 3)
-        return pd.DataFrame({
-            "frame_index": np.repeat(np.array(self._index, np.int64), n_joints),
-            "joint": pd.Categorical.from_codes(codes, pd.Index(self.origin.skeleton.names)),
-            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2], "sd_mm": self.track.sd_mm.ravel(),
-        })  # fmt: skip
-
-    @property
-    def gaps(self) -> pd.DataFrame:
-        """The table `gaps` of the track so far."""
-        return tables.to_pandas(tables.GAPS, self.rows.gaps())
 
     def note(self, **sections: Any) -> None:
         """Add facts found on the way to session.json: tables are merged, lists extended, the rest replaced."""
@@ -262,7 +234,9 @@ class SessionWriter:
         if "bouts" not in results:
             results["bouts"] = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
         bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
-        self._write_tables(rows, results, columns)
+        of_track = Results(self.origin, rows, self._flips)
+        of_track.write_track(self._folder)
+        of_track.write_measured(self._folder, results, columns)
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems)
@@ -273,7 +247,7 @@ class SessionWriter:
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
         self._document["files"] = file_facts(self._folder, self._checkpoint.logs)
-        self._document.update(self._account(rows, dict(timings_s or {})))
+        self._document.update(self._account(of_track, dict(timings_s or {})))
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         try:
@@ -283,72 +257,31 @@ class SessionWriter:
             self._publish()
         return Session.open(self.path)
 
-    def _write_tables(self, rows: Rows, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]) -> None:
-        """All parquet files, summary.csv and columns.json."""
-        described = self.origin.table_metadata()
-        own: dict[str, Any] = {
-            "frames": [rows.frames()], "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
-            "flips": [rows.flips(self._flips)],
-            "sessions": [self._session_row(rows)],
-        }  # fmt: skip
-        for name, blocks in own.items():
-            tables.write_table(self._folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
-        for name, result in results.items():
-            schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
-            if not schema:  # kinematics without any measure
-                continue
-            block = tables.from_pandas(schema, result)
-            if name == "summary":
-                tables.check_described(block, schema, name)
-                result.map(tables.harmless).to_csv(self._folder / "summary.csv", index=False, lineterminator="\n")
-            else:
-                tables.write_table(self._folder / f"{name}.parquet", schema, [block], described)
-        text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
-        (self._folder / "columns.json").write_text(text + "\n", encoding="utf-8")
-
     @property
     def _elapsed(self) -> float:
         return time.perf_counter() - self._started
 
-    def _session_row(self, rows: Rows) -> dict[str, Any]:
-        track, subject = rows.track, self.origin.subject
-        step = median_step(rows.time_s)
-        return {
-            "session_id": rows.session_id, "individual": rows.individual,
-            **{name: subject.get(name, "") for name in ("subject_id", "group", "cage", "sex", "batch")},
-            "session_start_time": self.origin.session_start_time,
-            "n_frames": track.n_frames, "n_frames_observed": int(track.observed.sum()),
-            "observed_s": float((stop_times(rows.time_s) - rows.time_s)[track.observed].sum()),
-            "fps_median": 1.0 / step if step else float("nan"),
-            "calibration_hash": self.origin.calibration_hash, "software_version": package_version("liex_lab"),
-        }  # fmt: skip
-
-    def _account(self, rows: Rows, timings_s: dict[str, float]) -> dict[str, Any]:
+    def _account(self, results: Results, timings_s: dict[str, float]) -> dict[str, Any]:
         """Counts of the frames, and what the run cost."""
-        track, elapsed = rows.track, self._checkpoint.seconds_before + self._elapsed
-        time_s = rows.time_s
-        row = self._session_row(rows)
-        flags = {flag or "good": int(np.sum(track.flag == flag)) for flag in np.unique(track.flag)}
+        elapsed = self._checkpoint.seconds_before + self._elapsed
         return {
-            "frames": {
-                "n_frames": track.n_frames, "n_observed": int(track.observed.sum()), "flags": flags,
-                "n_missing": int(rows.missing_before().sum()), "n_gaps": int((rows.missing_before() > 0).sum()),
-                "duration_s": float(stop_times(time_s)[-1]), "observed_s": row["observed_s"],
-                "fps_median": None if np.isnan(row["fps_median"]) else row["fps_median"],
-            },
+            "frames": results.counts(),
             "depth_unit_mm": 1.0,
             "timings_s": {**timings_s, "write": round(self._seconds, 4), "total": round(elapsed, 4)},
-            "frames_per_s": round(track.n_frames / elapsed, 2),
+            "frames_per_s": round(self.n_frames / elapsed, 2),
             "peak_memory_mb": peak_memory_mb(),
             "machine": {"name": platform.node(), "system": platform.platform(), "cores": os.cpu_count()},
-            "interruptions": self._checkpoint.n_parts - 1,
-        }  # fmt: skip
+            "interruptions": self._checkpoint.n_interruptions,
+        }
 
     def _publish(self) -> None:
         """Rename the whole folder into place; an older session goes only after that."""
         old = self.path.with_name(f"{self.path.name}.old")
         check_place(self.path, self._overwrite)
         if self.path.exists():
+            made = corrected_folder(self.path)
+            if made.is_dir():  # what people said is not lost; it applies again where the poses came out the same
+                shutil.copytree(made, self._folder / FOLDER)
             shutil.rmtree(old, ignore_errors=True)
             self.path.rename(old)
         self._checkpoint.drop_parts()
@@ -372,6 +305,17 @@ class SessionWriter:
             except Exception:  # an error is under way already; it is the one to tell
                 continue
         self._checkpoint.leave(keep)
+
+
+def seen_rows(frames: Sequence[DepthFrame], seen: Columnar) -> dict[str, NDArray[Any]]:
+    """What is kept on disk of consecutive frames: what was seen in them, their count and their time."""
+    index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
+    return {**columns_of(seen), INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
+
+
+def unfinished(path: Path, origin: Provenance) -> Checkpoint:
+    """The unfinished session that will be at `path`, begun or gone on with."""
+    return Checkpoint(part_folder(path), {"n_frames": origin.n_frames, **origin.document()})
 
 
 def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:

@@ -12,10 +12,12 @@ from liex_lab.geometry import SE3
 
 Array = NDArray[np.float64]
 
+CORRECTED = "corrected"  # the flag of a pose of which a person placed joints
 FLAGS = {
     "": "a pose was measured and is trusted",
     "doubtful": "a pose was measured, but its predicted error is large for this animal",
     "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged",
+    "corrected": "a person placed joints of this pose; the others follow as the bones allow",
     "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
 }
 

@@ -78,7 +78,7 @@ def test_the_page_is_well_formed(page):
 def test_every_figure_is_well_formed_svg_of_finite_numbers(page):
     drawn = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
     # pictures; histogram, lanes, three curves, budget, activity, matrix, way
-    assert len(drawn) == 4 + 9 + page.count(" bouts</figcaption>")
+    assert len(drawn) == 16 + 9 + page.count(" bouts</figcaption>")
     for svg in drawn:
         ElementTree.fromstring(svg)
         assert "nan" not in re.sub(r"base64,[^\"]*", "", svg)

@@ -19,8 +19,9 @@ N_FRAMES = 40
 
 
 def pretended_run(
-    recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], progress: Progress
-) -> Path:
+    recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], crew: object,
+    progress: Progress,
+) -> Path:  # fmt: skip
     """Stands in for `run_session`."""
     from liex_lab.catalog import find_model, sha256
     from liex_lab.recordings.recording import file_digest

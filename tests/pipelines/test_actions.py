@@ -8,13 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.pipelines.actions import (
-    human_bouts,
     labelled_sessions,
     read_any_labels,
     suggest,
     train_actions,
 )
-from liex_lab.pipelines.session_tracks import track_of, wall_of
 
 from liex_lab.actions.storage import bundled_action_models, find_action_model, load_action_model
 from liex_lab.errors import LiexError
@@ -22,6 +20,9 @@ from liex_lab.exchange import export
 from liex_lab.exchange.boris_labels import read_boris_project
 from liex_lab.recordings import fish_acts, mouse_acts
 from liex_lab.sessions import Session
+from liex_lab.sessions.applying import edited_bouts
+from liex_lab.sessions.correcting import labelled_bouts
+from liex_lab.sessions.tracks import track_of, wall_of
 from tests.sessions.walking_mouse import WalkingMouse, write
 
 LABELS = pd.DataFrame({"action": ["stroll", "tower", "stroll"], "start_s": [0.0, 2.0, 3.5], "stop_s": [2.0, 3.5, 6.0]})
@@ -50,13 +51,16 @@ def test_a_session_gives_back_the_track_it_was_made_from(session: Session, mouse
     np.testing.assert_allclose(track.joints_mm, true.joints_mm, atol=1e-9)
     np.testing.assert_allclose(track.root_rotation, true.root_rotation, atol=1e-9)
     np.testing.assert_allclose(track.angles_rad, true.angles_rad, atol=1e-9)
+    told = ("uv_px", "sd_mm", "sd_root", "sd_angles_rad", "centroid_mm", "residual_mm", "p_flip", "bridged", "flag")
+    for name in told:
+        np.testing.assert_array_equal(getattr(track, name), getattr(true, name), err_msg=name)
     assert wall_of(session).shape == (180,)
 
 
 def test_an_ethogram_goes_to_boris_and_comes_back_as_a_humans(session: Session, tmp_path: Path) -> None:
     project = export(session, "boris", tmp_path / "walk.boris")
     assert session.name in read_boris_project(project)["observations"]
-    back = human_bouts(session.path, project)
+    back = edited_bouts(session.bouts, labelled_bouts(session, read_any_labels(project)), session.frames)
     own = session.bouts
     assert list(back["action"]) == list(own["action"])
     assert np.abs(back["start_s"].to_numpy() - own["start_s"].to_numpy()).max() < 0.034
@@ -90,7 +94,16 @@ def test_the_bundled_models_know_their_words_and_are_small(animal: str, words: t
     model = load_action_model(animal)
     assert model.skeleton == animal
     assert set(model.words) == {"", *words} == {"", *model.definitions}
-    assert set(model.unresolved((np.arange(9) / 15.0 * 1e9).astype(np.int64))) <= set(words)
+    told = {rate: model.unresolved((np.arange(9) / rate * 1e9).astype(np.int64)) for rate in (15.0, 30.0, 300.0)}
+    quick = {"fish": "c_turn", "mouse": "sniff"}[animal]
+    assert {quick} <= set(told[30.0]) <= set(told[15.0]) <= set(words)
+    assert "at 30 per second" in told[30.0][quick]
+    assert told[300.0] == {}
+
+
+def test_a_c_start_at_30_frames_a_second_is_said_to_be_less_than_a_frame() -> None:
+    told = load_action_model("fish").unresolved((np.arange(9) / 30.0 * 1e9).astype(np.int64))
+    assert "0.02 s, 0.6 frames at 30 per second" in told["c_turn"]
 
 
 def test_an_hour_is_recognised_in_seconds() -> None:

@@ -38,7 +38,7 @@ def _write(place: str, pause_s: float) -> None:
                 writer.add(frames, seen=track)
                 time.sleep(pause_s)
         writer.track = writer.seen(Track)
-        writer.close(**behaviour.measure(writer.frames, writer.poses).for_session())
+        writer.close(**behaviour.measure_rows(writer.rows).for_session())
 
 
 def start(place: Path, pause_s: float = 0.0, every_s: float = 0.0) -> BaseProcess:

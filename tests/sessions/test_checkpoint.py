@@ -18,7 +18,7 @@ from liex_lab.sessions.joining import rrd_messages
 from tests.sessions.interrupted import CHUNK, MOUSE, start, write_session
 from tests.sessions.test_rrd import columns_of
 
-N_KILLS = 8  # tests/campaign.py does many more
+N_KILLS = 8  # tests/campaign does many more
 
 
 def tables_of(folder: Path) -> dict[str, bytes]:

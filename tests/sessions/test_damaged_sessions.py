@@ -4,33 +4,70 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
+from liex_lab.sessions.checkpoint import LOGS, Checkpoint
+from liex_lab.sessions.evidence import read_evidence, read_flips, write_evidence
+from liex_lab.sessions.failure import read_failure
+from liex_lab.tracking.curve import Subject
+from liex_lab.tracking.observations import Observations
+from tests.damage import ANYTHING, check, damage
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 READS: list[Callable[[Session], Any]] = [
     lambda s: s.name, lambda s: s.frames, lambda s: s.poses, lambda s: s.bouts, lambda s: s.summary,
     lambda s: s.columns, lambda s: s.camera, lambda s: s.T_arena_camera, lambda s: s.arena, lambda s: s.zones,
-    lambda s: s.plan,
+    lambda s: s.plan, read_evidence, read_flips,
 ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("whole") / "circle.liex", WalkingMouse(steady(1.0)), individual="=1+1").path
+    path = write(tmp_path_factory.mktemp("whole") / "circle.liex", WalkingMouse(steady(1.0)), individual="=1+1").path
+    add_evidence(path)
+    return path
 
 
 @pytest.fixture(scope="module")
 def copy(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(whole, tmp_path_factory.mktemp("copy") / "circle.liex"))
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return begun(tmp_path_factory.mktemp("begun"))
+
+
+def add_evidence(folder: Path) -> None:
+    """Put observations.npz into a session."""
+    mouse = WalkingMouse(steady(1.0))
+    subject = Subject(mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 5.0, 0.5, (1.0,) * 5)
+    write_evidence(folder, Observations.empty(mouse.skeleton, mouse.times_ns), subject)
+
+
+def begun(folder: Path) -> Path:
+    """An unfinished session of two checkpoints."""
+    held = Checkpoint(folder / "x.part", FACTS)
+    for log in LOGS:
+        held.part(log, 0).write_bytes(b"0123456789")
+    held.seen.append({"a": np.arange(6.0).reshape(3, 2), "b": np.arange(3)})
+    held.save(3, 1.0, dict.fromkeys(LOGS, 8))
+    held.leave(keep=True)
+    return folder / "x.part"
+
+
+FACTS = {"n_frames": 3}
 
 
 def read_all(folder: Path) -> None:
@@ -41,36 +78,21 @@ def read_all(folder: Path) -> None:
         assert "\n" not in str(error)  # noqa: PT017
         return
     for read in READS:
-        try:
-            read(session)
-        except LiexError as error:
-            assert "\n" not in str(error)  # noqa: PT017
-
-
-_JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3), max_leaves=8,
-)  # fmt: skip
+        check(partial(read, session))
 
 
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_value_anywhere_in_session_json(whole: Path, copy: Path, data: st.DataObject) -> None:
     document = json.loads((whole / "session.json").read_text())
-    place, keys = document, list(document)
-    while keys:
-        key = data.draw(st.sampled_from(keys))
-        inner = place[key]
-        if not isinstance(inner, dict) or not inner or data.draw(st.booleans()):
-            place[key] = data.draw(_JSON)
-            break
-        place, keys = inner, list(inner)
+    damage(document, data)
     (copy / "session.json").write_text(json.dumps(document))
     read_all(copy)
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(name=st.sampled_from(["frames.parquet", "bouts.parquet", "summary.csv", "columns.json", "plan.toml"]),
+@given(name=st.sampled_from(["frames.parquet", "bouts.parquet", "summary.csv", "columns.json", "plan.toml",
+                             "observations.npz"]),
        data=st.data())  # fmt: skip
 def test_any_byte_anywhere_in_its_files(whole: Path, copy: Path, name: str, data: st.DataObject) -> None:
     content = bytearray((whole / name).read_bytes())
@@ -83,6 +105,33 @@ def test_any_byte_anywhere_in_its_files(whole: Path, copy: Path, name: str, data
     (copy / name).write_bytes(bytes(content))
     read_all(copy)
     (copy / name).write_bytes((whole / name).read_bytes())
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(name=st.sampled_from(["checkpoint.json", "seen/columns.json"]), data=st.data())
+def test_any_value_anywhere_in_an_unfinished_session(part: Path, name: str, data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        copy = Path(shutil.copytree(part, Path(scratch) / "x.part"))
+        document = json.loads((copy / name).read_text())
+        damage(document, data)
+        (copy / name).write_text(json.dumps(document))
+        held = Checkpoint(copy, FACTS)  # it goes on, or begins anew
+        n = held.state.n_frames
+        assert n in (0, 3) or name == "checkpoint.json"
+        assert all(len(values) >= n for values in held.seen.read().values())
+        held.save(n + 1, held.seconds_before + 1.0, dict.fromkeys(LOGS, 0))
+        assert [len(held.parts(log)) for log in LOGS] == [held.n_parts] * 2
+        held.leave(keep=False)
+
+
+@settings(max_examples=60, deadline=None)
+@given(document=ANYTHING)
+def test_any_json_instead_of_a_failure(document: Any) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "failed.json").write_text(json.dumps(document))
+        found = read_failure(Path(folder))
+        assert found is not None
+        assert isinstance(found["reason"], str)
 
 
 @pytest.mark.parametrize("file", ["../../../etc/passwd", "/etc/passwd", "session.rrd", "thumbnails/../../x.png"])

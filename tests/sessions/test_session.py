@@ -258,7 +258,7 @@ def test_thumbnails_hold_the_depth_around_the_animal(session):
     import cv2
 
     shown = session.metadata["thumbnails"]
-    assert len(shown) == 4
+    assert len(shown) == 16
     for entry in shown:
         picture = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
         assert picture is not None

@@ -157,5 +157,5 @@ def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Se
             writer.add(frames, track)
         origin = writer.origin
         around = behaviour.Surroundings(origin.arena, [zone.name for zone in origin.zones])
-        measured = behaviour.measure(writer.frames, writer.poses, None, around, writer.gaps)
+        measured = behaviour.measure_rows(writer.rows, None, around)
         return writer.close(**measured.for_session())

@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.api import flip_session, run_session
+from liex_lab.api import correct_session, run_session
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import flip_span
 
 ADDRESS = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"
 SPAN = slice(9, 18)
@@ -28,7 +29,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Session:
 @pytest.fixture(scope="module")
 def flipped(tracked: Session, tmp_path_factory: pytest.TempPathFactory) -> Session:
     folder = Path(shutil.copytree(tracked.path, tmp_path_factory.mktemp("flipped") / tracked.path.name))
-    return Session.open(flip_session(folder, FROM_S, TO_S))
+    return Session.open(correct_session(folder, [flip_span(tracked, FROM_S, TO_S)]))
 
 
 def along(session: Session) -> np.ndarray:
@@ -49,43 +50,30 @@ def test_every_table_follows(tracked, flipped):
     turned = flipped.kinematics["heading_rad"][middle] - tracked.kinematics["heading_rad"][middle]
     assert abs(np.cos(turned) + 1.0) < 0.5
     assert not np.allclose(flipped.rotations["wz_rad"], tracked.rotations["wz_rad"], equal_nan=True)
-    assert flipped.metadata["plan"] == tracked.metadata["plan"]
-    assert flipped.metadata["camera"] == tracked.metadata["camera"]
-    assert flipped.metadata["input"] == tracked.metadata["input"]
+    for name in ("plan", "camera", "input", "files"):
+        assert flipped.metadata[name] == tracked.metadata[name]
     for name in ("frame_index", "time_ns", "gap_before"):
         pd.testing.assert_series_equal(flipped.frames[name], tracked.frames[name])
-
-
-def test_the_correction_is_a_row_and_the_tables_as_tracked_stay_beside(tracked, flipped):
     (row,) = flipped.flips[flipped.flips["source"] == "human"].itertuples()
-    assert (row.start_frame, row.stop_frame, row.applied, row.undone_at) == (SPAN.start, SPAN.stop, True, "")
-    before = flipped.path / "as_tracked"
-    pd.testing.assert_frame_equal(pd.read_parquet(before / "poses.parquet"), tracked.poses)
-    assert (before / "session.json").is_file()
-    assert not list(flipped.path.parent.glob(".flip*"))
+    assert (row.start_frame, row.stop_frame, row.applied) == (SPAN.start, SPAN.stop, True)
 
 
-def test_taken_back_it_is_as_before_and_the_row_says_when(tracked, flipped, tmp_path):
+def test_what_was_measured_is_as_it_was_and_the_correction_can_be_taken_back(tracked, flipped, tmp_path):
     folder = Path(shutil.copytree(flipped.path, tmp_path / flipped.path.name))
-    again = Session.open(flip_session(folder, 0.0, 1.0, undo=True))
+    pd.testing.assert_frame_equal(Session.open(folder, raw=True).poses, tracked.poses)
+    assert (folder / "poses.parquet").read_bytes() == (tracked.path / "poses.parquet").read_bytes()
+    again = Session.open(correct_session(folder, undo=[1]))
     pd.testing.assert_frame_equal(again.poses, tracked.poses)
-    (row,) = again.flips[again.flips["source"] == "human"].itertuples()
-    assert str(row.undone_at).startswith("20")
-    with pytest.raises(SessionError, match="no correction that a human made lies within"):
-        flip_session(folder, 0.0, 1.0, undo=True)
+    pd.testing.assert_frame_equal(again.bouts, tracked.bouts)
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0.5, 0.5), (0.6, 0.2), (50.0, 60.0)])
-def test_a_span_without_frames_is_refused(tracked, start, stop):
-    with pytest.raises(SessionError, match="a span to flip is from a time to a later one"):
-        flip_session(tracked.path, start, stop)
-
-
-def test_a_session_of_an_earlier_version_says_what_to_do(tracked, tmp_path):
+def test_a_session_without_what_its_frames_said_tells_what_to_do(tracked, tmp_path):
     folder = Path(shutil.copytree(tracked.path, tmp_path / "old.liex"))
+    flip = flip_span(tracked, FROM_S, TO_S)
     (folder / "observations.npz").unlink()
     with pytest.raises(SessionError, match=r"run `liex run` on the recording again"):
-        flip_session(folder, FROM_S, TO_S)
+        correct_session(folder, [flip])
     (folder / "observations.npz").write_bytes(b"PK not really")
     with pytest.raises(SessionError, match="damaged"):
-        flip_session(folder, FROM_S, TO_S)
+        correct_session(folder, [flip])
+    assert not (folder / "corrected").exists()

@@ -1,0 +1,197 @@
+"""Corrections applied: to the track of a session, and to the bouts of its ethogram."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from liex_lab.actions.labels import HUMAN
+from liex_lab.body.fitting import fit_poses
+from liex_lab.body.pose import Pose
+from liex_lab.errors import SessionError
+from liex_lab.geometry import SE3
+from liex_lab.sessions.corrections import BoutEdit, FlipSpan, JointMove, Log
+from liex_lab.sessions.evidence import read_evidence, read_flips
+from liex_lab.sessions.rows import frame_count
+from liex_lab.sessions.tables import BOUTS
+from liex_lab.sessions.tracks import track_of
+from liex_lab.tracking.curve import MARGIN, track_whole
+from liex_lab.tracking.track import CORRECTED, Flip, Track
+
+if TYPE_CHECKING:
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.camera import Camera
+    from liex_lab.sessions.session import Session
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+_HELD = 20.0  # how much more a joint that a person placed counts than one that may follow
+
+
+@dataclass(frozen=True)
+class CorrectedTrack:
+    """A track with the corrections of flips and joints in it. turned: rows in which exchanging head and tail may have
+    changed the pose; moved: rows with joints that a person placed; flips: the table `flips`.
+    """
+
+    track: Track
+    turned: Rows
+    moved: Rows
+    flips: tuple[Flip, ...]
+
+    @property
+    def changed(self) -> bool:
+        """Whether any pose is another one."""
+        return bool(len(self.turned) + len(self.moved))
+
+
+def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> CorrectedTrack:
+    """The track of a session, opened raw, with the standing corrections of its log."""
+    track = track_of(session, skeleton)
+    index = session.frames["frame_index"].to_numpy(np.int64)
+    flips, turned = tuple(read_flips(session)), np.zeros(0, np.int64)
+    spans: list[FlipSpan] = log.corrections(FlipSpan)
+    if spans:
+        track, flips, turned = _turned_round(session, track, index, spans)
+    moves: list[JointMove] = log.corrections(JointMove)
+    moved = place_joints(track, index, moves, session.camera, session.T_arena_camera)
+    return CorrectedTrack(track, turned, moved, flips)
+
+
+def _turned_round(
+    session: Session, track: Track, index: Rows, spans: Sequence[FlipSpan]
+) -> tuple[Track, tuple[Flip, ...], Rows]:  # fmt: skip
+    """The track made again from what the single frames said, with the spans turned round; far from them it stays."""
+    seen, subject = read_evidence(session)
+    wanted = [Flip(*_rows_of(index, span), 1.0, True, HUMAN) for span in spans]
+    earlier = [flip for flip in read_flips(session) if flip.source == HUMAN]  # of versions that wrote into the table
+    again = track_whole(subject, seen, [*earlier, *wanted])
+    near = np.zeros(len(index), bool)
+    for flip in wanted:
+        near[max(0, flip.start - MARGIN) : flip.stop + MARGIN] = True
+    for column in fields(Track):
+        if column.name not in ("skeleton", "times_ns"):
+            getattr(track, column.name)[near] = getattr(again.track, column.name)[near]
+    return track, again.flips, np.flatnonzero(near)
+
+
+def place_joints(
+    track: Track, index: Rows, moves: Sequence[JointMove], camera: Camera, T_arena_camera: SE3
+) -> Rows:  # fmt: skip
+    """Put joints where a person says, in place, and let the others follow; returns the rows that this changed.
+
+    A local fit of the chain: bones keep their lengths and joints their limits, and those that nobody placed stay as
+    near as they can to where they were.
+    """
+    if not moves:
+        return np.zeros(0, np.int64)
+    skeleton, names = track.skeleton, list(track.skeleton.names)
+    rows = np.unique(np.searchsorted(index, [move.frame for move in moves]))
+    weight = np.ones((len(rows), skeleton.n_joints))
+    points = track.joints_mm[rows].copy()
+    for move in moves:
+        k, j = int(np.searchsorted(rows, np.searchsorted(index, move.frame))), names.index(move.joint)
+        points[k, j], weight[k, j] = (move.x_mm, move.y_mm, move.z_mm), _HELD
+    if not np.isfinite(points).all():
+        raise SessionError("a joint was moved in a frame that has no pose; take that correction back")
+    limits = skeleton.limits
+    start = Pose(SE3(track.root_rotation[rows], track.root_mm[rows]),
+                 np.clip(track.angles_rad[rows], limits[..., 0], limits[..., 1]), track.scale[rows])  # fmt: skip
+    for k in range(len(rows)):
+        pull = np.diag(weight[k])
+        fit = fit_poses(skeleton, (pull @ points[k])[None], pull, start[k : k + 1], keep_scale=True)
+        row, pose = rows[k], fit.pose
+        track.root_rotation[row], track.root_mm[row] = pose.root.rotation[0], pose.root.translation[0]
+        track.angles_rad[row], track.joints_mm[row] = pose.angles[0], pose.joints(skeleton)[0]
+    track.uv_px[rows] = camera.project(T_arena_camera.inverse() @ track.joints_mm[rows])
+    track.bridged[rows], track.flag[rows] = False, CORRECTED
+    return rows
+
+
+def _rows_of(index: Rows, span: FlipSpan) -> tuple[int, int]:
+    return int(np.searchsorted(index, span.start_frame)), int(np.searchsorted(index, span.stop_frame))
+
+
+def edited_bouts(bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.DataFrame) -> pd.DataFrame:
+    """The columns of `tables.BOUTS` of an ethogram with a person's edits, one after the other.
+
+    Each clears the bout that it edits, then its own span: a bout that reaches into it keeps what lies outside. What a
+    person says has the source human, the score 1 and no model.
+    """
+    rows = _spans(bouts, frames)
+    for edit in edits:
+        rows = _cleared(_cleared(rows, edit.was_start_ns, edit.was_stop_ns), edit.start_ns, edit.stop_ns)
+        if edit.action:
+            said = {"action": edit.action, "score": 1.0, "source": HUMAN, "model_hash": ""}
+            rows.append({**said, "start_ns": edit.start_ns, "stop_ns": edit.stop_ns})
+    return _table(rows, frames)
+
+
+def spliced_bouts(bouts: pd.DataFrame, other: pd.DataFrame, rows: Rows, frames: pd.DataFrame) -> pd.DataFrame:
+    """The bouts of one ethogram, and in some rows of the recording those of another; one word across a seam is one
+    bout.
+    """
+    times = frames["time_ns"].to_numpy(np.int64)
+    inside, mixed = _spans(other, frames), _spans(bouts, frames)
+    end = max([int(times[-1]) + 1, *(row["stop_ns"] for row in [*inside, *mixed])])
+    for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        start = int(times[part[0]])
+        stop = int(times[part[-1] + 1]) if part[-1] + 1 < len(times) else end
+        mixed = _cleared(mixed, start, stop) + _cleared(_cleared(inside, 0, start), stop, end)
+    joined: list[dict[str, Any]] = []
+    for row in sorted(mixed, key=lambda row: row["start_ns"]):
+        last = joined[-1] if joined else None
+        if last and last["stop_ns"] == row["start_ns"] and last["action"] == row["action"]:
+            joined[-1] = {**last, "stop_ns": row["stop_ns"]}
+        else:
+            joined.append(row)
+    return _table(joined, frames)
+
+
+def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
+    """Bouts as rows with their ends on the recording's clock: the frames' own times where they are one."""
+    times = frames["time_ns"].to_numpy(np.int64)
+    rows: list[dict[str, Any]] = []
+    for row in bouts[["action", "start_s", "stop_s", "score", "source", "model_hash"]].to_dict("records"):
+        ends = [int(times[0]) + round(1e9 * row[name]) for name in ("start_s", "stop_s")]
+        nearest = [int(times[min(np.searchsorted(times, end - 1), len(times) - 1)]) for end in ends]
+        start, stop = (b if abs(a - b) <= 1 else a for a, b in zip(ends, nearest, strict=True))
+        rows.append({**{str(k): v for k, v in row.items()}, "start_ns": start, "stop_ns": stop})
+    return rows
+
+
+def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[dict[str, Any]]:
+    """Bouts without what lies within a span; a bout around it becomes two."""
+    kept: list[dict[str, Any]] = []
+    for row in rows:
+        if stop_ns <= start_ns or row["stop_ns"] <= start_ns or row["start_ns"] >= stop_ns:
+            kept.append(row)
+            continue
+        kept += [{**row, "stop_ns": start_ns}] if row["start_ns"] < start_ns else []
+        kept += [{**row, "start_ns": stop_ns}] if row["stop_ns"] > stop_ns else []
+    return kept
+
+
+def _table(rows: Sequence[dict[str, Any]], frames: pd.DataFrame) -> pd.DataFrame:
+    """Rows in order of time as the table; a piece of a bout without a frame is none."""
+    times, count = frames["time_ns"].to_numpy(np.int64), frame_count(frames["frame_index"].to_numpy(np.int64))
+    first, made = int(times[0]), []
+    for row in sorted(rows, key=lambda row: row["start_ns"]):
+        a, b = np.searchsorted(times, [row["start_ns"], row["stop_ns"]])
+        if a == b:
+            continue
+        start_s, stop_s = ((row[name] - first) * 1e-9 for name in ("start_ns", "stop_ns"))
+        made.append({
+            "session_id": frames["session_id"].iloc[0], "individual": frames["individual"].iloc[0],
+            **{name: row[name] for name in ("action", "score", "source", "model_hash")},
+            "start_s": start_s, "stop_s": stop_s, "duration_s": stop_s - start_s,
+            "start_frame": int(count[a]), "stop_frame": int(count[b]),
+        })  # fmt: skip
+    table = pd.DataFrame(made, columns=[column.name for column in BOUTS])
+    return table.astype({column.name: "str" if column.dtype == "string" else column.dtype for column in BOUTS})

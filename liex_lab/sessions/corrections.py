@@ -1,0 +1,228 @@
+"""What people correct in a session: head and tail exchanged in a span, a joint moved, bouts of the ethogram.
+
+A session's own files are never written again. Beside them lies the folder `corrected`: `corrections.json` is the log,
+to which entries are only ever added (one may take back another), and the tables are what the session's own become with
+the entries that stand. `Session.open` reads those; `Session.open(path, raw=True)` reads what was measured.
+"""
+
+from __future__ import annotations
+
+import getpass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar
+
+from liex_lab.catalog import sha256
+from liex_lab.errors import SessionError
+
+FOLDER, LOG = "corrected", "corrections.json"
+SCHEMA_VERSION = 1
+FACTS = {"frames", "actions", "action_model", "unresolved_actions", "corrections"}  # sections that may change
+EDITS = ("add", "rename", "recut", "delete")
+
+
+@dataclass(frozen=True)
+class FlipSpan:
+    """Head and tail are exchanged in the frames start_frame to stop_frame, the camera's count, stop exclusive."""
+
+    kind: ClassVar[str] = "flip"
+    start_frame: int
+    stop_frame: int
+
+    def __str__(self) -> str:
+        """What is said in a list."""
+        return f"head and tail exchanged in frames {self.start_frame} to {self.stop_frame - 1}"
+
+
+@dataclass(frozen=True)
+class JointMove:
+    """In one frame, the camera's count, a joint lies at (x_mm, y_mm, z_mm) of the arena frame."""
+
+    kind: ClassVar[str] = "joint"
+    frame: int
+    joint: str
+    x_mm: float
+    y_mm: float
+    z_mm: float
+
+    def __str__(self) -> str:
+        """What is said in a list."""
+        return f"{self.joint} of frame {self.frame} to ({self.x_mm:.1f}, {self.y_mm:.1f}, {self.z_mm:.1f}) mm"
+
+
+@dataclass(frozen=True)
+class BoutEdit:
+    """From start_ns to stop_ns, the recording's clock, stop exclusive, the animal does `action`; '' is nothing that has
+    a name. was_start_ns to was_stop_ns: the bout that is edited and loses its time first; equal where there was none.
+    edit: a word of EDITS; was: the edited bout's action, for the reader.
+    """
+
+    kind: ClassVar[str] = "bout"
+    edit: str
+    action: str
+    start_ns: int
+    stop_ns: int
+    was: str = ""
+    was_start_ns: int = 0
+    was_stop_ns: int = 0
+
+    def __post_init__(self) -> None:
+        if self.edit not in EDITS or self.stop_ns <= self.start_ns:
+            raise ValueError(f"{self.edit} from {self.start_ns} to {self.stop_ns}")
+
+    def __str__(self) -> str:
+        """What is said in a list."""
+        seconds = f"{(self.stop_ns - self.start_ns) * 1e-9:.3f} s"
+        if self.edit == "rename":
+            return f"{self.was} of {seconds} is {self.action}"
+        if self.edit == "delete":
+            return f"no {self.was} for {seconds}"
+        return f"{self.action} for {seconds}" + (" (cut anew)" if self.edit == "recut" else "")
+
+
+Correction = FlipSpan | JointMove | BoutEdit
+_KINDS: dict[str, type[Correction]] = {"flip": FlipSpan, "joint": JointMove, "bout": BoutEdit}
+_UNDO = "undo"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the log: a correction, or, where `what` is None, that the entry number `undoes` is taken back.
+
+    made_at: ISO 8601 with zone.
+    """
+
+    number: int
+    author: str
+    made_at: str
+    what: Correction | None
+    undoes: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the log keeps it."""
+        about = {"number": self.number, "author": self.author, "made_at": self.made_at}
+        if self.what is None:
+            return {**about, "kind": _UNDO, "undoes": self.undoes}
+        return {**about, "kind": self.what.kind, **asdict(self.what)}
+
+    @staticmethod
+    def from_dict(entry: Mapping[str, Any]) -> Entry:
+        """What `to_dict` made. Raises ValueError, KeyError or TypeError where it is none."""
+        about = (int(entry["number"]), str(entry["author"]), str(entry["made_at"]))
+        if entry["kind"] == _UNDO:
+            return Entry(*about, None, int(entry["undoes"]))
+        kind = _KINDS[entry["kind"]]
+        values = {f.name: _typed(entry[f.name], f.type) for f in fields(kind)}
+        return Entry(*about, kind(**values))
+
+
+def _typed(value: Any, kind: Any) -> Any:
+    """A value of the log with its own type; annotations are text here."""
+    return {"int": int, "float": float, "str": str}[str(kind)](value)
+
+
+@dataclass(frozen=True)
+class Log:
+    """All entries, first to last; made_of: which poses and bouts they correct, see `basis`; files: bytes and hash of
+    each corrected table; facts: what session.json would say instead.
+    """
+
+    made_of: str
+    entries: tuple[Entry, ...] = ()
+    files: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def standing(self) -> tuple[Entry, ...]:
+        """The corrections that nobody took back, in the order in which they were made."""
+        gone = {entry.undoes for entry in self.entries if entry.what is None}
+        return tuple(entry for entry in self.entries if entry.what is not None and entry.number not in gone)
+
+    def corrections(self, kind: type[Any]) -> list[Any]:
+        """The standing corrections of one kind."""
+        return [entry.what for entry in self.standing if isinstance(entry.what, kind)]
+
+    def added(self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = "") -> Log:
+        """The log with further entries: first those that are taken back, then new ones."""
+        known = {entry.number for entry in self.standing}
+        for number in undo:
+            if number not in known:
+                told = ", ".join(str(n) for n in sorted(known)) or "none"
+                raise SessionError(f"there is no correction {number} to take back; those that stand are {told}")
+        who, now = author or author_name(), datetime.now(UTC).isoformat(timespec="seconds")
+        number = max((entry.number for entry in self.entries), default=0)
+        new: list[Entry] = []
+        for undone, one in [*((n, None) for n in dict.fromkeys(undo)), *((0, w) for w in what)]:
+            number += 1
+            new.append(Entry(number, who, now, one, undone))
+        return Log(self.made_of, (*self.entries, *new), self.files, self.facts)
+
+    def to_json(self) -> str:
+        """The content of corrections.json."""
+        document = {
+            "schema_version": SCHEMA_VERSION, "made_of": self.made_of,
+            "entries": [entry.to_dict() for entry in self.entries],
+            "files": {name: dict(facts) for name, facts in self.files.items()}, "facts": dict(self.facts),
+        }  # fmt: skip
+        return json.dumps(document, indent=1, ensure_ascii=False, default=str, allow_nan=False) + "\n"
+
+
+def author_name() -> str:
+    """Who is logged in, as far as the system tells."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):
+        return "unknown"
+
+
+def corrected_folder(session: Path) -> Path:
+    """The folder of the corrections; while it is being replaced, the one that was there before."""
+    folder, old = session / FOLDER, session / f"{FOLDER}.old"
+    return old if old.is_dir() and not folder.is_dir() else folder
+
+
+def basis(session: Path, metadata: Mapping[str, Any]) -> str:
+    """What the corrections of a session are made of: the hash of its poses, its own bouts and flips."""
+    stated, found = metadata.get("files") or {}, []
+    for name in ("poses.parquet", "bouts.parquet", "flips.parquet"):
+        facts = stated.get(name) if isinstance(stated, dict) else None
+        found.append(str(facts["sha256"]) if isinstance(facts, dict) and "sha256" in facts else sha256(session / name))
+    return "-".join(one[:16] for one in found)
+
+
+def read_log(session: Path) -> Log:
+    """The corrections of the session in this folder; an empty log where there are none.
+
+    Raises SessionError where the log is damaged or was written by a later version.
+    """
+    path = corrected_folder(session) / LOG
+    if not path.is_file():
+        return Log("")
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        version = int(document["schema_version"])
+        if version > SCHEMA_VERSION:
+            raise SessionError(
+                f"{path} was written by a newer liex_lab (schema {version}, this one reads up to {SCHEMA_VERSION}); "
+                "upgrade with `pip install -U liex_lab`"
+            )
+        entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
+        files, facts = document.get("files", {}), document.get("facts", {})
+        if not all(isinstance(one, dict) for one in (files, facts, *files.values(), *facts.values())):
+            raise TypeError("files and facts are tables of tables")
+        if not set(facts) <= FACTS:
+            raise ValueError(f"facts of {', '.join(sorted(set(facts) - FACTS))}")
+        return Log(str(document["made_of"]), entries, files, facts)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise SessionError(
+            f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it, or remove the folder "
+            f"{FOLDER} to go on with what was measured"
+        ) from None
+
+
+def applies(log: Log, session: Path, metadata: Mapping[str, Any]) -> bool:
+    """Whether the log has corrections that stand, and they were made on these poses and bouts."""
+    return bool(log.standing) and log.made_of == basis(session, metadata)

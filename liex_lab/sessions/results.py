@@ -1,0 +1,81 @@
+"""Everything tabular of a session, written into a folder: from a track, and from what was measured of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.sessions import tables
+from liex_lab.sessions.provenance import Provenance, package_version
+from liex_lab.sessions.rows import Rows, median_step, stop_times
+from liex_lab.sessions.tables import Column
+from liex_lab.tracking.track import Flip
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Results:
+    """A track as rows, and where it comes from; `flips`: what was found out about head and tail."""
+
+    origin: Provenance
+    rows: Rows
+    flips: Sequence[Flip] = ()
+
+    def write_track(self, folder: Path) -> None:
+        """The tables of the track itself: frames, poses, rotations, gaps, flips, sessions."""
+        rows, described = self.rows, self.origin.table_metadata()
+        own: dict[str, Any] = {
+            "frames": [rows.frames()], "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
+            "flips": [rows.flips(self.flips)],
+            "sessions": [self.session_row()],
+        }  # fmt: skip
+        for name, blocks in own.items():
+            tables.write_table(folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
+
+    def write_measured(self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]) -> None:
+        """The tables of behaviour, summary.csv, and columns.json, which describes every table there is."""
+        described = self.origin.table_metadata()
+        for name, result in results.items():
+            schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
+            if not schema:  # kinematics without any measure
+                continue
+            block = tables.from_pandas(schema, result)
+            if name == "summary":
+                tables.check_described(block, schema, name)
+                result.map(tables.harmless).to_csv(folder / "summary.csv", index=False, lineterminator="\n")
+            else:
+                tables.write_table(folder / f"{name}.parquet", schema, [block], described)
+        text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
+        (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
+
+    def session_row(self) -> dict[str, Any]:
+        """The row of the table `sessions`."""
+        rows, track, subject = self.rows, self.rows.track, self.origin.subject
+        step = median_step(rows.time_s)
+        return {
+            "session_id": rows.session_id, "individual": rows.individual,
+            **{name: subject.get(name, "") for name in ("subject_id", "group", "cage", "sex", "batch")},
+            "session_start_time": self.origin.session_start_time,
+            "n_frames": track.n_frames, "n_frames_observed": int(track.observed.sum()),
+            "observed_s": float((stop_times(rows.time_s) - rows.time_s)[track.observed].sum()),
+            "fps_median": 1.0 / step if step else float("nan"),
+            "calibration_hash": self.origin.calibration_hash, "software_version": package_version("liex_lab"),
+        }  # fmt: skip
+
+    def counts(self) -> dict[str, Any]:
+        """How many frames there are, and how they were measured: `frames` of session.json."""
+        rows, track, row = self.rows, self.rows.track, self.session_row()
+        flags = {flag or "good": int(np.sum(track.flag == flag)) for flag in np.unique(track.flag)}
+        return {
+            "n_frames": track.n_frames, "n_observed": int(track.observed.sum()), "flags": flags,
+            "n_missing": int(rows.missing_before().sum()), "n_gaps": int((rows.missing_before() > 0).sum()),
+            "duration_s": float(stop_times(rows.time_s)[-1]), "observed_s": row["observed_s"],
+            "fps_median": None if np.isnan(row["fps_median"]) else row["fps_median"],
+        }  # fmt: skip

@@ -1,0 +1,102 @@
+"""Stretches of a recording that other processes look at, side by side: each is written whole in a folder of its own.
+
+They lie inside the unfinished session until it takes them over, in order. A stretch may be written twice, by a worker
+that died and another one: it becomes whole by a rename, and both say the same.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from liex_lab.sessions.buffer import Columnar
+from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
+from liex_lab.sessions.failure import write_whole
+from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.writer import seen_rows
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.frame import DepthFrame
+
+_SIZES, _SEEN = "stretch.json", "seen"
+
+
+def stretch_folder(unfinished: Path, start: int, stop: int) -> Path:
+    """Where frames start to stop (exclusive) of the unfinished session in a folder lie when they are whole."""
+    return unfinished / STRETCHES / f"{start:09d}-{stop:09d}"
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether a stretch is there with all that it says it has."""
+    try:
+        sizes = json.loads((folder / _SIZES).read_text(encoding="utf-8"))
+        return all((folder / log).stat().st_size == sizes[log] for log in LOGS)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
+    """Make a whole stretch the next part of an unfinished session, which has n_frames frames then."""
+    held.seen.append(Columns(folder / _SEEN).read())
+    held.take(n_frames, seconds, {log: folder / log for log in LOGS})
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+class StretchWriter:
+    """Depth of consecutive frames and what was seen in them. In a `with` block: whole at its end, or not there."""
+
+    def __init__(self, folder: Path, origin: Provenance, first_ns: int | None) -> None:
+        """first_ns: when the recording's first frame was; None where that is in this stretch."""
+        from liex_lab.sessions.mcap import McapWriter
+        from liex_lab.sessions.rrd import ReplayWriter
+
+        self._whole, self._folder = folder, folder.with_name(f".{folder.name}.{os.getpid()}")
+        shutil.rmtree(self._folder, ignore_errors=True)
+        (self._folder / _SEEN).mkdir(parents=True)
+        self._seen = Columns(self._folder / _SEEN)
+        self._replay, self._mcap = (
+            kind(self._folder / log, origin) for kind, log in zip((ReplayWriter, McapWriter), LOGS, strict=True)
+        )
+        if first_ns is not None:
+            self._replay.go_on(first_ns)
+
+    def __enter__(self) -> StretchWriter:
+        return self
+
+    def add(self, frames: Sequence[DepthFrame], seen: Columnar) -> None:
+        """The next frames."""
+        from liex_lab.recordings.rvl import to_millimetres
+
+        depth, times = [to_millimetres(frame.depth) for frame in frames], [int(frame.time_ns) for frame in frames]
+        self._replay.add([int(frame.index) for frame in frames], times, depth)
+        self._mcap.add(times, depth)
+        self._seen.append(seen_rows(frames, seen))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
+            self._seen.close()
+            for log in (self._replay, self._mcap):
+                log.abandon()
+            if error is None:
+                self._become_whole(sizes)
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _become_whole(self, sizes: dict[str, int]) -> None:
+        """What was written up to now counts; what closing the logs adds to them does not."""
+        for log, size in sizes.items():
+            os.truncate(self._folder / log, size)
+        write_whole(self._folder / _SIZES, json.dumps(sizes))
+        if is_whole(self._whole):  # somebody else was quicker
+            return
+        shutil.rmtree(self._whole, ignore_errors=True)
+        self._folder.rename(self._whole)

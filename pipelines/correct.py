@@ -1,0 +1,139 @@
+"""The job `liex correct`: what people correct is kept beside a session, and every table follows."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.pipelines.session import measure_behaviour
+
+from liex_lab.errors import SessionError
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+from liex_lab.sessions.corrections import FOLDER, LOG, BoutEdit, Correction, Log, basis, read_log
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from liex_lab.behaviour.summary import Behaviour
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.applying import CorrectedTrack
+    from liex_lab.sessions.results import Results
+    from liex_lab.sessions.writer import ReportMaker
+
+_BUSY = ".correcting"
+_AS_BEFORE = ("kinematics", "zones")  # tables that edits of bouts do not change
+
+
+def correct_session(
+    session: str | Path,
+    what: Sequence[Correction] = (),
+    *,
+    undo: Sequence[int] = (),
+    author: str = "",
+    report: ReportMaker | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Add corrections to a session and take others back, by their numbers; with neither, make everything again.
+
+    All at once or not at all: the folder `corrected` is replaced by a rename. Corrections that were made on an earlier
+    measurement of the recording apply to this one from then on. Raises SessionError where one cannot be applied.
+    """
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.lock import locked
+
+    raw = Session.open(session, raw=True)
+    with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
+        made_of, log = basis(raw.path, raw.metadata), read_log(raw.path)
+        if log.entries and log.made_of != made_of and (what or undo):
+            raise SessionError(
+                f"the corrections of {raw.path} were made on another measurement of this recording; look at them with "
+                f"`liex correct list`, then apply them with `liex correct redo`, or remove the folder {FOLDER}"
+            )
+        log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
+        if not log.entries:
+            raise SessionError(f"{raw.path} has no corrections to apply; `liex correct --help` says how to make one")
+        part = raw.path / f"{FOLDER}.part"
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        try:
+            if log.standing:
+                progress(0, None, "measuring what was corrected")
+                log = _apply(raw, log, part)
+            (part / LOG).write_text(log.to_json(), encoding="utf-8")
+            _put(part)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    if report is not None:
+        progress(0, None, "writing the report")
+        report(raw.path)
+    return raw.path
+
+
+def _apply(raw: Session, log: Log, folder: Path) -> Log:
+    """Write the tables that are others than the session's own; returns the log that lists them."""
+    from liex_lab.sessions.applying import corrected_track
+    from liex_lab.sessions.evidence import provenance_of
+    from liex_lab.sessions.place import file_facts
+    from liex_lab.sessions.results import Results
+    from liex_lab.sessions.rows import Rows
+    from liex_lab.sessions.tracks import skeleton_of
+
+    skeleton = skeleton_of(raw)
+    origin, found = provenance_of(raw, skeleton), corrected_track(raw, log, skeleton)
+    index = raw.frames["frame_index"].to_numpy()
+    rows = Rows(found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones)
+    results = Results(origin, rows, found.flips)
+    behaviour, facts = _behaviour(raw, log, found, results)
+    written = behaviour.tables
+    if found.changed:
+        results.write_track(folder)
+        facts["frames"] = results.counts()
+    else:
+        written = {name: table for name, table in written.items() if name not in _AS_BEFORE}
+    results.write_measured(folder, written, behaviour.vocabulary.columns)
+    facts |= {"corrections": _told(log), "actions": dict(behaviour.actions)}
+    return replace(log, files=file_facts(folder, {}), facts=facts)
+
+
+def _told(log: Log) -> dict[str, Any]:
+    """The standing corrections in short: `corrections` of session.json as it is read."""
+    made = [(entry.what, entry.author) for entry in log.standing if entry.what is not None]
+    kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
+    return {"n": len(made), **kinds, "authors": sorted({author for _, author in made}),
+            "last": log.standing[-1].made_at}  # fmt: skip
+
+
+def _behaviour(
+    raw: Session, log: Log, found: CorrectedTrack, results: Results
+) -> tuple[Behaviour, dict[str, Any]]:  # fmt: skip
+    """The behaviour of the corrected track, and facts of it for session.json.
+
+    The ethogram is the session's own; where head and tail were exchanged it is named again; then come the edits.
+    """
+    from liex_lab.behaviour.summary import measure_rows, stated_by
+    from liex_lab.sessions.applying import edited_bouts, spliced_bouts
+    from liex_lab.sessions.tables import FRAMES, to_pandas
+
+    rules, around = stated_by(raw)
+    frames: pd.DataFrame = to_pandas(FRAMES, results.rows.frames())
+    bouts, actions, facts = raw.bouts, dict(raw.metadata.get("actions") or {}), {}
+    if len(found.turned):
+        again, facts = measure_behaviour(results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin)
+        bouts, actions = spliced_bouts(bouts, again.bouts, found.turned, frames), {**again.actions, **actions}
+    bouts = edited_bouts(bouts, log.corrections(BoutEdit), frames)
+    return measure_rows(results.rows, rules, around, bouts=bouts, actions=actions), facts
+
+
+def _put(part: Path) -> None:
+    """Rename the new folder into place; until then readers find the old one (see `corrections.corrected_folder`)."""
+    folder, old = part.with_name(FOLDER), part.with_name(f"{FOLDER}.old")
+    if folder.is_dir():
+        shutil.rmtree(old, ignore_errors=True)
+        os.rename(folder, old)
+    os.rename(part, folder)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,63 @@
+"""SIGKILL of the main process at random moments."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from liex_lab.pipelines.stretches import MEASURING
+
+from liex_lab.errors import LiexError
+from liex_lab.sessions import Session
+from tests.campaign.runs import begin, refusal, tables_of, undisturbed
+
+
+def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
+    """Kill runs at n random moments; a run that was killed is begun again until it is whole, and compared."""
+    rng, scratch = random.Random(seed), Path(tempfile.mkdtemp(prefix="liex-kills-"))
+    usual_s, expected = undisturbed(scratch, n_frames)
+    out, lost, where = scratch / "killed", [0.0], dict[str, int]()
+    killed = finished = equal = half = 0
+    while killed < n or not finished:
+        process = begin(out, n_frames)
+        process.join(rng.uniform(0.0, 1.1 * usual_s) if killed < n else None)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            killed += 1
+            stage, seconds = _lost(out)
+            where[stage] = where.get(stage, 0) + 1
+            lost.append(seconds)
+        elif process.exitcode:
+            raise RuntimeError(f"a run that nobody killed ended by itself: {refusal(out)}")
+        for place in out.glob("*.liex"):  # it is there: then it is whole
+            try:
+                Session.open(place)
+                equal += tables_of(place) == expected
+            except LiexError:
+                half += 1
+            finished += 1
+            shutil.rmtree(place)
+    shutil.rmtree(scratch)
+    return {"killed": killed, "killed_while": where, "finished": finished, "equal_tables": equal,
+            "half_written_read_as_whole": half, "usual_s": round(usual_s, 1),
+            "most_s_of_measuring_done_again": round(max(lost), 1)}  # fmt: skip
+
+
+def _lost(out: Path) -> tuple[str, float]:
+    """What was being done, and seconds of measuring since the last checkpoint, or since this process began to."""
+    try:
+        stage, since = json.loads((out / "stage.json").read_text())
+    except (OSError, ValueError):
+        return "beginning", 0.0
+    (out / "stage.json").unlink()
+    if stage != MEASURING:
+        return stage, 0.0
+    spent = time.monotonic() - since
+    states = [time.time() - state.stat().st_mtime for state in out.glob("*.part/checkpoint.json")]
+    return stage, min([spent, *states])

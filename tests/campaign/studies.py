@@ -1,0 +1,136 @@
+"""Studies whose workers are killed, and a study of a hundred sessions of which ten are broken."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from liex_lab.pipelines.study_state import Standing, standings
+
+from liex_lab.study import Study
+from tests.campaign.runs import SAMPLE, tables_of
+
+_N_SESSIONS = 4  # of a study whose workers are killed
+
+
+def workers(n: int, seed: int) -> dict[str, Any]:
+    """SIGKILL of a worker at n random moments of studies of four sessions; each study ends by itself."""
+    import psutil
+
+    rng, killed, done, same, again = random.Random(seed), 0, 0, 0, 0
+    expected: dict[str, dict[str, bytes]] = {}
+    given_up: dict[str, int] = {}
+    while killed < n or not expected:
+        folder = Path(tempfile.mkdtemp(prefix="liex-workers-"))
+        study = _study(folder, [(f"m{k}", "rawdata/walk.mcap") for k in range(_N_SESSIONS)])
+        (folder / "rawdata").mkdir()
+        shutil.copy(SAMPLE, folder / "rawdata" / "walk.mcap")
+        command = [sys.executable, "-m", "liex_lab", "cohort", str(study), "--workers", "2"]
+        quiet = not expected  # the first study is left alone
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None:
+            time.sleep(rng.uniform(3.0, 20.0))
+            found = [] if process.poll() is not None else [
+                one for one in psutil.Process(process.pid).children(recursive=True)
+                if "spawn_main" in " ".join(one.cmdline())]  # fmt: skip
+            if found and not quiet and killed < n:
+                rng.choice(found).send_signal(signal.SIGKILL)
+                killed += 1
+        for one in standings(Study.load(study)):
+            if one.state != "done":
+                given_up[one.reason] = given_up.get(one.reason, 0) + 1
+                continue
+            tables = tables_of(one.session.folder)
+            same += expected.setdefault(one.session.id, tables) == tables
+            done += 1
+        if any(one.state == "failed" for one in standings(Study.load(study))):  # one command tries them again
+            subprocess.run([*command, "--retry"], capture_output=True, check=False)
+            again += all(one.state == "done" for one in standings(Study.load(study)))
+        shutil.rmtree(folder)
+    return {"workers_killed": killed, "sessions_done": done, "equal_tables": same, "given_up": given_up,
+            "studies_whole_after_retry": again}  # fmt: skip
+
+
+# how a recording is broken, and what of the reason a person needs to read
+BROKEN = {
+    "missing": "there is no recording",
+    "empty file": "empty",
+    "cut short": "cut",
+    "no mcap": "MCAP",
+    "no depth": "no frame|holds no|no depth",
+    "text": "MCAP",
+    "8 bit": "8",
+    "no animal": "no animal",
+    "one frame": "frame",
+    "dark": "depth|read",
+}
+
+
+def broken(n: int, n_frames: int, n_workers: int) -> dict[str, Any]:
+    """A study of n sessions, ten of them broken in different ways; who fails and why; mended, one command does them."""
+    from liex_lab.api import run_study
+
+    folder = Path(tempfile.mkdtemp(prefix="liex-broken-"))
+    raw = folder / "rawdata"
+    raw.mkdir()
+    _break(raw, SAMPLE.read_bytes())
+    names = [(f"b{k}", f"rawdata/{_file_of(name)}") for k, name in enumerate(BROKEN)]
+    names += [(f"g{k}", f"synthetic:walk?seed={k}&frames={n_frames}&sensor=primesense-qvga")
+              for k in range(n - len(BROKEN))]  # fmt: skip
+    study = _study(folder, names)
+    found = run_study(study, workers=n_workers)
+    told = {name: _said(one) for name, one in zip(BROKEN, found, strict=False)}
+    for name in BROKEN:
+        shutil.copy(SAMPLE, raw / _file_of(name).replace(".png", ".mcap"))
+    study.write_text(study.read_text().replace(".png", ".mcap"))
+    after = run_study(study, workers=n_workers, retry=True)
+    shutil.rmtree(folder)
+    return {"done": _count(found, "done"), "failed": _count(found, "failed"), "reasons": told,
+            "done_after_they_were_mended_and_tried_again": _count(after, "done")}  # fmt: skip
+
+
+def _count(found: list[Standing], state: str) -> int:
+    return [one.state for one in found].count(state)
+
+
+def _said(one: Standing) -> dict[str, Any]:
+    failure = one.failure or {}
+    return {name: failure.get(name) for name in ("stage", "reason", "remedy")}
+
+
+def _study(folder: Path, names: list[tuple[str, str]]) -> Path:
+    """A study file with one animal for each (name, recording)."""
+    text = "".join(f'[[animals]]\nid = "{name}"\n[[sessions]]\nanimal = "{name}"\nsession = "01"\n'
+                   f'recording = "{recording}"\n' for name, recording in names)  # fmt: skip
+    (folder / "study.toml").write_text(text)
+    return folder / "study.toml"
+
+
+def _file_of(name: str) -> str:
+    return name.replace(" ", "_") + (".png" if name == "8 bit" else ".mcap")
+
+
+def _break(raw: Path, sample: bytes) -> None:
+    """The broken recordings."""
+    import cv2
+    import numpy as np
+
+    from tests.recordings.writers import write_mcap
+
+    contents = {"empty file": b"", "cut short": sample[: len(sample) // 2], "no mcap": os.urandom(5000),
+                "text": b"x,y\n1,2"}  # fmt: skip
+    for name, content in contents.items():
+        (raw / _file_of(name)).write_bytes(content)
+    cv2.imwrite(str(raw / _file_of("8 bit")), np.zeros((20, 20), np.uint8))
+    floor = np.full((40, 120, 160), 700, np.uint16)
+    for name, depth in (("no animal", floor), ("one frame", floor[:1]), ("dark", 0 * floor)):
+        write_mcap(raw / _file_of(name), depth)
+    write_mcap(raw / _file_of("no depth"), floor[:0])
