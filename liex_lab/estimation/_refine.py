@@ -241,7 +241,7 @@ def _pull(points, balls, radius, slopes, robust, gradient, curvature):
 
 @njit(cache=True)
 def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient, curvature):
-    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal; slopes as in `_pull`."""
+    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal. slopes (n, 3, P)."""
     row, target = np.empty(gradient.size), np.empty(3)
     last = heights.shape[0] - 1
     for b in range(len(slopes)):

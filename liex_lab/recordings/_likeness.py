@@ -25,7 +25,8 @@ _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
     """The mean depth, mm, of the blocks labelled `mark`, and how unlike a hand they are: the less, the more alike.
 
-    slot: the label of the rest of the surface, which the blocks get back; found (FIELDS,) as `_nearest.locate` fills it.
+    slot: the label of the rest of the surface, which the blocks get back; found (FIELDS,) as `_nearest.locate` fills
+    it.
     """
     box = np.empty(4, np.int64)
     box_around(labels.shape, found, _WITHIN * AROUND_MM * size, intrinsics, box)
