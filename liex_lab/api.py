@@ -171,6 +171,14 @@ def verify_session(
     return job(session, run_session, None if recording is None else str(recording), progress)
 
 
+def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
+    """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it cost in memory."""
+    from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.long import write_long as job
+
+    return job(minutes, out, write_report)
+
+
 def run_scale(
     n_frames: int = 900, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
