@@ -74,6 +74,19 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
     return made
 
 
+def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
+    """What can be looked at over time: (name with its unit, time s (n,), values (n,), colour), broken at gaps."""
+    frames = session.frames
+    time_s = frames["time_s"].to_numpy(float)
+    made = []
+    if session.has("kinematics.parquet"):
+        moved = session.kinematics
+        shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+        made = [(f"{title}, {unit}", time_s, _across_gaps(moved[name], frames), colour)
+                for name, title, _, unit, colour, _ in _CURVES if name in shown and name in moved]  # fmt: skip
+    return [*made, ("Predicted error, mm", time_s, _across_gaps(frames["predicted_error_mm"], frames), _RED)]
+
+
 def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
     """A measure around the onsets of the actions: (title, SVG), all of a measure on the same scale."""
     if not session.has("kinematics.parquet"):

@@ -313,17 +313,23 @@ def _frame(across: Scale, up: Scale) -> str:
 
 def _paths(x: Array, y: Array) -> list[str]:
     """Path data of a curve; of a long one every column keeps its lowest and highest point."""
-    if len(x) > 2 * _MAX_COLUMNS:
-        edges = np.linspace(0, len(x), _MAX_COLUMNS + 1).astype(int)
-        rows: list[int] = []
-        for a, b in pairwise(edges):
-            part = y[a:b]
-            if np.isfinite(part).all():
-                rows += sorted({a + int(part.argmin()), a + int(part.argmax())})
-            else:  # a column with a hole shows the hole
-                rows += [a, a + int(np.flatnonzero(~np.isfinite(part))[0])]
-        x, y = x[rows], y[rows]
-    return _broken(x, y)
+    rows = kept_rows(y, _MAX_COLUMNS)
+    return _broken(x[rows], y[rows])
+
+
+def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
+    """The rows of a curve (n,) to draw: all of a short one, of a long one each column's lowest and highest."""
+    if len(y) <= 2 * n_columns:
+        return np.arange(len(y))
+    edges = np.linspace(0, len(y), n_columns + 1).astype(int)
+    rows: list[int] = []
+    for a, b in pairwise(edges):
+        part = y[a:b]
+        if np.isfinite(part).all():
+            rows += sorted({a + int(part.argmin()), a + int(part.argmax())})
+        else:  # a column with a hole shows the hole
+            rows += [a, a + int(np.flatnonzero(~np.isfinite(part))[0])]
+    return np.array(rows, np.int64)
 
 
 def _broken(x: Array, y: Array) -> list[str]:

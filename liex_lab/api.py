@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.errors import MissingPackageError
 from liex_lab.plan import Plan
 from liex_lab.progress import Board, Progress, progress_board, silent
 from liex_lab.study import Study
@@ -126,6 +127,41 @@ def run_study(
                again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
 
 
+def serve_dashboard(
+    study: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8050,
+    told: Callable[[str], None] = print,
+    progress: Progress = silent,
+) -> None:
+    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears the address.
+
+    On a host other than this machine alone, every visitor has to know a token, which is part of the address. Raises
+    MissingPackageError where the extra `dashboard` is not installed.
+    """
+    import secrets
+
+    from liex_lab.pipelines.listing import list_sessions
+
+    try:
+        from liex_lab.dashboards.app import LOOPBACK, address, make_app, serve
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(
+            f"the dashboard needs {error.name}, which is not installed; pip install 'liex_lab[dashboard]'"
+        ) from None
+    from liex_lab.dashboards.app_data import StudyData
+    from liex_lab.sessions.viewer import show_replay
+
+    name, look = list_sessions(study)
+    data = StudyData(name, look)
+    data.warm(progress)
+    alone = host in LOOPBACK
+    token = "" if alone else secrets.token_urlsafe(24)
+    app = make_app(data, token=token, show_replay=show_replay if alone else None)
+    serve(app, host, port, lambda found: told(address(host, found, token)))
+
+
 def verify_session(
     session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
@@ -133,6 +169,14 @@ def verify_session(
     from liex_lab.pipelines.verify import verify_session as job
 
     return job(session, run_session, None if recording is None else str(recording), progress)
+
+
+def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
+    """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it cost in memory."""
+    from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.long import write_long as job
+
+    return job(minutes, out, write_report)
 
 
 def run_scale(

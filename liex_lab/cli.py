@@ -19,7 +19,7 @@ from rich.text import Text
 import liex_lab
 from liex_lab.cli_correct import correct
 from liex_lab.cli_results import compare, export
-from liex_lab.cli_study import cohort, scale, verify
+from liex_lab.cli_study import cohort, dashboard, scale, verify
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -37,6 +37,7 @@ evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers."
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(correct, name="correct")
 app.command()(cohort)
+app.command()(dashboard)
 app.command()(verify)
 evaluate.command("scale")(scale)
 app.command()(compare)
@@ -419,12 +420,19 @@ def live(
 def show(
     session: SessionPath,
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser instead of a window.")] = False,
+    at_s: Annotated[float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")] = None,
 ) -> None:
     """Open a session's replay in Rerun."""
     from liex_lab.sessions import Session
+    from liex_lab.sessions.viewer import has_screen, show_replay
 
     replay = Session.open(session).path / "session.rrd"
-    if not web and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if at_s is not None:
+        if web:
+            raise typer.BadParameter("a moment can be shown in a window only; leave out --web or --at")
+        show_replay(replay, at_s).wait()
+        return
+    if not web and not has_screen():
         raise LiexError(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )

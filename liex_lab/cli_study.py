@@ -55,6 +55,30 @@ def cohort(
         raise typer.Exit(SOME_FAILED)
 
 
+def dashboard(
+    study: Annotated[
+        Path, typer.Argument(metavar="STUDY", help="A study's .toml file, or a folder with sessions in it.")
+    ],
+    host: Annotated[
+        str, typer.Option("--host", help="Another address than this machine's own; visitors then need a token.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = 8050,
+    open_browser: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
+) -> None:
+    """Look at a study in the browser: sessions, ethograms, groups, any frame; Ctrl+C ends it."""
+    from liex_lab.api import serve_dashboard
+
+    def told(address: str) -> None:
+        typer.echo(f"dashboard: {address}   (Ctrl+C ends it)")
+        if open_browser:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    with progress_bar() as progress:
+        serve_dashboard(study, host=host, port=port, told=told, progress=progress)
+
+
 def verify(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")],
     recording: Annotated[

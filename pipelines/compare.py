@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _WHO = ("group", "cage", "sex", "batch")
-_USUAL = ("distance_m", "mean_speed_mm_s", "mean_abs_yaw_rate_rad_s", "turn_bias", "outer_half_share",
-          "top_third_share", "tail_beat_hz")  # fmt: skip
 
 
 def compare_sessions(
@@ -34,7 +32,7 @@ def compare_sessions(
     usual ones and every action's share. reference: compare with this group only. animals: a CSV with subject_id and any
     of group, cage, sex, batch, which overrules what the sessions say. Returns the table's rows and the files.
     """
-    from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods
+    from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods, usual_measures
     from liex_lab.sessions import Session
     from liex_lab.sessions.tables import dictionary, from_pandas, write_table
 
@@ -77,18 +75,12 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
     for place in map(Path, places):
         if not place.is_dir():
             raise SessionError(f"{place} is not a folder; name session folders, or folders with sessions in them")
-        inside = [place] if (place / "session.json").is_file() else [p.parent for p in place.rglob("session.json")]
+        inside = {place} if (place / "session.json").is_file() else {p.parent for p in place.rglob("session.json")}
+        inside = {folder for folder in inside if not inside & set(folder.parents)}  # not a session's older tables
         if not inside:
             raise SessionError(f"there is no session in {place}; `liex run` makes them")
         found |= {folder.resolve() for folder in inside}
     return sorted(found)
-
-
-def usual_measures(table: pd.DataFrame) -> list[str]:
-    """What is compared when nobody says: the usual ones that have values, and every action's share."""
-    shares = [str(name) for name in table.columns if str(name).removesuffix("_share") + "_count" in table.columns
-              and str(name).endswith("_share")]  # fmt: skip
-    return [name for name in (*_USUAL, *shares) if name in table and table[name].notna().any()]
 
 
 def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:

@@ -45,7 +45,7 @@ def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
 
     folder = study.cohort_folder
     folder.mkdir(parents=True, exist_ok=True)
-    rows = [_row(study, one) for one in standings]
+    rows = study_rows(study, standings)
     names = [column.name for column in STUDY_SESSIONS]
     block = {name: [row[name] for row in rows] for name in names}
     part = folder / f".{TABLE}.parquet.part"
@@ -59,6 +59,11 @@ def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
     entries = [entry for entry in dictionary(STUDY_SESSIONS) if entry["table"] == TABLE]
     write_whole(folder / f"{TABLE}_columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
     return folder / f"{TABLE}.csv"
+
+
+def study_rows(study: Study, standings: Sequence[Standing]) -> list[dict[str, Any]]:
+    """One row per session, its keys the columns of STUDY_SESSIONS."""
+    return [_row(study, one) for one in standings]
 
 
 def _row(study: Study, one: Standing) -> dict[str, Any]:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
+_USUAL = ("distance_m", "mean_speed_mm_s", "mean_abs_yaw_rate_rad_s", "turn_bias", "outer_half_share",
+          "top_third_share", "tail_beat_hz")  # fmt: skip
 
 STATS: tuple[Column, ...] = columns(
     "stats",
@@ -70,8 +72,15 @@ def collect(sessions: Iterable[Session]) -> pd.DataFrame:
     for session in sessions:
         who = session.table("sessions")
         table = who.merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
-        rows.append(table.assign(n_bouts=len(session.bouts)))
+        rows.append(table.assign(n_bouts=len(session.table("bouts", ["action"]))))
     return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame(columns=["session_id", *WHO])
+
+
+def usual_measures(table: pd.DataFrame) -> list[str]:
+    """What is compared when nobody says: the usual ones that have values, and every action's share."""
+    shares = [str(name) for name in table.columns if str(name).removesuffix("_share") + "_count" in table.columns
+              and str(name).endswith("_share")]  # fmt: skip
+    return [name for name in (*_USUAL, *shares) if name in table and table[name].notna().any()]
 
 
 def compare(

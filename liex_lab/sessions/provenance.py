@@ -8,6 +8,7 @@ import platform
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -138,6 +139,7 @@ def plan_table(plan_toml: str) -> dict[str, Any]:
         raise SessionError(f"the plan to be stored is not TOML ({error}); pass the plan's own TOML text") from None
 
 
+@cache
 def package_version(name: str) -> str:
     """The installed version of a package, or 'unknown' when it runs from a plain folder."""
     try:

@@ -1,0 +1,25 @@
+"""Small parts that the dashboard's pages share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dash import dcc, html
+
+_GRAPH = {"displaylogo": False, "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"], "responsive": True}
+
+
+def aria(**names: str) -> dict[str, Any]:
+    """Attributes for those who read a page with their ears: `label` becomes aria-label."""
+    return {f"aria-{name}": value for name, value in names.items()}
+
+
+def graph(name: str, figure: dict[str, Any], told: str) -> html.Div:
+    """A figure with what it shows in words."""
+    drawn = dcc.Graph(id=name, figure=figure, config=_GRAPH)  # type: ignore[arg-type]
+    return html.Div(drawn, role="figure", className="graph", **aria(label=told))
+
+
+def download(title: str, address: str, className: str = "button") -> html.A:
+    """A link whose target is saved, not shown."""
+    return html.A(title, href=address, className=className, download="")

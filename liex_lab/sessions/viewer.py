@@ -1,0 +1,89 @@
+"""A session's replay in a window of Rerun's viewer, at a moment."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from liex_lab.errors import LiexError
+
+_PATIENCE_S = 30.0  # for a viewer to come up
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A viewer that shows a replay: its process, and Rerun's client that commands it."""
+
+    process: subprocess.Popen[bytes]
+    client: Any
+
+    def wait(self) -> None:
+        """Until the viewer is closed."""
+        self.process.wait()
+
+    def close(self) -> None:
+        """End the viewer."""
+        _end(self.process)
+
+
+def has_screen() -> bool:
+    """Whether a window can be shown here."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
+    """Open a .rrd in a window at a time, s since its first frame.
+
+    The viewer listens on 127.0.0.1 alone and ends with this process. Raises LiexError where it does not come up.
+    """
+    if not replay.is_file():
+        raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
+    if not headless and not has_screen():
+        raise LiexError(f"Rerun needs a screen and there is none here; open {replay} on a computer that has one")
+    from rerun.experimental import ViewerClient
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    process = _begin("--port", str(port), "--hide-welcome-screen", *(["--headless"] if headless else []))
+    ends, seen = time.monotonic() + _PATIENCE_S, ""
+    while time.monotonic() < ends and process.poll() is None:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.open(str(replay.resolve()))
+            client.set_time("time", duration=at_s, play_state="paused")
+            return Shown(process, client)
+        except Exception as error:  # not up yet; what it raises then is not documented
+            seen = str(error).partition("\n")[0][:200]
+            time.sleep(0.3)
+    _end(process)
+    raise LiexError(f"Rerun did not show {replay} ({seen or 'it ended at once'}); try `liex show` in a terminal")
+
+
+def _begin(*arguments: str) -> subprocess.Popen[bytes]:
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
+    command = [sys.executable, "-m", "rerun", *arguments, "--bind", "127.0.0.1"]
+    viewer = subprocess.Popen(
+        command, env={**os.environ, "RERUN_ANALYTICS": "0"}, start_new_session=True, stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    atexit.register(_end, viewer)
+    return viewer
+
+
+def _end(viewer: subprocess.Popen[bytes]) -> None:
+    """End a viewer with what it has started: `rerun` is a wrapper around the real one."""
+    if viewer.poll() is None:
+        if hasattr(os, "killpg"):
+            os.killpg(viewer.pid, signal.SIGTERM)
+        else:
+            viewer.terminate()
+        viewer.wait(timeout=10)

@@ -1,0 +1,230 @@
+"""What the dashboard shows is what the folders hold; what it hands out runs nowhere; and not everybody may ask."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from liex_lab.dashboards import app_plots, app_tables
+from liex_lab.dashboards.app import address, make_app
+from liex_lab.dashboards.app_data import Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app_session import moved_to
+from liex_lab.pipelines.listing import list_sessions
+from typer.testing import CliRunner
+
+from liex_lab import api, cli
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.sessions import Session
+from tests.dashboards import copies
+
+KEY = "sub-m003_ses-01"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return copies.study(tmp_path_factory.mktemp("study"), 24)
+
+
+@pytest.fixture(scope="module")
+def data(study: Path) -> StudyData:
+    return StudyData(*list_sessions(study))
+
+
+def test_every_session_of_the_study_is_listed_with_its_state_and_quality(data: StudyData) -> None:
+    table = data.overview().set_index("session")
+    assert len(table) == 24
+    assert table["state"].value_counts().to_dict() == {"done": 22, "failed": 1, "new": 1}
+    failed = table[table["state"] == "failed"].iloc[0]
+    assert (failed["reason"], failed["remedy"]) == ("frame 33 cannot be read", "copy it again")
+    done = table.loc[KEY]
+    assert (done["n_frames"], done["n_gaps"], done["n_missing"]) == (174, 1, 6)
+    assert done["posed_share"] == pytest.approx(172 / 174)
+    assert set(table["group"]) == set(copies.GROUPS)
+
+
+def test_a_folder_of_sessions_needs_no_study_file_and_older_tables_are_no_sessions(study: Path, tmp_path: Path) -> None:
+    one = tmp_path / "one.liex"
+    shutil.copytree(study.parent / "first.liex", one)
+    (one / "as_tracked").mkdir()
+    shutil.copy(one / "session.json", one / "as_tracked")
+    shutil.copytree(one, tmp_path / "two.liex")
+    name, look = list_sessions(tmp_path)
+    assert name == tmp_path.name
+    assert [(entry.key, entry.state) for entry in look()] == [("one.liex", "done"), ("two.liex", "done")]
+    with pytest.raises(LiexError, match="no study"):
+        list_sessions(tmp_path / "nowhere")
+
+
+def test_a_session_that_is_written_again_is_read_again(study: Path, tmp_path: Path) -> None:
+    shutil.copytree(study.parent / "first.liex", tmp_path / "s.liex")
+    data = StudyData(*list_sessions(tmp_path))
+    assert data.overview()["n_gaps"].tolist() == [0]
+    document = tmp_path / "s.liex" / "session.json"
+    about = json.loads(document.read_text())
+    about["frames"]["n_gaps"] = 77
+    document.write_text(json.dumps(about))
+    assert data.overview()["n_gaps"].tolist() == [77]
+
+
+@settings(max_examples=30)
+@given(
+    edges=st.lists(st.floats(0, 10), min_size=2, max_size=14, unique=True), n=st.integers(1, 40),
+    words=st.lists(st.sampled_from(["a", "b", "c"]), min_size=7, max_size=7),
+)  # fmt: skip
+def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
+    edges: list[float], n: int, words: list[str]
+) -> None:
+    spans = np.array(sorted(edges)[: len(edges) // 2 * 2]).reshape(-1, 2)
+    one = Ethogram(spans[1:], words[: len(spans) - 1], spans[:1], 10.0)
+    found = raster(one, ["a", "b", "c"], 0.0, 10.0, n)
+    for k, place in enumerate(found):
+        low, high = 10.0 * k / n, 10.0 * (k + 1) / n
+        seconds = dict.fromkeys([0, 1, 2, -2], 0.0)
+        for kind, (a, b) in zip([-2, *("abc".index(w) for w in one.words)], spans, strict=True):
+            seconds[kind] += max(min(b, high) - max(a, low), 0.0)
+        if place == -1:
+            assert max(seconds.values()) < 1e-9
+        else:
+            assert seconds[place] >= max(seconds.values()) - 1e-9
+
+
+def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
+    colours = colours_of([f"w{k}" for k in range(12)])
+    assert len(set(list(colours.values())[:9])) == 9
+    assert len(set(list(colours.values())[9:])) == 1
+
+
+def test_names_are_text_in_every_figure(data: StudyData) -> None:
+    table = data.collected()
+    ones = {key: Ethogram(np.array([[0.0, 1.0]]), ["<i>x"], np.zeros((0, 2)), 2.0) for key in ("<b>s",)}
+    shares = pd.DataFrame({"key": ["<b>s"], "<i>x_share": [0.5], "<i>x_s": [1.0]})
+    figures = [
+        app_plots.groups(table, "mean_speed_mm_s", "<u>"), app_plots.ethograms(ones, ["<i>x"]),
+        app_plots.differences(data.stats("mean_speed_mm_s"), "<u>"), app_plots.time_budgets(shares, ["<i>x"]),
+        app_plots.whole_session(ones["<b>s"], ["<i>x"], [("<u>", np.arange(3.0), np.arange(3.0), "#000")]),
+    ]  # fmt: skip
+    for figure in figures:
+        for item in figure["data"]:
+            item.pop("customdata", None)  # a key, which nobody shows
+        text = json.dumps(figure, default=lambda value: np.asarray(value).tolist())
+        assert not any(markup in text for markup in ("<b>", "<i>", "<u>", "drug</b>"))
+        assert "drug&lt;/b&gt; %{y}" not in text.partition("hovertemplate")[2].partition('"')[2].partition('"')[0]
+
+
+def test_the_groups_are_compared_as_liex_compare_does(data: StudyData) -> None:
+    stats = data.stats("mean_speed_mm_s").set_index("measure")
+    row = stats.loc["mean_speed_mm_s"]
+    assert abs(row["estimate"]) == pytest.approx(40.0, abs=15.0)
+    assert (row["n_animals"], row["n_sessions"]) == (12, 22)
+    assert "measure" in app_tables.STATS
+    assert len(stats) > 3  # the family that p is corrected for is not the one measure that is looked at
+
+
+def test_rows_are_found_by_words_and_sorted_with_the_unknown_last(data: StudyData) -> None:
+    table = app_tables.find(data, "sessions")
+    assert app_tables.arranged(table, "m003 DONE", "", False)["session"].tolist() == [KEY, "sub-m003_ses-02"]
+    rows = app_tables.arranged(table, "", "predicted_error_mm", True)
+    assert set(rows["state"].tail(2)) == {"failed", "new"}
+    assert app_tables.arranged(table, "nobody", "", False).empty
+
+
+def test_a_table_in_a_spreadsheet_computes_nothing_and_is_whole() -> None:
+    rows = pd.DataFrame({"name": ['=HYPERLINK("http://x")', "-2+3", "plain", None], "=x": [1.5, -2.0, 3.0, np.nan]})
+    found = pd.read_csv(io.StringIO("".join(app_tables.as_csv(rows))))
+    assert found["name"].tolist()[:3] == ["'=HYPERLINK(\"http://x\")", "'-2+3", "plain"]
+    assert list(found.columns) == ["name", "'=x"]
+    assert found["'=x"].tolist()[:3] == [1.5, -2.0, 3.0]
+
+
+def test_every_table_of_a_session_can_be_had(data: StudyData) -> None:
+    browser = make_app(data).server.test_client()
+    session = data.session(KEY)
+    for name in app_tables.session_tables(data, KEY):
+        answer = browser.get(f"/session-csv/{KEY}/{name}.csv")
+        assert answer.status_code == 200
+        rows = session.summary if name == "summary" else session.table(name)
+        assert answer.text.count("\n") == len(rows) + 1
+    for name in ("sessions", "summaries", "stats/mean_speed_mm_s", f"bouts/{KEY}"):
+        assert browser.get(app_tables.csv_address(name)).status_code == 200
+    beside = f"/session-csv/{KEY}/../session.csv"
+    for gone in (beside, "/session-csv/nobody/frames.csv", "/csv/secrets.csv", "/report/x"):
+        assert browser.get(gone).status_code == 404
+
+
+def test_steps_go_to_the_next_frame_bout_and_flag(data: StudyData) -> None:
+    session: Session = data.session(KEY)
+    times = session.frames["time_s"].to_numpy()
+    assert moved_to(session, times[3], "frame", 1) == times[4]
+    assert moved_to(session, times[0], "frame", -1) == times[0]
+    starts = sorted(session.bouts["start_s"])
+    assert moved_to(session, starts[0], "bout", 1) == starts[1]
+    assert moved_to(session, 0.0, "flag", 1) == pytest.approx(times[150])
+    assert moved_to(session, times[-1], "flag", 1) == times[-1]
+
+
+def test_this_machine_alone_may_ask_and_no_other_site(data: StudyData) -> None:
+    browser = make_app(data).server.test_client()
+    assert browser.get("/", headers={"Host": "127.0.0.1:8050"}).status_code == 200
+    assert browser.get("/", headers={"Host": "evil.example:8050"}).status_code == 403
+    sent = {"Host": "127.0.0.1:8050", "Origin": "http://evil.example"}
+    assert browser.post("/_dash-update-component", headers=sent, json={}).status_code == 403
+    policy = browser.get("/").headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "http" not in policy
+
+
+def test_on_another_address_a_token_is_asked_for(data: StudyData) -> None:
+    app = make_app(data, token="right")
+    browser = app.server.test_client()
+    for path in ("/", "/csv/sessions.csv", "/_dash-layout", "/?token=wrong"):
+        assert browser.get(path, headers={"Host": "lab:1"}).status_code == 401
+    let_in = browser.get("/?token=right", headers={"Host": "lab:1"})
+    assert let_in.status_code == 302
+    assert "HttpOnly" in let_in.headers["Set-Cookie"]
+    assert "token" not in let_in.headers["Location"]
+    browser.set_cookie("liex_dashboard", "right", domain="lab")
+    assert browser.get("/csv/sessions.csv", headers={"Host": "lab:1"}).status_code == 200
+    assert address("0.0.0.0", 5, "right") == "http://0.0.0.0:5/?token=right"
+    assert address("127.0.0.1", 5, "") == "http://127.0.0.1:5/"
+
+
+def test_the_token_is_new_each_time_and_only_where_others_can_ask(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[dict[str, object]] = []
+    monkeypatch.setattr("liex_lab.dashboards.app.make_app", lambda data, **how: made.append(how))
+    monkeypatch.setattr("liex_lab.dashboards.app.serve", lambda app, host, port, told: told(port))
+    monkeypatch.setattr(StudyData, "warm", lambda self, progress: None)
+    said: list[str] = []
+    for host in ("127.0.0.1", "0.0.0.0", "0.0.0.0"):
+        api.serve_dashboard(study, host=host, port=5, told=said.append)
+    assert made[0]["token"] == ""
+    assert made[0]["show_replay"] is not None
+    assert made[1]["token"] != made[2]["token"]
+    assert len(str(made[1]["token"])) >= 32
+    assert made[1]["show_replay"] is None  # a viewer would open where nobody looks
+    assert said[1].endswith(str(made[1]["token"]))
+
+
+def test_without_dash_a_sentence_says_what_to_install(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "dash", None)
+    for name in [name for name in sys.modules if name.startswith("liex_lab.dashboards.app")]:
+        monkeypatch.delitem(sys.modules, name)
+    ran = CliRunner().invoke(cli.app, ["dashboard", str(study)])
+    assert isinstance(ran.exception, LiexError)
+    assert "pip install 'liex_lab[dashboard]'" in str(ran.exception)
+
+
+def test_what_is_not_there_is_told(data: StudyData) -> None:
+    with pytest.raises(SessionError, match="no measured session"):
+        data.session("sub-m000_ses-02")
+    with pytest.raises(SessionError, match="no table"):
+        app_tables.find(data, "nothing")
