@@ -72,6 +72,7 @@ class SessionWriter:
         self._started, self._seconds = time.perf_counter(), 0.0
         self._held = TrackBuffer(origin.skeleton, 0)
         self._flips: Sequence[Flip] = ()
+        self._candidates: Observations | None = None
         self._keepsakes = Keepsakes()
         self._done = False
         self._folder = part_folder(path)
@@ -189,6 +190,7 @@ class SessionWriter:
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
         """The track of all frames so far, what was found out about its flips, and what it was made of."""
         self.track, self._flips = tracked.track, tracked.flips
+        self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
 
     @property
@@ -244,7 +246,7 @@ class SessionWriter:
         give_back()
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
         problems = self._document["problems"]
-        self._replay.finish(rows, kinematics, bouts, words, problems)
+        self._replay.finish(rows, kinematics, bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
         self._checkpoint.join_logs()
         self.note(actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {}))
