@@ -30,9 +30,8 @@ from liex_lab.recordings.acting import STEP_S, Individual, Motion
 from liex_lab.recordings.filming import Camerawork, film
 from liex_lab.recordings.fish import FishHabits
 from liex_lab.recordings.habits import MouseHabits
-from liex_lab.tracking.curve import Subject, single_frames, track_whole
+from liex_lab.tracking.curve import Subject, track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.track import Track
 from liex_lab.tracking.windowed import WindowTracker
 
 Array = NDArray[np.float64]
@@ -83,13 +82,7 @@ class Acted:
         """
         rows = np.arange(len(self.words)) if not rate_hz else thinned(self.seen.times_ns, rate_hz)
         seen = Observations(self.seen.skeleton, *(getattr(self.seen, name)[rows] for name in COLUMNS))
-        return self._labelled(track_whole(self.subject, seen).track, rows)
-
-    def unsmoothed(self) -> LabelledTrack:
-        """What each frame says by itself."""
-        return self._labelled(single_frames(self.subject, self.seen), np.arange(len(self.words)))
-
-    def _labelled(self, track: Track, rows: NDArray[np.int64]) -> LabelledTrack:
+        track = track_whole(self.subject, seen).track
         one = LabelledTrack(track, self.words[rows], self.animal, self.wall_mm[rows], self.truth[rows].astype(float))
         return one[one.words == self.cut] if self.cut else one
 

@@ -31,7 +31,7 @@ def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
-    from liex_lab.pipelines.acted import acted
+    from liex_lab.pipelines.acted import acted, acted_tracks
     from liex_lab.pipelines.action_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
 
     if animal not in WORDS:
@@ -39,10 +39,8 @@ def learning_set(
     recordings = acted(training_recordings(animal), estimator, progress)
     usual = by_usual_camera(recordings)
     slower = [one.tracked(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
-    alone = [one.unsmoothed() for one in usual]  # a live track is smoothed less than a recording's
-    cuts = acted(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
-    told = [one.tracked() for one in cuts] + [one.unsmoothed() for one in cuts]
-    return [*(one.tracked() for one in recordings), *slower, *alone], told
+    cuts = acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
+    return [*(one.tracked() for one in recordings), *slower], cuts
 
 
 def train_actions(
