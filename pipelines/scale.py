@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from liex_lab.pipelines.build import build_recording
@@ -19,9 +19,6 @@ from liex_lab.pipelines.stretches import CHUNK
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.study import Study
-
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
 
 RunSession = Callable[..., Path]
 _VIRTUAL = "synthetic:walk?seed=5&frames={n}&sensor=primesense"
@@ -166,7 +163,7 @@ def simulate(
 _WRITE_LONG = """
 import json, sys
 import numpy as np
-from liex_lab.pipelines.scale import write_long
+from liex_lab.api import write_long
 print(json.dumps(write_long(float(sys.argv[1]), sys.argv[2])))
 """
 
@@ -178,34 +175,3 @@ def _memory(minutes: float, folder: Path) -> float:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     return float(json.loads(done.stdout.splitlines()[-1])["peak_memory_mb"])
-
-
-def looped(short: Recording, n_frames: int) -> Recording:
-    """A recording of any length: the frames of a short one, held in memory, to and fro, at times that run on."""
-    from liex_lab.recordings.recording import Recording
-
-    depth = [short.frame(row).depth for row in range(len(short))]
-    there = [*range(len(depth)), *range(len(depth) - 2, 0, -1)]
-    long = Recording(
-        name="long", format="synthetic", camera=short.camera,
-        times_ns=np.arange(n_frames, dtype=np.int64) * int(1e9 / _FPS), read=lambda row: depth[there[row % len(there)]],
-    )  # fmt: skip
-    long.take_digest("0" * 64)
-    return long
-
-
-def write_long(minutes: float, out: str) -> dict[str, Any]:
-    """A session of any length from the frames of a short recording, over and over; returns its cost.
-
-    Depth is small, for its size does not matter here: it goes straight to disk. Every frame is seen, tracked and
-    written into every file as in `liex run`.
-    """
-    from liex_lab.pipelines.session import measure_session
-
-    from liex_lab.recordings import open_recording
-    from liex_lab.sessions import Session
-
-    with open_recording("synthetic:walk?seed=5&frames=300&sensor=primesense-qvga") as short:
-        long = looped(short, int(minutes * 60 * _FPS))
-        metadata = Session.open(measure_session(long, Plan.load("mouse"), out)).metadata
-    return {name: metadata[name] for name in ("peak_memory_mb", "frames_per_s")}

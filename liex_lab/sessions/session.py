@@ -28,9 +28,11 @@ FILES = (
     "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
     "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "transitions.parquet",
     "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap", "observations.npz",
+    "replay.rbl", "foxglove.json",
 )  # fmt: skip
 _OPTIONAL = {
     "kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet", "observations.npz",
+    "replay.rbl", "foxglove.json",
 }  # fmt: skip
 
 
