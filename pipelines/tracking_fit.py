@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +156,7 @@ def honesty(measured: Sequence[Seen], tuning: Tuning) -> tuple[tuple[float, floa
     x, z = np.concatenate(said), np.concatenate(off)
     edges = np.quantile(x, np.linspace(0.0, 1.0, _BINS + 1))
     knots, least = [], _FACTORS[0]
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         rows = (x >= low) & (x <= high)
         least = float(np.clip(np.quantile(z[rows], 0.9) / _Z90, least, _FACTORS[1]))  # larger errors err more
         knots.append((round(float(np.median(x[rows])), 5), round(least, 3)))
