@@ -92,7 +92,8 @@ class Session:
     @property
     def name(self) -> str:
         """The session's id."""
-        return str(self.metadata["session_id"])
+        with reading_from(self.path / "session.json"):
+            return str(self.metadata["session_id"])
 
     def file(self, name: str) -> Path:
         """Where a file of the session lies: the corrected one where there is one, else the session's own."""
