@@ -50,8 +50,8 @@ PROTOCOL = (
     "recordings the frames nearest to its times, and the tracker nothing else; at {fast:g} frames per second the first "
     "{fast_minutes:.0f} minutes of the same ones are rendered again, frame by frame. lost_by_fps: what that is less "
     "than at the usual rate over the same time. speed_only_macro_f1: a decision tree on speed alone, to show that the "
-    "task is not told by speed. one_hour: the time that features and recognition of an hour's track take; core_seconds: of the machine's "
-    "cores, whatever else they did."
+    "task is not told by speed. one_hour: the time that features and recognition of an hour's track take; "
+    "core_seconds: of the machine's cores, whatever else they did."
 )
 
 
