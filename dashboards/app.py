@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote
 
-from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_update
+from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc, html
 from liex_lab.dashboards import app_groups, app_session, app_study, app_tables
 from liex_lab.dashboards.app_data import StudyData
 from liex_lab.dashboards.app_frames import Frames
@@ -137,23 +137,18 @@ def _register(app: Dash, data: StudyData, *, may_show: bool) -> None:
         return _page(data, path or "/", search or "", may_show), marks
 
     @app.callback(
-        Output({"part": "order", "table": MATCH}, "data"),
-        Input({"part": "sort", "table": MATCH, "column": ALL}, "n_clicks"),
-        State({"part": "order", "table": MATCH}, "data"), prevent_initial_call=True,
-    )  # fmt: skip
-    def sort(n_clicks: list[int], order: dict[str, Any]) -> Any:
-        if not any(n_clicks) or not isinstance(ctx.triggered_id, dict):
-            return no_update
-        column = ctx.triggered_id["column"]
-        return {"column": column, "down": order["column"] == column and not order["down"]}
-
-    @app.callback(
-        Output({"part": "rows", "table": MATCH}, "children"),
+        Output({"part": "cells", "table": MATCH}, "data"),
         Input({"part": "filter", "table": MATCH}, "value"), Input({"part": "order", "table": MATCH}, "data"),
         State({"part": "filter", "table": MATCH}, "id"),
     )  # fmt: skip
     def fill(words: str | None, order: dict[str, Any], asked: dict[str, str]) -> Any:
+        name = asked["table"]
         try:
-            return app_tables.fill(asked["table"], app_tables.find(data, asked["table"]), words or "", order)
+            return app_tables.fill(name, app_tables.find(data, name), words or "", order)
         except LiexError as error:
-            return html.P(str(error))
+            return app_tables.sentence(name, str(error))
+
+    app.clientside_callback(
+        ClientsideFunction("liex", "draw"), Output({"part": "rows", "table": MATCH}, "className"),
+        Input({"part": "cells", "table": MATCH}, "data"),
+    )  # fmt: skip

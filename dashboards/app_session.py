@@ -163,11 +163,11 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
     @app.callback(
         Output("moment", "value"),
         Input("whole", "clickData"), Input("around", "clickData"),
-        Input({"part": "step", "by": ALL, "to": ALL}, "n_clicks"), Input({"part": "moment", "at": ALL}, "n_clicks"),
+        Input({"part": "step", "by": ALL, "to": ALL}, "n_clicks"),
         State("moment", "value"), State("session-key", "data"), State("session-unit-s", "data"),
         prevent_initial_call=True,
     )  # fmt: skip
-    def move(whole: Any, around: Any, _steps: Any, _rows: Any, at_s: float | None, key: str, unit_s: float) -> Any:
+    def move(whole: Any, around: Any, _steps: Any, at_s: float | None, key: str, unit_s: float) -> Any:
         asked = ctx.triggered_id
         if not ctx.triggered[0]["value"]:
             return no_update
@@ -175,8 +175,6 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
             return round(float(whole["points"][0]["x"]) * unit_s, 4)
         if asked == "around":
             return round(float(around["points"][0]["x"]), 4)
-        if asked["part"] == "moment":
-            return float(asked["at"])
         return round(moved_to(data.session(key), at_s or 0.0, asked["by"], int(asked["to"])), 4)
 
     @app.callback(
