@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from liex_lab.sessions import Session
+
+FILE = "replay.rbl"
 _NAMES = {"speed_mm_s": "speed", "nose_height_mm": "nose above the floor", "bend_rad": "bend of the body",
           "tail_beat_hz": "tail beat"}  # fmt: skip
+
+
+def write_blueprint(session: Session) -> Path:
+    """Write the layout as a file of its own, replay.rbl, into a session's folder: dragged into a viewer, it lays out
+    any replay of ours. Returns its path.
+    """
+    path = session.path / FILE
+    beside = path.with_name(f".{FILE}")
+    replay_blueprint(session.metadata).save("liex_lab", str(beside))
+    beside.replace(path)
+    return path
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:

@@ -12,6 +12,7 @@ from liex_lab.dashboards.charts import around_actions, charts, curves, pictures
 from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 
 from liex_lab.sessions import Session
+from liex_lab.sessions.failure import write_whole
 
 TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = {
@@ -25,7 +26,7 @@ _TABLES = {
 def write_report(folder: str | Path) -> Path:
     """Make report.html in a session's folder from what lies in it, and return its path."""
     path = Path(folder) / "report.html"
-    path.write_text(render(Session.open(folder)), encoding="utf-8")
+    write_whole(path, render(Session.open(folder)))
     return path
 
 

@@ -45,7 +45,7 @@ def run_session(
     says what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
     from liex_lab.dashboards.blueprint import replay_blueprint
-    from liex_lab.dashboards.report import write_report
+    from liex_lab.dashboards.views import write_views
     from liex_lab.pipelines.crew import Processes
     from liex_lab.pipelines.session import measure_session
 
@@ -54,7 +54,7 @@ def run_session(
         crew = Processes(workers)
     return measure_session(
         recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
-        report=write_report, crew=crew, progress=progress,
+        report=write_views, crew=crew, progress=progress,
     )  # fmt: skip
 
 
@@ -71,10 +71,10 @@ def correct_session(
     what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`, everything is made
     again. author: "" takes who is logged in. What was measured stays as it is; see `liex_lab.sessions.corrections`.
     """
-    from liex_lab.dashboards.report import write_report
+    from liex_lab.dashboards.views import write_views
     from liex_lab.pipelines.correct import correct_session as job
 
-    return job(session, what, undo=undo, author=author, report=write_report, progress=progress)
+    return job(session, what, undo=undo, author=author, report=write_views, progress=progress)
 
 
 def follow_live(
@@ -171,8 +171,16 @@ def verify_session(
     return job(session, run_session, None if recording is None else str(recording), progress)
 
 
+def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
+    """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it cost in memory."""
+    from liex_lab.dashboards.report import write_report
+    from liex_lab.pipelines.long import write_long as job
+
+    return job(minutes, out, write_report)
+
+
 def run_scale(
-    n_frames: int = 900, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
+    n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
     """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
     from liex_lab.pipelines.scale import evaluate_scale

@@ -18,7 +18,7 @@ from rich.text import Text
 
 import liex_lab
 from liex_lab.cli_correct import correct
-from liex_lab.cli_results import compare, export
+from liex_lab.cli_results import compare, export, report
 from liex_lab.cli_study import cohort, dashboard, scale, verify
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
@@ -42,6 +42,7 @@ app.command()(verify)
 evaluate.command("scale")(scale)
 app.command()(compare)
 app.command()(export)
+app.command()(report)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
 SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
@@ -89,6 +90,10 @@ def run(
     out: OutFolder = Path(),
     topic: TopicName = None,
     settings: Settings = None,
+    no_depth: Annotated[bool, typer.Option("--no-depth", help="A replay without the depth pictures.")] = False,
+    candidates: Annotated[
+        bool, typer.Option("--candidates", help="A replay with every pose that single frames thought possible.")
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
     workers: Annotated[
         int, typer.Option("--workers", min=1, help="Processes that share a long recording; the tables are the same.")
@@ -98,6 +103,7 @@ def run(
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
+    asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
     chosen = Plan.load(plan).with_settings([*asked, *(settings or [])])  # first: a wrong plan is told at once
     from liex_lab.api import run_session
 
@@ -343,6 +349,20 @@ def evaluate_statistics(
 
     with progress_bar() as progress:
         result = measure(n_studies, effect, progress=progress)
+    _tell_numbers(result, json_file)
+
+
+@evaluate.command("report")
+def evaluate_report(
+    session: SessionPath,
+    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of the long session.")] = 60.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How long the report of a long session takes, and its memory: SESSION repeated until it is so long."""
+    from liex_lab.pipelines.evaluate_report import evaluate_report as measure
+
+    with progress_bar() as progress:
+        result = measure(session, minutes, progress=progress)
     _tell_numbers(result, json_file)
 
 

@@ -37,6 +37,13 @@ def compare(
     typer.echo(f"tables: {found['folder']}")
 
 
+def report(session: Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]) -> None:
+    """Write a session's report.html again, with what people corrected since."""
+    from liex_lab.dashboards.report import write_report
+
+    typer.echo(f"report: {write_report(session)}")
+
+
 def export(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")],
     to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap or csv.")],

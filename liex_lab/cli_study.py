@@ -97,7 +97,7 @@ def verify(
 
 
 def scale(
-    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 900,
+    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 3000,
     minutes: Annotated[
         list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
     ] = None,
@@ -107,7 +107,7 @@ def scale(
     from liex_lab.api import run_scale
 
     with progress_bar() as progress:
-        numbers = run_scale(n_frames, minutes or (1.0, 10.0), progress=progress)
+        numbers = run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)
     text = json.dumps(numbers, indent=2)
     if json_file is not None:
         json_file.write_text(text + "\n", encoding="utf-8")

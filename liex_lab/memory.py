@@ -19,3 +19,16 @@ def peak_memory_mb() -> float | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def give_back() -> None:
+    """Hand memory that is not used any more back to the system, where it would be kept for later.
+
+    glibc keeps what lies between arrays still in use, which after hours of recording is much.
+    """
+    if sys.platform == "linux":
+        import ctypes
+
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)

@@ -224,6 +224,13 @@ class Behaviour(_Table):
         return self
 
 
+class Replay(_Table):
+    """[replay]: what the Rerun replay, session.rrd, holds."""
+
+    depth: bool = Field(True, description="the depth pictures; without them it takes a hundredth of the room")
+    candidates: bool = Field(False, description="every pose that single frames thought possible, too")
+
+
 class Actions(_Table):
     """[actions]: who names what the animal does."""
 
@@ -249,6 +256,7 @@ class Plan(_Table):
     session: SessionFacts = SessionFacts()
     actions: Actions = Actions()
     behaviour: Behaviour = Behaviour()
+    replay: Replay = Replay()
 
     @staticmethod
     def load(plan: str | Path) -> Plan:

@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+
+def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
+    """The same items, each made by a thread while the one before it is used; what goes wrong is raised in its turn."""
+    left, end = iter(items), object()
+    with ThreadPoolExecutor(1) as maker:
+        coming = maker.submit(next, left, end)
+        while True:
+            item = coming.result()
+            if item is end:
+                return
+            coming = maker.submit(next, left, end)
+            yield item  # type: ignore[misc]
 
 
 @contextmanager

@@ -40,7 +40,9 @@ class Training:
 
 
 BASELINES: dict[str, ForestPlan | CnnPlan] = {"rf": ForestPlan(), "cnn": CnnPlan()}
-_N_IMAGES, _DEGRADED = 40_960, 0.5
+# about as many images as our own model of the animal learns from; the CNN sees as many in all, whatever their number
+_N_IMAGES = {"mouse": 40_960, "hand": 20_480}
+_N_OTHERS, _SEEN, _DEGRADED = 16_384, 122_880, 0.5
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
@@ -50,8 +52,12 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
     """
     from liex_lab.pipelines.train import recipe_of
 
-    recipe = replace(recipe_of("paper", skeleton), n_images=_N_IMAGES, n_calibration=0, degraded_share=_DEGRADED)
-    return Training(recipe, BASELINES[variant])
+    n_images = _N_IMAGES.get(skeleton.name, _N_OTHERS)
+    recipe = replace(recipe_of("paper", skeleton), n_images=n_images, n_calibration=0, degraded_share=_DEGRADED)
+    plan = BASELINES[variant]
+    if isinstance(plan, CnnPlan):
+        plan = replace(plan, epochs=round(_SEEN / n_images))
+    return Training(recipe, plan)
 
 
 def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> Baseline:

@@ -26,17 +26,19 @@ class Crew(Protocol):
 
 @dataclass(frozen=True)
 class Processes:
-    """n processes of this machine, which share its cores."""
+    """n processes of this machine; threads: cores for each, 0 an equal share."""
 
     n: int
+    threads: int = 0
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """See `Crew`. Raises SessionError where a process ends without a word."""
         if not works:
             return
         count = min(self.n, len(works))
+        threads = self.threads or max(1, n_cores() // count)
         context = multiprocessing.get_context("spawn")  # numba's threads do not live through a fork
-        with _shared_cores(count), ProcessPoolExecutor(count, mp_context=context) as pool:
+        with _cores_for_each(threads), ProcessPoolExecutor(count, mp_context=context) as pool:
             try:
                 for future in as_completed([pool.submit(do, work) for work in works]):
                     yield future.result()
@@ -60,10 +62,10 @@ def worker_environment(n_threads: int) -> dict[str, str]:
 
 
 @contextmanager
-def _shared_cores(count: int) -> Iterator[None]:
-    """Processes that are started in the block get an equal share of the cores."""
+def _cores_for_each(n_threads: int) -> Iterator[None]:
+    """Processes that are started in the block use so many cores."""
     before = dict(os.environ)
-    os.environ.update(worker_environment(max(1, n_cores() // count)))
+    os.environ.update(worker_environment(n_threads))
     try:
         yield
     finally:

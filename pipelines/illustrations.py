@@ -30,14 +30,17 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
     ranked: the example's candidates, best score first; rank_correlation: mean over images of Spearman's correlation of
     score and error over an image's candidates; steps: error after every joint and round, over all candidates.
     """
-    from liex_lab.estimation.training import start_candidates
+    from liex_lab.estimation.proposals import N_WAYS
+    from liex_lab.estimation.training import Proposals, start_candidates
 
     skeleton, method = model.skeleton, model.method
     data = _unseen(skeleton, model, n_images)
     rng = np.random.default_rng(0)
-    k = method.n_candidates
-    candidates = start_candidates(data, skeleton, replace(method, training_candidates=k), rng)
-    n = len(data.size)
+    k, n, seen = method.n_candidates, len(data.size), None
+    if (forest := model.cascade.proposals) is not None:
+        k = min(k, N_WAYS * forest.n_trees)
+        seen = Proposals(forest, np.zeros((forest.n_trees, n), np.bool_))  # no tree has seen any of them
+    candidates = start_candidates(data, skeleton, replace(method, training_candidates=k), rng, seen)
     names, errors, positions = _follow(model.cascade, data, candidates)
     scores = _scores(model, data, candidates).reshape(n, k)
     final = errors[-1].reshape(n, k)

@@ -10,21 +10,20 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from liex_lab.pipelines.build import build_recording
-from liex_lab.pipelines.stretches import CHUNK
+from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker
+from liex_lab.pipelines.crew import Processes
+from liex_lab.pipelines.long import looped
+from liex_lab.pipelines.stretches import CHUNK, Stretch, look_side_by_side
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.study import Study
 
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
-
 RunSession = Callable[..., Path]
-_VIRTUAL = "synthetic:walk?seed=5&frames={n}&sensor=primesense"
+_VIRTUAL = "synthetic:walk?seed={seed}&frames=150&sensor=primesense"
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 _N_SIMULATED = 2000  # sessions
 _FPS = 30
@@ -36,26 +35,30 @@ ASSUMPTIONS = (
 
 
 def evaluate_scale(
-    run: RunSession, n_frames: int = 900, minutes: tuple[float, ...] = (1.0, 10.0), progress: Progress = silent
+    run: RunSession, n_frames: int = 3000, minutes: tuple[float, ...] = (1.0, 10.0), progress: Progress = silent
 ) -> dict[str, Any]:
     """Measure one session's stages, two workers against one, memory by length, and simulate many workers.
+
+    Workers of one recording share its stretches, those of a study its sessions.
 
     n_frames: of each virtual recording, 640 x 480; minutes: lengths of recording whose memory is measured.
     """
     with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
         folder = Path(scratch)
-        progress(0, 4, "making recordings")
+        progress(0, 5, "making recordings")
         recordings = [_recording(folder, k, n_frames) for k in range(2)]
-        progress(1, 4, "measuring the stages of a session")
+        progress(1, 5, "measuring the stages of a session")
         stages = _stages(run, recordings[0], folder)
-        progress(2, 4, "measuring one worker and two")
+        progress(2, 5, "looking at one recording by one process and by two")
+        looking = _side_by_side(recordings[0], folder)
+        progress(3, 5, "measuring a study by one worker and by two")
         workers = _workers(run, recordings, folder)
-        progress(3, 4, "measuring memory by length")
+        progress(4, 5, "measuring memory by length")
         memory = {f"{length:g} min": _memory(length, folder) for length in minutes}
     hour = [seconds * 3600 * _FPS / n_frames for seconds in workers["seconds_each"]]
     simulated = simulate(hour, workers["scheduler_s_per_session"])
     return {
-        **stages, "sessions_per_hour": workers["sessions_per_hour"], "two_workers_over_one": workers["gain"],
+        **stages, **looking, "sessions_per_hour": workers["sessions_per_hour"], "two_workers_over_one": workers["gain"],
         "memory_mb_by_length": memory, "simulated_sessions_per_hour": simulated, "assumptions": ASSUMPTIONS,
         "n_frames": n_frames,
     }  # fmt: skip
@@ -65,9 +68,12 @@ def _recording(folder: Path, seed: int, n_frames: int) -> Path:
     """A virtual mouse, written as an MCAP file: reading it costs what reading a recording costs."""
     from liex_lab.pipelines.convert import convert
 
+    from liex_lab.recordings import open_recording
+
     path = folder / "rawdata" / f"walk{seed}.mcap"
     path.parent.mkdir(exist_ok=True)
-    convert(_VIRTUAL.format(n=n_frames).replace("seed=5", f"seed={5 + seed}"), path)
+    with open_recording(_VIRTUAL.format(seed=5 + seed)) as short:
+        convert(looped(short, n_frames), path)
     return path
 
 
@@ -81,13 +87,30 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
     n = session.metadata["frames"]["n_frames"]
     spent = session.metadata["timings_s"]
     bound = _decode_and_write(session, recording, plan, folder / "bound.liex")
+    whole = spent["prepare"] + spent["total"]  # beginning to look, and everything after it
     return {
-        "frames_per_s": n / spent["total"], "frames_per_s_without_preparation": n / (spent["total"] - spent["prepare"]),
+        "frames_per_s": n / whole, "frames_per_s_once_begun": n / spent["total"], "prepare_s": spent["prepare"],
         "ms_per_frame": {
-            name: 1e3 * value / n for name, value in {**bound, **spent}.items() if name != "bound"
+            name: 1e3 * value / n for name, value in {**bound, **spent}.items() if name not in ("bound", "prepare")
         },
-        "times_decode_and_write": spent["total"] / bound["bound"], "peak_memory_mb": session.metadata["peak_memory_mb"],
+        "times_decode_and_write": whole / bound["bound"],
+        "times_decode_and_write_once_begun": spent["total"] / bound["bound"],
+        "peak_memory_mb": session.metadata["peak_memory_mb"],
     }  # fmt: skip
+
+
+def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
+    """Frames a second that are read, looked at and written by one process and by two, of one core each."""
+    plan, found = Plan.load("mouse"), {}
+    with build_recording(recording, plan) as opened:
+        tracker = build_tracker(opened, plan)
+        whole = Stretch(str(recording), plan, tracker, build_provenance(opened, plan, tracker), folder, 0, len(opened))
+    for count in (1, 2):
+        began = time.perf_counter()
+        look_side_by_side(Processes(count, threads=1), whole, folder / f"stretches-{count}.liex", silent)
+        found[count] = whole.stop / (time.perf_counter() - began)
+    return {"looking_frames_per_s": {str(count): rate for count, rate in found.items()},
+            "looking_two_processes_over_one": found[2] / found[1]}  # fmt: skip
 
 
 def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) -> dict[str, float]:
@@ -166,7 +189,7 @@ def simulate(
 _WRITE_LONG = """
 import json, sys
 import numpy as np
-from liex_lab.pipelines.scale import write_long
+from liex_lab.api import write_long
 print(json.dumps(write_long(float(sys.argv[1]), sys.argv[2])))
 """
 
@@ -178,34 +201,3 @@ def _memory(minutes: float, folder: Path) -> float:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     return float(json.loads(done.stdout.splitlines()[-1])["peak_memory_mb"])
-
-
-def looped(short: Recording, n_frames: int) -> Recording:
-    """A recording of any length: the frames of a short one, held in memory, to and fro, at times that run on."""
-    from liex_lab.recordings.recording import Recording
-
-    depth = [short.frame(row).depth for row in range(len(short))]
-    there = [*range(len(depth)), *range(len(depth) - 2, 0, -1)]
-    long = Recording(
-        name="long", format="synthetic", camera=short.camera,
-        times_ns=np.arange(n_frames, dtype=np.int64) * int(1e9 / _FPS), read=lambda row: depth[there[row % len(there)]],
-    )  # fmt: skip
-    long.take_digest("0" * 64)
-    return long
-
-
-def write_long(minutes: float, out: str) -> dict[str, Any]:
-    """A session of any length from the frames of a short recording, over and over; returns its cost.
-
-    Depth is small, for its size does not matter here: it goes straight to disk. Every frame is seen, tracked and
-    written into every file as in `liex run`.
-    """
-    from liex_lab.pipelines.session import measure_session
-
-    from liex_lab.recordings import open_recording
-    from liex_lab.sessions import Session
-
-    with open_recording("synthetic:walk?seed=5&frames=300&sensor=primesense-qvga") as short:
-        long = looped(short, int(minutes * 60 * _FPS))
-        metadata = Session.open(measure_session(long, Plan.load("mouse"), out)).metadata
-    return {name: metadata[name] for name in ("peak_memory_mb", "frames_per_s")}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,17 +19,20 @@ from liex_lab.pipelines.build import (
 from liex_lab.pipelines.crew import Crew
 from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
 
+from liex_lab.memory import give_back
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
+from liex_lab.threads import ahead
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
     from liex_lab.behaviour.summary import Behaviour
+    from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance, Session
     from liex_lab.sessions.rows import Rows
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
-
+    from liex_lab.tracking.tracker import FrameTracker
 
 
 def measure_session(
@@ -53,7 +57,6 @@ def measure_session(
     from liex_lab.sessions import Session
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.place import check_place, part_folder
-    from liex_lab.tracking.observations import Observations
 
     started = time.perf_counter()
     with build_recording(recording, plan, progress) as opened:
@@ -71,25 +74,43 @@ def measure_session(
             look_side_by_side(crew, whole, folder, progress)
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
             writer.go_on(lambda row: opened.frame(row).depth)
-            for frames in opened.chunks(CHUNK, writer.n_frames):
-                began = time.perf_counter()
-                seen = tracker.observe(frames)
-                timings["track"] += time.perf_counter() - began
-                writer.add(frames, seen=seen)
-                progress(frames[-1].index + 1, len(opened), MEASURING)
+            with closing(_read_ahead(opened, writer.n_frames)) as chunks:
+                for frames in chunks:
+                    began = time.perf_counter()
+                    seen = tracker.observe(frames)
+                    timings["track"] += time.perf_counter() - began
+                    writer.add(frames, seen=seen)
+                    progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
-            whole = writer.seen(Observations)
-            writer.take(tracker.track(whole), whole, tracker.subject)
+            make_track(writer, tracker)
             timings["track"] += time.perf_counter() - began
             writer.note(problems=opened.problems, **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
 
 
+def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
+    """The frames from `first` on in chunks; while one is looked at the next is read, but for those that are rendered,
+    which takes all cores.
+    """
+    chunks = opened.chunks(CHUNK, first)
+    yield from chunks if opened.format == "synthetic" else ahead(chunks)
+
+
+def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
+    """The track of a session whose frames have all been looked at."""
+    from liex_lab.tracking.observations import Observations
+
+    whole = writer.seen(Observations)
+    writer.take(tracker.track(whole), whole, tracker.subject)
+
+
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
+    give_back()  # hours of recording leave much behind
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin)
     writer.note(**notes)
+    give_back()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from liex_lab.actions._plain_skops import read_plain
 from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.timeline import Network, TimelineModel
 from liex_lab.catalog import MODELS, sha256
@@ -44,9 +45,7 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
     """A bundled model by its animal ('mouse'), or one from a file. Raises ModelError where it cannot be used."""
     path = find_action_model(name, folder)
     try:
-        from skops import io
-
-        document = io.load(path, trusted=[])
+        document = read_plain(path)
         if document["format"] != _FORMAT:
             raise ModelError(f"the action model {path} has format {document['format']}, this liex_lab reads {_FORMAT}")
         chain = ActionChain(*(np.asarray(document["chain"][name]) for name in ActionChain.__dataclass_fields__))

@@ -41,7 +41,7 @@ _BATCH = 64
 
 @dataclass(frozen=True)
 class CnnPlan:
-    """The budget: about seven minutes of two cores with bfloat16 for 40,960 images. width: of AlexNet's own numbers of
+    """The budget: about seven minutes of two cores with bfloat16 for 122,880 views. width: of AlexNet's own numbers of
     channels, halved to see more images in that time; connected: neurons of the two hidden layers; epochs: times that
     every image is seen; the step size rises to `rate` and falls to nothing.
     """

@@ -91,7 +91,7 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
         to_depth(inverse, depth[i])
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, origin, depth):
     """Depth (n, H, W) mm of meshes (n, V, 3) on all threads; arguments as in `draw`, leading axis n."""
     for i in prange(len(vertices)):

@@ -94,20 +94,24 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
     return HandShape(offsets, Capsules(flesh.joints, ends, radii, np.zeros(n)), arm)
 
 
-def forearms(rng: np.random.Generator, rotations: Array, positions: Array, scale: Array) -> tuple[Array, Array]:
+def forearms(
+    rng: np.random.Generator, rotations: Array, positions: Array, scale: Array, bent: Array | None = None
+) -> tuple[Array, Array]:  # fmt: skip
     """Frames (n, 3, 3) of forearms, x from the elbow to the wrist, and elbows (n, 3) mm of hands in the camera frame.
 
     rotations (n, J, 3, 3), positions (n, J, 3) mm; scale (n,). The wrist bends as wrists do, and further where the arm
-    would otherwise come from the camera's side: who holds out a hand stands behind it.
+    would otherwise come from the camera's side: who holds out a hand stands behind it. bent (n, 3) rad: the wrists'
+    bends where they are known; else each is drawn.
     """
     n = len(scale)
     bend = np.zeros((n, 3))
-    bend[:, 1] = np.clip(np.radians(rng.normal(0.0, 22.0, n)), -1.0, 1.0)
-    bend[:, 2] = np.clip(np.radians(rng.normal(0.0, 12.0, n)), -0.4, 0.4)
-    bent = rotations[:, 0] @ so3.exp(bend)
-    forward = bent[:, :, 0].copy()
+    if bent is None:
+        bent = np.radians(np.stack([np.zeros(n), rng.normal(0.0, 22.0, n), rng.normal(0.0, 12.0, n)], axis=1))
+    bend[:, 1], bend[:, 2] = np.clip(bent[:, 1], -1.0, 1.0), np.clip(bent[:, 2], -0.4, 0.4)
+    turned = rotations[:, 0] @ so3.exp(bend)
+    forward = turned[:, :, 0].copy()
     forward[:, 2] = np.minimum(forward[:, 2], _MOST_AWAY)
-    frame = so3.exp(aim(bent[:, :, 0], forward)) @ bent
+    frame = so3.exp(aim(turned[:, :, 0], forward)) @ turned
     return frame, positions[:, 1:3].mean(axis=1) - (scale * ARM_MM)[:, None] * frame[:, :, 0]
 
 

@@ -288,7 +288,7 @@ def _estimate_block(
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner, metric, tuning, body, starts, poses):
     """Algorithm 1 for the frames `seen`, in which an animal was found.
 

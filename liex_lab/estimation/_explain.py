@@ -35,14 +35,31 @@ class Body(NamedTuple):
 def place_balls(rotations, positions, scale, body, out):
     """Middles (B, 3) mm of the balls of one pose: rotations (J, 3, 3), positions (J, 3)."""
     for b in range(len(body.joints)):
+        share = body.share[b]
+        one, other = body.joints[b, 0], body.joints[b, 1]
         for i in range(3):
-            ends = np.zeros(2)
-            for e in range(2):
-                j = body.joints[b, e]
-                ends[e] = positions[j, i]
-                for k in range(3):
-                    ends[e] += scale * rotations[j, i, k] * body.offsets[b, e, k]
-            out[b, i] = ends[0] + body.share[b] * (ends[1] - ends[0])
+            first, second = positions[one, i], positions[other, i]
+            for k in range(3):
+                first += scale * rotations[one, i, k] * body.offsets[b, 0, k]
+                second += scale * rotations[other, i, k] * body.offsets[b, 1, k]
+            out[b, i] = first + share * (second - first)
+
+
+@njit(cache=True)
+def nearest_ball(x, y, z, balls, radius, guess):
+    """Signed distance mm of a point from the surface of the nearest of the balls (B, 3), and which that is.
+
+    guess: one that may be it; roots are only drawn where a ball may be nearer than the nearest so far.
+    """
+    which = guess
+    off2 = (x - balls[which, 0]) ** 2 + (y - balls[which, 1]) ** 2 + (z - balls[which, 2]) ** 2
+    best = np.sqrt(off2) - radius[which]
+    for b in range(len(balls)):
+        reach = best + radius[b]
+        off2 = (x - balls[b, 0]) ** 2 + (y - balls[b, 1]) ** 2 + (z - balls[b, 2]) ** 2
+        if reach > 0.0 and off2 < reach * reach:
+            best, which = np.sqrt(off2) - radius[b], b
+    return best, which
 
 
 @njit(cache=True)
@@ -76,7 +93,7 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
     out[0] = SHARE_UNIT * beside / n
     out[1], out[2] = MM_UNIT * off / seen, MM_UNIT * out_of / seen
     out[3] = SHARE_UNIT * hidden / n
-    n_read, far, apart, within = 0, 0.0, 0.0, 0.0
+    n_read, far, apart, within, which = 0, 0.0, 0.0, 0.0, 0
     for r in range(_STRIDE // 2, last + 1, _STRIDE):
         for c in range(_STRIDE // 2, last + 1, _STRIDE):
             if heights[r, c] == 0:
@@ -87,11 +104,7 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
             z = (heights[r, c] / 16.0 - look[13]) / (look[10] * dx + look[11] * dy + look[12])
             px, py = z * (look[4] * dx + look[5] * dy + look[6]), z * (look[7] * dx + look[8] * dy + look[9])
             pz = heights[r, c] / 16.0
-            nearest, which = 1e9, 0
-            for b in range(len(balls)):
-                d = np.sqrt((px - balls[b, 0]) ** 2 + (py - balls[b, 1]) ** 2 + (pz - balls[b, 2]) ** 2) - radius[b]
-                if d < nearest:
-                    nearest, which = d, b
+            nearest, which = nearest_ball(px, py, pz, balls, radius, which)
             if which >= n_own:
                 continue
             nearest *= per_mm

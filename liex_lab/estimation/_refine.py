@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.estimation._explain import place_balls
+from liex_lab.estimation._explain import nearest_ball, place_balls
 from liex_lab.estimation._kernels import so3_exp
 
 _STRIDE = 4  # every so many crop pixels a reading pulls
@@ -23,7 +23,8 @@ _MOST_GROWTH, _MOST_TURN = 0.1, 0.5  # of log scale, and of an angle (rad), in o
 
 class Tree(NamedTuple):
     """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3); free (F, 2) joint and axis of every angle,
-    limits (F, 2) rad, moves (J, F) which of them turn which joint.
+    limits (F, 2) rad, moves (J, F) which of them turn which joint, turns (B, M) those that move each ball, in order and
+    -1 where there are no more.
     """
 
     parents: Any
@@ -32,6 +33,7 @@ class Tree(NamedTuple):
     free: Any
     limits: Any
     moves: Any
+    turns: Any
 
 
 class Wishes(NamedTuple):
@@ -46,32 +48,27 @@ class Wishes(NamedTuple):
 
 
 @njit(cache=True)
-def _closer(nearest, r, c, a, b):
-    """Let pixel (r, c) take over what is nearest to its neighbour (a, b), where that is nearer."""
-    if a < 0 or b < 0 or a >= nearest.shape[0] or b >= nearest.shape[1]:
+def nearest_reading(heights, r, c, known):
+    """The nearest pixel on the animal to a crop pixel off it: into known[r, c] (2,), row -2 where there is none.
+
+    Few pixels are ever asked for, so they are looked for in growing squares and remembered; known (S, S, 2) comes in
+    as -1.
+    """
+    if known[r, c, 0] != -1:
         return
-    known = (nearest[r, c, 0] - r) ** 2 + (nearest[r, c, 1] - c) ** 2
-    if (nearest[a, b, 0] - r) ** 2 + (nearest[a, b, 1] - c) ** 2 < known:
-        nearest[r, c, 0], nearest[r, c, 1] = nearest[a, b, 0], nearest[a, b, 1]
-
-
-@njit(cache=True)
-def nearest_readings(heights, nearest):
-    """For every crop pixel the nearest one on the animal: nearest (S, S, 2) rows and columns (Danielsson 1980)."""
-    side = heights.shape[0]
-    for r in range(side):
-        for c in range(side):
-            nearest[r, c, 0] = r if heights[r, c] > 0 else -10000
-            nearest[r, c, 1] = c if heights[r, c] > 0 else -10000
-    for sweep in range(2):
-        for k in range(side):
-            r, before = (k, k - 1) if sweep == 0 else (side - 1 - k, side - k)
-            for c in range(side):
-                for b in range(c - 1, c + 2):
-                    _closer(nearest, r, c, before, b)
-                _closer(nearest, r, c, r, c - 1)
-            for c in range(side - 2, -1, -1):
-                _closer(nearest, r, c, r, c + 1)
+    side, least = heights.shape[0], 1 << 30
+    known[r, c, 0] = -2
+    reach = 1
+    while reach < side and reach * reach < least:
+        for a in range(max(r - reach, 0), min(r + reach + 1, side)):
+            hop = 1 if abs(a - r) == reach else 2 * reach  # whole rows above and below, else both ends of the row
+            for b in range(c - reach, c + reach + 1, hop):
+                if 0 <= b < side and heights[a, b] > 0:
+                    off = (a - r) ** 2 + (b - c) ** 2
+                    if off < least:
+                        least = off
+                        known[r, c, 0], known[r, c, 1] = a, b
+        reach += 1
 
 
 @njit(cache=True)
@@ -101,7 +98,7 @@ def crop_pixel(look, p):
 @njit(cache=True)
 def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
     """Joint frames of a pose, as `body.kinematics.forward_kinematics`."""
-    turn = np.empty((3, 3))
+    turn, local = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         positions[0, i] = root_position[i]
         for k in range(3):
@@ -109,7 +106,11 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
     for j in range(1, tree.parents.size):
         p = tree.parents[j]
         so3_exp(angles[j, 0], angles[j, 1], angles[j, 2], turn)
-        local = tree.rest[j] @ turn
+        for i in range(3):
+            for k in range(3):
+                local[i, k] = 0.0
+                for m in range(3):
+                    local[i, k] += tree.rest[j, i, m] * turn[m, k]
         for i in range(3):
             total = positions[p, i]
             for k in range(3):
@@ -123,24 +124,23 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
 
 
 @njit(cache=True)
-def cross(a, b):
-    """The cross product (3,)."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-@njit(cache=True)
 def turning_axes(free, angles, rotations, axes):
     """World axes (F, 3) about which the free angles (F, 2: joint, axis) turn: R J_r(w) e, J_r the right Jacobian."""
+    e = np.empty(3)
     for f in range(len(free)):
         j, k = free[f, 0], free[f, 1]
-        w = angles[j]
-        th2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-        e = np.zeros(3)
+        w0, w1, w2 = angles[j, 0], angles[j, 1], angles[j, 2]
+        th2 = w0 * w0 + w1 * w1 + w2 * w2
+        e[0], e[1], e[2] = 0.0, 0.0, 0.0
         e[k] = 1.0
         if th2 > 1e-8:
             th = np.sqrt(th2)
             b, c = (1.0 - np.cos(th)) / th2, (th - np.sin(th)) / (th2 * th)
-            e = e - b * cross(w, e) + c * cross(w, cross(w, e))
+            # w x e and w x (w x e)
+            x, y, z = w1 * e[2] - w2 * e[1], w2 * e[0] - w0 * e[2], w0 * e[1] - w1 * e[0]
+            e[0] += c * (w1 * z - w2 * y) - b * x
+            e[1] += c * (w2 * x - w0 * z) - b * y
+            e[2] += c * (w0 * y - w1 * x) - b * z
         for i in range(3):
             axes[f, i] = rotations[j, i, 0] * e[0] + rotations[j, i, 1] * e[1] + rotations[j, i, 2] * e[2]
 
@@ -160,15 +160,17 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
         share = body.share[b] if e == 1 else 1.0 - body.share[b]
         if share == 0.0:
             continue
-        end = np.empty(3)
-        for i in range(3):
-            end[i] = positions[j, i]
-            for k in range(3):
-                end[i] += scale * rotations[j, i, k] * body.offsets[b, e, k]
-        for f in range(len(tree.free)):
+        u, v, w = scale * body.offsets[b, e, 0], scale * body.offsets[b, e, 1], scale * body.offsets[b, e, 2]
+        ex = positions[j, 0] + rotations[j, 0, 0] * u + rotations[j, 0, 1] * v + rotations[j, 0, 2] * w
+        ey = positions[j, 1] + rotations[j, 1, 0] * u + rotations[j, 1, 1] * v + rotations[j, 1, 2] * w
+        ez = positions[j, 2] + rotations[j, 2, 0] * u + rotations[j, 2, 1] * v + rotations[j, 2, 2] * w
+        for m in range(tree.turns.shape[1]):
+            f = tree.turns[b, m]
+            if f < 0:
+                break
             if tree.moves[j, f]:
                 a = tree.free[f, 0]
-                x, y, z = end[0] - positions[a, 0], end[1] - positions[a, 1], end[2] - positions[a, 2]
+                x, y, z = ex - positions[a, 0], ey - positions[a, 1], ez - positions[a, 2]
                 ax, ay, az = axes[f, 0], axes[f, 1], axes[f, 2]
                 slope[0, _ROOT + f] += share * (ay * z - az * y)
                 slope[1, _ROOT + f] += share * (az * x - ax * z)
@@ -217,19 +219,14 @@ def _solve(curvature, gradient, step):
 
 
 @njit(cache=True)
-def _pull(points, balls, radius, n_own, slopes, robust, gradient, curvature):
+def _pull(points, balls, radius, slopes, robust, gradient, curvature):
     """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B, 3) passes through
-    it. slopes (n_own, 3, P).
+    it. slopes (n, 3, P) of the first n balls, which are the body's own.
     """
-    row = np.empty(gradient.size)
+    row, which = np.empty(gradient.size), 0
     for i in range(len(points)):
-        best, which = 1e9, 0
-        for b in range(len(balls)):
-            off = (points[i, 0] - balls[b, 0]) ** 2 + (points[i, 1] - balls[b, 1]) ** 2
-            off = np.sqrt(off + (points[i, 2] - balls[b, 2]) ** 2) - radius[b]
-            if off < best:
-                best, which = off, b
-        if which >= n_own:
+        best, which = nearest_ball(points[i, 0], points[i, 1], points[i, 2], balls, radius, which)
+        if which >= len(slopes):
             continue
         length = max(best + radius[which], 1e-6)
         weight = 1.0 / (1.0 + (best / robust) ** 2) ** 2
@@ -243,7 +240,7 @@ def _pull(points, balls, radius, n_own, slopes, robust, gradient, curvature):
 
 
 @njit(cache=True)
-def _push(heights, look, nearest, balls, radius, slopes, robust, beside, gradient, curvature):
+def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient, curvature):
     """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal. slopes (n, 3, P)."""
     row, target = np.empty(gradient.size), np.empty(3)
     last = heights.shape[0] - 1
@@ -258,7 +255,8 @@ def _push(heights, look, nearest, balls, radius, slopes, robust, beside, gradien
                 row[6] += radius[b]
                 _add(row, out, weight, gradient, curvature)
             continue
-        a, d = nearest[r, c, 0], nearest[r, c, 1]
+        nearest_reading(heights, r, c, known)
+        a, d = known[r, c, 0], known[r, c, 1]
         if a < 0:
             continue
         point_of(heights, look, a, d, target)
@@ -289,10 +287,12 @@ def _hold(tree, prior, moved, growth, turned, gradient, curvature):
 def _go(step, tree, root_rotation, root_position, angles, scale):
     """Take a step (P,), in place; returns the new scale."""
     turn = np.empty((3, 3))
-    shift = root_rotation @ step[3:6]
     so3_exp(step[0], step[1], step[2], turn)
-    root_rotation[:] = root_rotation @ turn
-    root_position += shift
+    for i in range(3):
+        x, y, z = root_rotation[i, 0], root_rotation[i, 1], root_rotation[i, 2]
+        root_position[i] += x * step[3] + y * step[4] + z * step[5]
+        for k in range(3):
+            root_rotation[i, k] = x * turn[0, k] + y * turn[1, k] + z * turn[2, k]
     for f in range(len(tree.free)):
         j, k = tree.free[f, 0], tree.free[f, 1]
         turned = angles[j, k] + min(max(step[_ROOT + f], -_MOST_TURN), _MOST_TURN)
@@ -314,11 +314,11 @@ def _readings(heights, look):
 
 
 @njit(cache=True)
-def refine_one(heights, look, nearest, points, tree, body, wishes, n_steps, root_rotation, root_position, angles,
+def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_rotation, root_position, angles,
                scale):  # fmt: skip
     """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale.
 
-    nearest (S, S, 2) as `nearest_readings`, points (n, 3) as `_readings` of the height map.
+    known (S, S, 2) as in `nearest_reading`, points (n, 3) as `_readings` of the height map.
     """
     n_values, n_joints = _ROOT + len(tree.free), tree.parents.size
     rotations, positions = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3))
@@ -333,8 +333,8 @@ def refine_one(heights, look, nearest, points, tree, body, wishes, n_steps, root
         for b in range(body.n_own):
             ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
         gradient, curvature, radius = np.zeros(n_values), np.zeros((n_values, n_values)), body.radius * scale
-        _pull(points, balls, radius, body.n_own, slopes, wishes.robust, gradient, curvature)
-        _push(heights, look, nearest, balls, radius, slopes, wishes.robust, wishes.beside, gradient, curvature)
+        _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
+        _push(heights, look, known, balls, radius, slopes, wishes.robust, wishes.beside, gradient, curvature)
         _hold(tree, wishes.prior, moved, np.log(scale / first_scale), angles - first_angles, gradient, curvature)
         for i in range(n_values):
             curvature[i, i] *= 1.0 + _DAMPING
@@ -349,14 +349,13 @@ def refine_one(heights, look, nearest, points, tree, body, wishes, n_steps, root
 def refine_all(heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales):
     """`refine_one` for the K poses of each of n frames."""
     for i in prange(len(scales)):
-        nearest = np.empty((heights.shape[1], heights.shape[1], 2), np.int32)
-        nearest_readings(heights[i], nearest)
+        known = np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32)
         points = _readings(heights[i], looks[i])
         for k in range(scales.shape[1]):
             scales[i, k] = refine_one(
                 heights[i],
                 looks[i],
-                nearest,
+                known,
                 points,
                 tree,
                 body,

@@ -18,6 +18,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.cascade import Cascade
 from liex_lab.estimation.method import Method
+from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest
 
 SCHEMA = 2
@@ -187,25 +188,5 @@ def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     words[:, 6:] = parts["threshold"].view(np.int8).reshape(-1, 2)
     nodes[~is_leaf, :2] = words.view(np.int32)
     nodes[~is_leaf, 3] = parts["kind"]
-    leaf = 0
-    for tree, root in enumerate(parts["roots"]):
-        stop = parts["roots"][tree + 1] if tree + 1 < len(parts["roots"]) else n_nodes
-        leaf = _number(is_leaf[root:stop].tolist(), nodes[root:stop], int(root), leaf)
+    number_nodes(is_leaf, np.append(parts["roots"], n_nodes), nodes)
     return Forest(nodes, parts["roots"], np.ascontiguousarray(parts["leaves"].T.astype(np.float32)))
-
-
-def _number(is_leaf: list[bool], nodes: NDArray[np.int32], root: int, leaf: int) -> int:
-    """Child pointers of one tree, in the order in which `_grow_tree` made them; the next free leaf."""
-    children = [0] * len(is_leaf)
-    stack, made = [0], 1
-    while stack:
-        at = stack.pop()
-        if is_leaf[at]:
-            leaf += 1
-            children[at] = -leaf
-        else:
-            children[at] = root + made
-            stack += [made + 1, made]
-            made += 2
-    nodes[:, 2] = children
-    return leaf

@@ -44,7 +44,11 @@ class Refiner:
             above[child] |= above[parent]
         moves = np.ascontiguousarray(above[:, free[:, 0]])
         limits = np.ascontiguousarray(s.limits[free[:, 0], free[:, 1]])
-        return Refiner(s, kernels.Tree(s.parents, s.offsets, s.rest, free, limits, moves), body_of(balls))
+        movers = [np.flatnonzero(moves[one] | moves[other]) for one, other in balls.joints]
+        turns = np.full((len(movers), max(map(len, movers), default=0)), -1, np.int64)
+        for row, some in zip(turns, movers, strict=True):
+            row[: len(some)] = some
+        return Refiner(s, kernels.Tree(s.parents, s.offsets, s.rest, free, limits, moves, turns), body_of(balls))
 
     def refine(self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float, n_steps: int) -> Pose:
         """Poses (n, K) in their view frames, each moved into its height map (n, S, S) cut as looks (n, 17) say."""

@@ -101,3 +101,28 @@ def next_random(state):
 def random_below(state, n):
     """A random integer of 0 .. n - 1."""
     return np.int64((next_random(state) >> np.uint64(33)) % np.uint64(n))
+
+
+@njit(cache=True)
+def number_nodes(is_leaf, starts, nodes):
+    """Child pointers of trees, in the order in which growth made them, into word 2 of `nodes` (n, 4).
+
+    is_leaf (n,); starts (trees + 1,): where each tree's nodes begin, and the end. A tree's children are appended as a
+    pair when their parent splits, the left side of the stack first.
+    """
+    leaf = 0
+    stack = np.empty(is_leaf.size + 1, np.int64)
+    for tree in range(starts.size - 1):
+        root = starts[tree]
+        stack[0], n, made = 0, 1, 1
+        while n > 0:
+            n -= 1
+            at = stack[n]
+            if is_leaf[root + at]:
+                leaf += 1
+                nodes[root + at, 2] = -leaf
+            else:
+                nodes[root + at, 2] = root + made
+                stack[n], stack[n + 1] = made + 1, made
+                n += 2
+                made += 2

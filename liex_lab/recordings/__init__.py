@@ -119,6 +119,8 @@ def _open(path: Path, how: _How) -> Recording:
     if looks_like_nyu(path.parent, [path.name]):
         return how.open("nyu.open_nyu", path)
     if (where := _reader(path.name)) is not None:
+        if not path.stat().st_size:
+            raise RecordingError(f"{path} is empty; copy the recording again")
         return how.open(where, path)
     why = _NOT_READ.get(path.suffix.lower())
     raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")

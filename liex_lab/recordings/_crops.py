@@ -12,7 +12,7 @@ BRIDGE = 4  # blocks without readings that may lie between the parts of an anima
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
     """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
     for k in prange(depths.shape[0]):
@@ -109,7 +109,7 @@ def cut_crop(
         moments[k, 8] = segment.back_slope(heights[k], origin[k], step, intrinsics, distance[k], moments[k])
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def extract_all(
     depths, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
     n_px, moments, distance, n_blobs,
@@ -119,7 +119,7 @@ def extract_all(
                     heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def extract_windows(
     depths, background, margin, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
     n_steps, n_px, moments, distance, n_blobs,

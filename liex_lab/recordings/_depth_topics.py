@@ -72,11 +72,17 @@ class _Topic:
         self.stamp_ns.append(stamp_ns)
         self.places.extend(message.place)
 
+    def forget(self, chunk: int) -> None:
+        """Forget the messages of this chunk and those after it: they are at the end, and will be met again."""
+        while self.places and self.places[-3] >= chunk:
+            del self.places[-3:], self.log_ns[-1], self.stamp_ns[-1]
+
 
 @dataclass
 class _Found:
-    """What a file holds. calibrations and units: by topic."""
+    """What a file holds. calibrations and units: by topic; parsers: None of channels that are of no use."""
 
+    parsers: dict[Channel, Parser | None] = field(default_factory=dict)
     depths: dict[Channel, _Topic] = field(default_factory=dict)
     calibrations: dict[str, Calibration] = field(default_factory=dict)
     units: dict[str, DepthUnit] = field(default_factory=dict)
@@ -122,14 +128,27 @@ class _Frames:
 def open_topic(file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress) -> Recording:
     """One depth topic of an open file as a recording, which closes the file."""
     try:
-        return _open(file, kind, camera, topic, progress)
+        return _open(file, kind, camera, topic, progress, _Found())
     except BaseException:
         file.close()
         raise
 
 
-def _open(file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress) -> Recording:
-    path, found = file.path, _walk(file, progress)
+def _open(
+    file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress, found: _Found
+) -> Recording:
+    """`open_topic` of a file in which this much was found before."""
+    path = file.path
+    _walk(file, found, progress)
+
+    def grow() -> Recording | None:
+        n_chunks = file.go_on()
+        if n_chunks is None:
+            return None
+        for depth in found.depths.values():
+            depth.forget(n_chunks)
+        return _open(file, kind, camera, topic, progress, found)
+
     chosen = _choose(file, found, topic)
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems: list[str] = list(camera_file.problems)
@@ -147,7 +166,7 @@ def _open(file: MessageFile, kind: str, camera: Lens | None, topic: str | None, 
     return Recording(
         name=path.resolve().stem, format=kind, camera=the_camera, times_ns=settled.times_ns, read=frames.read,
         sources=[path], problems=problems, truncated=not file.whole, metadata=metadata, close=file.close,
-        faults=settled.faults,
+        faults=settled.faults, grow=grow,
     )  # fmt: skip
 
 
@@ -164,10 +183,9 @@ def _stamps(topic: _Topic, order: NDArray[np.int64], problems: list[str]) -> NDA
     return logged if unstamped else stamps
 
 
-def _walk(file: MessageFile, progress: Progress) -> _Found:
-    """The depth topics, and the first calibration of every topic that has one."""
-    found = _Found()
-    parsers: dict[Channel, Parser | None] = {}
+def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
+    """Find the depth topics, and the first calibration of every topic that has one."""
+    parsers = found.parsers
 
     def wanted(channel: Channel) -> bool:
         if channel not in parsers:
@@ -183,7 +201,6 @@ def _walk(file: MessageFile, progress: Progress) -> _Found:
                 parsers[message.channel] = None  # its first picture is not depth
         except _DAMAGE:
             file.whole = False
-    return found
 
 
 def _note(found: _Found, envelope: Envelope, parse: Parser) -> bool:

@@ -27,17 +27,16 @@ _MARGIN = 2  # blocks: many cameras read nothing along the borders of their pict
 @njit(cache=True)
 def block_depths(depth, near, far, blocks):
     """Fill `blocks` from depth (H, W) mm."""
+    nothing = np.float32(1e9)
     for i in range(blocks.shape[0]):
         for j in range(blocks.shape[1]):
-            first, second = np.float32(1e9), np.float32(1e9)
+            first, second = nothing, nothing
             for r in range(i * BLOCK, i * BLOCK + BLOCK):
                 for c in range(j * BLOCK, j * BLOCK + BLOCK):
-                    z = depth[r, c]
-                    if near < z < far:
-                        if z < first:
-                            first, second = z, first
-                        elif z < second:
-                            second = z
+                    z = np.float32(depth[r, c])
+                    z = z if near < z < far else nothing
+                    second = min(second, max(first, z))  # no branches: what comes next cannot be foretold
+                    first = min(first, z)
             total, n = 0.0, 0
             if second < 1e8:
                 for r in range(i * BLOCK, i * BLOCK + BLOCK):
@@ -236,3 +235,21 @@ def point_of_block(blocks, i, j, intrinsics, out):
     out[0] = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
     out[1] = (i * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[3]) / intrinsics[1] * z
     out[2] = z
+
+
+@njit(cache=True)
+def box_around(shape, middle, radius, intrinsics, box):
+    """First and last row and column (4,) of the blocks of a grid whose points can lie within `radius` mm of `middle`
+    (3,) mm. All of them, where the camera itself is so near.
+    """
+    near, far = middle[2] - radius, middle[2] + radius
+    for axis in range(2):
+        last = shape[axis] - 1
+        box[2 * axis], box[2 * axis + 1] = 0, last
+        if near <= 0.0:
+            continue
+        x, f, c = middle[1 - axis], intrinsics[1 - axis], intrinsics[3 - axis]
+        low, high = x - radius, x + radius
+        low, high = min(low / near, low / far) * f + c, max(high / near, high / far) * f + c
+        box[2 * axis] = min(max(int(np.floor(low / BLOCK)) - 1, 0), last)
+        box[2 * axis + 1] = min(max(int(np.ceil(high / BLOCK)) + 1, 0), last)

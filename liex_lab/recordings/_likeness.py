@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from liex_lab.recordings._ends import AROUND_MM, point_of_block
+from liex_lab.recordings._ends import AROUND_MM, box_around, point_of_block
 from liex_lab.recordings._segment import BLOCK
 
 # what tells rendered hands from elbows, chests and heads by logistic regression, in units of the first: the logarithm
@@ -17,6 +17,7 @@ _AREA_LOG_MM2, _PER_AREA = 9.55, 0.55  # of a home-sized hand; what the square o
 _PER_BORDER = 0.6  # the share that lies along the border of the picture
 _WRIST_MM, _WIDE_MM, _PER_WIDTH, _MOST_WIDTHS = 50.0, 100.0, 0.25, 4.0  # how wide it goes on behind the cut
 _MARGIN = 2  # blocks
+_WITHIN = 2.0  # of `AROUND_MM`, from the hand's middle: all blocks that are marked, and what lies close behind the cut
 _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
@@ -24,13 +25,16 @@ _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
     """The mean depth, mm, of the blocks labelled `mark`, and how unlike a hand they are: the less, the more alike.
 
-    slot: the label of the rest of the surface; found (FIELDS,) as `_nearest.locate` fills it.
+    slot: the label of the rest of the surface, which the blocks get back; found (FIELDS,) as `_nearest.locate` fills
+    it.
     """
+    box = np.empty(4, np.int64)
+    box_around(labels.shape, found, _WITHIN * AROUND_MM * size, intrinsics, box)
     n_rows, n_columns = labels.shape
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
     area, around, behind, on_border, n, depth = 0.0, 0.0, 0.0, 0, 0, 0.0
-    for i in range(n_rows):
-        for j in range(n_columns):
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
             if labels[i, j] == slot:
                 side = _side(blocks[i, j], focal)
                 behind += side * side * _behind_cut(blocks, i, j, found, size, intrinsics)
@@ -46,6 +50,10 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
                 inside = 0 <= r < n_rows and 0 <= c < n_columns
                 if not inside or (labels[r, c] != mark and labels[r, c] != slot):
                     around += side
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
+            if labels[i, j] == mark:
+                labels[i, j] = slot
     area, n = max(area, 1.0), max(n, 1)
     width = min(behind / (_WRIST_MM * _WIDE_MM * size * size), _MOST_WIDTHS)
     unlike = _PER_AREA * (np.log(area / (size * size)) - _AREA_LOG_MM2) ** 2

@@ -84,6 +84,12 @@ class MessageFile(ABC):
     def walk(self, wanted: Callable[[Channel], bool], progress: Progress) -> Iterator[Envelope]:
         """Every whole message of the wanted channels, in file order."""
 
+    def go_on(self) -> int | None:
+        """Make ready for a walk over what was written behind the last whole record since; returns how many chunks the
+        walks before are sure of, None where the file has to be opened anew.
+        """
+        return None
+
     def resume(self, at: int) -> int:
         """Where to go on behind a record at `at` that is damaged: at the next chunk that is known, or the end."""
         self.whole = False

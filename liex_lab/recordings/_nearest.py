@@ -13,6 +13,7 @@ from liex_lab.recordings._ends import (
     AROUND_MM,
     MAX_SURFACES,
     block_depths,
+    box_around,
     label_surfaces,
     nearest_ends,
     point_of_block,
@@ -39,42 +40,55 @@ def locate(blocks, labels, tip, size, intrinsics, found):
 
     What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's length long.
     """
-    middle, moved, fingers = np.empty(3), np.empty(3), np.zeros(3)
+    middle, fingers = np.empty(3), np.zeros(3)
     slot = labels[int(tip[1]), int(tip[2])]
     point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
     _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
-    around = AROUND_MM * size
+    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
     cut, area, base = -1e9, 0.0, 0.0
     for step in range(3):
-        has_arm = _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers)
-        cut = _wrist(blocks, labels, slot, size, intrinsics, middle, fingers) if has_arm else -1e9
+        points = _within(blocks, labels, slot, around, intrinsics, middle)
+        has_arm = _away_from_arm(points, size, focal2, middle, fingers)
+        cut = _wrist(points, size, focal2, middle, fingers) if has_arm else -1e9
         base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
-        area = _beyond(blocks, labels, slot, around, intrinsics, middle, fingers, cut, step == 2, moved)
-        for k in range(3):
-            middle[k] = moved[k]
+        area = BLOCK * BLOCK * _beyond(points, middle, fingers, cut, labels, step == 2) / focal2
     for k in range(3):
         found[k], found[3 + k] = middle[k], fingers[k]
     found[6], found[7] = cut + base, area
 
 
 @njit(cache=True)
-def _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers):
-    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm leaves the sphere."""
-    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
-    p, shell = np.empty(3), 0.0
-    for k in range(3):
-        fingers[k] = 0.0
-    for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
+def _within(blocks, labels, slot, radius, intrinsics, middle):
+    """The points of a surface within `radius` mm of the middle, rows of x, y, z, distance, block row, block column."""
+    p, box = np.empty(3), np.empty(4, np.int64)
+    box_around(blocks.shape, middle, radius, intrinsics, box)
+    points, n = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), 6)), 0
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
             if labels[i, j] != slot:
                 continue
             point_of_block(blocks, i, j, intrinsics, p)
-            off = np.sqrt((p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2)
-            if _SHELL * around < off < around:
-                w = BLOCK * BLOCK * p[2] * p[2] / focal2
-                shell += w
-                for k in range(3):
-                    fingers[k] -= w * (p[k] - middle[k]) / off
+            off2 = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
+            if off2 < radius * radius:
+                points[n, 0], points[n, 1], points[n, 2] = p[0], p[1], p[2]
+                points[n, 3], points[n, 4], points[n, 5] = np.sqrt(off2), i, j
+                n += 1
+    return points[:n]
+
+
+@njit(cache=True)
+def _away_from_arm(points, size, focal2, middle, fingers):
+    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm leaves the sphere."""
+    shell = 0.0
+    for k in range(3):
+        fingers[k] = 0.0
+    for n in range(len(points)):
+        off = points[n, 3]
+        if off > _SHELL * AROUND_MM * size:
+            w = BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+            shell += w
+            for k in range(3):
+                fingers[k] -= w * (points[n, k] - middle[k]) / off
     norm = np.sqrt(fingers[0] ** 2 + fingers[1] ** 2 + fingers[2] ** 2)
     has_arm = shell > _SHELL_MM2 * size * size and norm > 0.3 * shell
     for k in range(3):
@@ -83,17 +97,13 @@ def _away_from_arm(blocks, labels, slot, size, intrinsics, middle, fingers):
 
 
 @njit(cache=True)
-def _wrist(blocks, labels, slot, size, intrinsics, middle, fingers):
+def _wrist(points, size, focal2, middle, fingers):
     """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the fingertips."""
-    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
-    p, along = np.empty(3), np.zeros(int(2.0 * around / _BIN_MM) + 2)
-    for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
-            if labels[i, j] == slot:
-                point_of_block(blocks, i, j, intrinsics, p)
-                s, off = _along(p, middle, fingers)
-                if off < around * around:
-                    along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * p[2] * p[2] / focal2
+    around = AROUND_MM * size
+    along = np.zeros(int(2.0 * around / _BIN_MM) + 2)
+    for n in range(len(points)):
+        s = _along(points[n], middle, fingers)
+        along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
     b, tip = along.size - 1, 0.0
     while b > 0 and tip < 100.0 * size * size:
         tip += along[b]
@@ -102,44 +112,36 @@ def _wrist(blocks, labels, slot, size, intrinsics, middle, fingers):
 
 
 @njit(cache=True)
-def _beyond(blocks, labels, slot, around, intrinsics, middle, fingers, cut, mark, moved):
-    """The middle `moved` (3,) of what lies in the sphere and beyond the cut, marked in labels if so asked; its area."""
-    p, total = np.empty(3), 0.0
-    for k in range(3):
-        moved[k] = 0.0
-    for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
-            if labels[i, j] == slot:
-                point_of_block(blocks, i, j, intrinsics, p)
-                s, off = _along(p, middle, fingers)
-                if off < around * around and s > cut:
-                    w = p[2] * p[2]
-                    total += w
-                    for k in range(3):
-                        moved[k] += w * p[k]
-                    if mark:
-                        labels[i, j] = MAX_SURFACES
-    for k in range(3):
-        moved[k] /= max(total, 1e-9)
-    return BLOCK * BLOCK * total / (intrinsics[0] * intrinsics[1])
+def _beyond(points, middle, fingers, cut, labels, mark):
+    """Move `middle` (3,) to the middle of what lies beyond the cut, marked in labels if so asked; its sum of z^2."""
+    total, x, y, z = 0.0, 0.0, 0.0, 0.0
+    for n in range(len(points)):
+        if _along(points[n], middle, fingers) > cut:
+            w = points[n, 2] * points[n, 2]
+            total += w
+            x += w * points[n, 0]
+            y += w * points[n, 1]
+            z += w * points[n, 2]
+            if mark:
+                labels[int(points[n, 4]), int(points[n, 5])] = MAX_SURFACES
+    least = max(total, 1e-9)
+    middle[0], middle[1], middle[2] = x / least, y / least, z / least
+    return total
 
 
 @njit(cache=True)
 def _along(p, middle, fingers):
-    """How far p (3,) lies from `middle` along `fingers`, and the square of its distance."""
-    s, off = 0.0, 0.0
-    for k in range(3):
-        s += (p[k] - middle[k]) * fingers[k]
-        off += (p[k] - middle[k]) ** 2
-    return s, off
+    """How far p (3,) lies from `middle` along `fingers`."""
+    return (p[0] - middle[0]) * fingers[0] + (p[1] - middle[1]) * fingers[1] + (p[2] - middle[2]) * fingers[2]
 
 
 @njit(cache=True)
 def _settle(blocks, labels, slot, radius, intrinsics, middle):
     """Move `middle` (3,) to the middle of what the surface has within `radius` mm of it."""
-    p, total, moved = np.empty(3), 0.0, np.zeros(3)
-    for i in range(blocks.shape[0]):
-        for j in range(blocks.shape[1]):
+    p, box, total, moved = np.empty(3), np.empty(4, np.int64), 0.0, np.zeros(3)
+    box_around(blocks.shape, middle, radius, intrinsics, box)
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
             if labels[i, j] == slot:
                 point_of_block(blocks, i, j, intrinsics, p)
                 off = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
@@ -161,10 +163,6 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
         locate(blocks, labels, ends[k], size, intrinsics, found)
         depth[k], unlike[k] = unlikeness(blocks, labels, slot, MAX_SURFACES, found, size, intrinsics)
         nearest = min(nearest, depth[k])
-        for i in range(labels.shape[0]):
-            for j in range(labels.shape[1]):
-                if labels[i, j] == MAX_SURFACES:
-                    labels[i, j] = slot
     for k in range(len(unlike)):
         unlike[k] += _PER_MM_BEHIND * min(depth[k] - nearest, _MOST_BEHIND_MM)
 
@@ -199,6 +197,7 @@ def sight_rotation(x, y, rotation):
 def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw):
     """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 not read."""
     size = raw.shape[0]
+    reaches = np.full((labels.shape[0] + 1, labels.shape[1] + 1), -1.0, np.float32)
     for r in range(size):
         v = origin[1] + step * r
         for c in range(size):
@@ -206,7 +205,10 @@ def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origi
             raw[r, c] = -1.0
             if not (0 < r < size - 1 and 0 < c < size - 1 and 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]):
                 continue
-            reach = _reach(blocks, labels, v // BLOCK, u // BLOCK)
+            row, column = v // BLOCK, u // BLOCK
+            if reaches[row, column] < 0.0:
+                reaches[row, column] = _reach(blocks, labels, row, column)
+            reach = reaches[row, column]
             z = depth[v, u]
             if reach == 0.0 or z >= min(reach, far):
                 continue

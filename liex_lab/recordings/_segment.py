@@ -45,7 +45,7 @@ def far_mode(values, window):
     return 0.0, 0.0
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
     """`far_mode` of every pixel of `stack` (n, H, W) mm, 0 = unread, into depth and spread (H, W).
 

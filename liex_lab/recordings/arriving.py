@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from typing import NamedTuple
+from queue import Queue
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from liex_lab.recordings.recording import Recording
 _FRAME = struct.Struct("<qqII")  # index, time ns, height, width; then float32 mm, row by row
 _HEAD = struct.Struct("<I")  # length of the greeting, JSON
 _POLL_S = 0.02
+_GREETING_S, _LONGEST_GREETING = 10.0, 1 << 20
+_MOST_WAITING = 128  # frames that have come and were not asked for yet; then the sender waits
 
 
 class Arrival(NamedTuple):
@@ -71,14 +74,22 @@ def _grown(opened: Recording, reopen: Callable[[], Recording], patience_s: float
         for index in range(done, len(opened)):
             last = time.perf_counter()
             yield Arrival(opened.frame(index), last)
-        done = len(opened)
-        opened.close()
+        done = max(done, len(opened))
         time.sleep(_POLL_S)
         try:
-            opened = reopen()
+            opened = _again(opened, reopen)
         except RecordingError:  # caught in the middle of a write
             continue
     opened.close()
+
+
+def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
+    """What is there now: read on where the format can, else opened anew."""
+    more = opened.grown()
+    if more is None:
+        opened.close()
+        more = reopen()
+    return more
 
 
 def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
@@ -91,12 +102,46 @@ def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
 def received(host: str, port: int) -> Arriving:
     """What a sender like `replayed` offers at an address."""
     try:
-        link = socket.create_connection((host, port), timeout=10.0)
+        link = socket.create_connection((host, port), timeout=_GREETING_S)
     except OSError as error:
         raise RecordingError(f"nobody sends frames at {host}:{port} ({error}); start the sender first") from None
-    (length,) = _HEAD.unpack(_exactly(link, _HEAD.size))
-    greeting = json.loads(_exactly(link, length))
-    return Arriving(greeting["name"], Camera.from_dict(greeting["camera"]), _frames(link))
+    greeting = _greeting(link, f"{host}:{port}")
+    link.settimeout(None)  # the first frame may be long in the making; who is gone closes the link
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    return Arriving(greeting["name"], Camera.from_dict(greeting["camera"]), _stamped(_frames(link)))
+
+
+def _greeting(link: socket.socket, where: str) -> dict[str, Any]:
+    """What a sender says first."""
+    head = _exactly(link, _HEAD.size)
+    length = _HEAD.unpack(head)[0] if head else 0
+    try:
+        said = json.loads(_exactly(link, length)) if 0 < length < _LONGEST_GREETING else None
+    except ValueError:
+        said = None
+    if not isinstance(said, dict) or not {"name", "camera"} <= set(said):
+        link.close()
+        raise RecordingError(
+            f"what is at {where} does not send depth frames as `replayed` does: no greeting with name and camera came; "
+            "check the port"
+        )
+    return said
+
+
+def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
+    """The same, read on a thread of its own, so that a frame's time is when it came and not when it was asked for."""
+    waiting: Queue[Arrival | None] = Queue(_MOST_WAITING)
+
+    def fetch() -> None:
+        try:
+            for arrival in frames:
+                waiting.put(arrival)
+        finally:
+            waiting.put(None)
+
+    threading.Thread(target=fetch, daemon=True).start()
+    while (arrival := waiting.get()) is not None:
+        yield arrival
 
 
 def _send(server: socket.socket, recording: Recording, speed: float) -> None:
@@ -105,8 +150,10 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         greeting = json.dumps({"name": recording.name, "camera": recording.camera.to_dict()}).encode()
         link.sendall(_HEAD.pack(len(greeting)) + greeting)
-        began, first = time.perf_counter(), int(recording.times_ns[0])
+        first = int(recording.times_ns[0])
+        began: float | None = None  # when the first frame is read: what that takes is not the recording's pace
         for frame in recording:
+            began = time.perf_counter() if began is None else began
             late = (frame.time_ns - first) * 1e-9 / speed - (time.perf_counter() - began)
             if late > 0:
                 time.sleep(late)

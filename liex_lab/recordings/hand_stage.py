@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ _EDGE_MM = 110.0  # the palm stays this far inside the picture
 class HandCast:
     """n hands and what is around each, camera frame, mm: meshes hand, arm, body, thing (n, V, 3), shown (n,) which
     things are there, wall (n, 4) as in `_hand_stage.picture`; pose (n) of the hands, joints (n, J, 3), spine_mm (n,);
-    parameters (n, N_PARAMETERS) of the sensors and seeds (n,) of their noise.
+    parameters (n, N_PARAMETERS) of the sensors and seeds (n,) of their noise. thing_faces (F, 3): of things' meshes.
     """
 
     pose: Pose
@@ -46,10 +46,12 @@ class HandCast:
     wall: Array
     parameters: Array
     seeds: NDArray[np.uint64]
+    thing_faces: NDArray[np.int32] = field(default_factory=lambda: PART_FACES)
 
-    def __getitem__(self, index: slice) -> HandCast:
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> HandCast:
         """Some of the pictures."""
-        return HandCast(*(getattr(self, field.name)[index] for field in fields(self)))
+        columns = [column.name for column in fields(self) if column.name != "thing_faces"]
+        return replace(self, **{name: getattr(self, name)[index] for name in columns})
 
     def pictures(
         self, faces: NDArray[np.int32], intrinsics: Array, size: NDArray[np.int64], origin: NDArray[np.int64],
@@ -62,7 +64,8 @@ class HandCast:
         out = np.empty((len(self.seeds), *shape), np.uint16)
         with threads(parallel):
             kernels.pictures(
-                self.hand, faces, self.arm, ARM_FACES, self.body, BODY_FACES, self.thing, PART_FACES, self.shown,
+                self.hand, faces, self.arm, ARM_FACES, self.body, BODY_FACES, self.thing, self.thing_faces,
+                self.shown,
                 self.wall, intrinsics, size, origin, self.parameters, self.seeds, NORMAL, out,
             )  # fmt: skip
         return out
@@ -91,15 +94,18 @@ def draw_places(rng: np.random.Generator, intrinsics: Array, picture: Array, low
 
 def assemble(
     rng: np.random.Generator, skeleton: Skeleton, pose: Pose, shape: HandShape, size: Array, intrinsics: Array,
-    parameters: Array, thing_share: float, scenery: int,
+    parameters: Array, thing_share: float, scenery: int, wrists: Array | None = None,
 ) -> HandCast:  # fmt: skip
-    """Hands (n) with their arms, bodies, walls and things; `scenery` pictures in a row share the same surroundings."""
+    """Hands (n) with their arms, bodies, walls and things; `scenery` pictures in a row share the same surroundings.
+
+    wrists (n, 3) rad: how each is bent, None draws it for every picture.
+    """
     n = len(size)
     rotations, positions = shape.joints(skeleton, pose)
     hand = shape.flesh.vertices(rotations, positions, pose.scale, pose.scale)
     each = np.arange(n) // scenery
     n_scenes = int(each[-1]) + 1
-    frame, elbow = forearms(rng, rotations, positions, pose.scale)
+    frame, elbow = forearms(rng, rotations, positions, pose.scale, wrists)
     body, shoulder = _bodies(positions, elbow, frame[:, :, 0], rng.random((n_scenes, 3, 8))[each])
     arm = arm_vertices(frame, elbow, shoulder, pose.scale, shape.arm)
     thing, shown = _things(rng, hand, thing_share)

@@ -14,11 +14,12 @@ from liex_lab.body.hand_shape import HandShape, draw_hands
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
-from liex_lab.geometry import SE3, so3
+from liex_lab.geometry import SE3
 from liex_lab.recordings import hand_stage as stage
 from liex_lab.recordings._sensors import PRIMESENSE_KIND
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.gestures import draw_gestures
 from liex_lab.recordings.hand_labels import N_FIRST_PERSON, NYU_CAMERA, REFERENCE_FILE, NyuReference, fit_hands
 from liex_lab.recordings.hand_postures import draw_seen, draw_wide
 from liex_lab.recordings.nearest import sight_rotations
@@ -53,11 +54,14 @@ _FLOOR_MM = 1300.0  # where the plane stands that is taken for the arena's floor
 class HandSession(TrueRecording):
     """A virtual recording of one person's hand; the joints are the person's own."""
 
-    def __init__(self, name: str, skeleton: Skeleton, sensor: Sensor, cast: stage.HandCast) -> None:
+    def __init__(
+        self, name: str, skeleton: Skeleton, sensor: Sensor, cast: stage.HandCast,
+        times_ns: NDArray[np.int64] | None = None,
+    ) -> None:  # fmt: skip
         n = len(cast.seeds)
-        times = np.arange(n, dtype=np.int64) * FRAME_NS
+        times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
         super().__init__(name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth)
-        self.skeleton, self.cast, self.surface = skeleton, cast, Surface.of(skeleton)
+        self.skeleton, self.sensor, self.cast, self.surface = skeleton, sensor, cast, Surface.of(skeleton)
         self.spine_mm = float(cast.spine_mm[0])
         self.floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
         self.T_arena_camera = self.floor.T_arena_camera
@@ -226,31 +230,16 @@ def gesture_session(
     drawn = float(rng.uniform(*SIZE_RANGE))
     size = np.full(n_frames, drawn if spine_mm is None else spine_mm / skeleton.length)
     shape = _same(draw_hands(rng, skeleton, family, 1), n_frames)
-    keys = 2 + int(n_frames / 20)
-    angles, turns = draw_seen(rng, skeleton, keys)
     c = sensor.camera
     intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n_frames, 4)).copy()
     picture = np.array([[c.width, c.height]], float)
-    middle = stage.draw_places(rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0]))
-    places = middle * rng.uniform(0.93, 1.07, (keys, 1)) + rng.normal(0.0, 15.0, (keys, 3))
-    at, share = _beat(rng, n_frames, keys)
-    step = so3.log(np.swapaxes(turns[:-1], 1, 2) @ turns[1:])[at]
-    turning = turns[at] @ so3.exp(share[:, None] * step)
-    bending = angles[at] + share[:, None, None] * (angles[at + 1] - angles[at])
-    moving = places[at] + share[:, None] * (places[at + 1] - places[at])
-    pose = stage.hold_out(rng, skeleton, bending, turning, size, moving)
+    (middle,) = stage.draw_places(rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0]))
+    moving = draw_gestures(rng, skeleton, n_frames, FRAME_NS * 1e-9, middle)
+    pose = stage.hold_out(rng, skeleton, moving.angles, moving.turns, size, moving.places)
     parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0)
-    cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics, parameters, thing_share, n_frames)
+    cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics, parameters, thing_share, n_frames,
+                          moving.wrists)  # fmt: skip
     return HandSession(name, skeleton, sensor, cast)
-
-
-def _beat(rng: np.random.Generator, n_frames: int, n_keys: int) -> tuple[NDArray[np.int64], Array]:
-    """Between which gestures (n,) each frame lies, and how far (n,) it has gone: slow at both ends, then a rest."""
-    frames = rng.integers(18, 40, n_keys)
-    starts = np.concatenate([[0], np.cumsum(frames)])
-    at = np.clip(np.searchsorted(starts, np.arange(n_frames), side="right") - 1, 0, n_keys - 2)
-    share = np.clip((np.arange(n_frames) - starts[at]) / (0.6 * frames[at]), 0.0, 1.0)
-    return at, 0.5 - 0.5 * np.cos(np.pi * share)
 
 
 def _same(shape: HandShape, n: int) -> HandShape:

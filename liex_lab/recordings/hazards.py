@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.camera import Camera
-from liex_lab.recordings.habits import Habits
 from liex_lab.recordings.stage import Stage
 from liex_lab.recordings.things import N_PARTS, THING_FACES, draw_thing, rounded
 
 Array = NDArray[np.float64]
+Beside = Callable[[np.random.Generator, Array, float], Array]  # a second object from joints (n, J, 3) and a length
 
 # kind: (share of the events, shortest and longest in s)
 EVENTS = {
@@ -32,6 +33,8 @@ _HOLE = (0.1, 0.26)  # radius, of the animal's length
 _CELL = 3  # pixels a side that come and go together
 # an occluder: half its width and how far it comes from, of the animal's length; how long it is
 _BAR_HALF, _BAR_FROM, _BAR_LONG = (0.12, 0.5), 2.0, 2.5
+# a thing held beside a hand: half its sides, and how far from the hand, of the hand's length
+_HELD, _HELD_ASIDE = (0.08, 0.3), (0.1, 0.5)
 _AWAY = np.array([0.0, 0.0, 1e6])  # behind the camera
 
 TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max() + 1)])
@@ -83,25 +86,25 @@ def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArra
 
 
 def draw_things(
-    rng: np.random.Generator, events: list[Event], stage: Stage, joints: Array, length_mm: float, habits: Habits
-) -> Array:
+    rng: np.random.Generator, events: list[Event], eye: Array, joints: Array, length_mm: float, beside: Beside,
+    floats: bool = True,
+) -> Array:  # fmt: skip
     """Meshes (n, 2 V, 3) mm of the occluder and of a second object in each frame; behind the camera where there is
-    none. joints (n, J, 3) mm: the animal's, arena frame.
+    none. joints (n, J, 3) mm: the animal's, arena frame, where eye (3,) is the camera.
     """
     one = int(THING_FACES.max()) + 1
-    things = np.tile(stage.T_arena_camera.translation + _AWAY, (len(joints), 2 * one, 1))
+    things = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
     for event in events:
         span = slice(event.start, event.stop)
         if event.kind == "occluder":
-            things[span, :one] = _passing(rng, stage, joints[span], length_mm, habits.floats)
+            things[span, :one] = _passing(rng, eye, joints[span], length_mm, floats)
         elif event.kind == "object":
-            things[span, one:] = _beside(rng, stage, joints[span], length_mm, habits)
+            things[span, one:] = beside(rng, joints[span], length_mm)
     return things
 
 
-def _passing(rng: np.random.Generator, stage: Stage, joints: Array, length_mm: float, floats: bool) -> Array:
+def _passing(rng: np.random.Generator, eye: Array, joints: Array, length_mm: float, floats: bool) -> Array:
     """A bar (n, V, 3) mm that is moved across the view between the camera and the animal."""
-    eye = stage.T_arena_camera.translation
     height = 0.65 * eye[2] if floats else min(3.0 * length_mm, 0.5 * eye[2])
     target = joints[len(joints) // 2].mean(axis=0)
     share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the lens to the animal
@@ -116,9 +119,11 @@ def _passing(rng: np.random.Generator, stage: Stage, joints: Array, length_mm: f
     return mesh + place[:, None]
 
 
-def _beside(rng: np.random.Generator, stage: Stage, joints: Array, length_mm: float, habits: Habits) -> Array:
-    """A thing (n, V, 3) mm that lies beside the animal's way for a while, near it where there is room."""
-    mesh = draw_thing(rng, str(rng.choice(habits.things)), length_mm)
+def beside_animal(
+    rng: np.random.Generator, stage: Stage, joints: Array, length_mm: float, kinds: tuple[str, ...]
+) -> Array:
+    """A thing (n, V, 3) mm that stands beside the animal's way for a while, near it where there is room."""
+    mesh = draw_thing(rng, str(rng.choice(kinds)), length_mm)
     way = joints[..., :2].reshape(-1, 2)
     best, best_cost = np.zeros(2), np.inf
     for _ in range(60):
@@ -129,6 +134,20 @@ def _beside(rng: np.random.Generator, stage: Stage, joints: Array, length_mm: fl
         if cost < best_cost:
             best, best_cost = place, cost
     return np.broadcast_to(mesh + np.array([*best, 0.0]), (len(joints), *mesh.shape))
+
+
+def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
+    """A block or a ball (n, V, 3) mm that is held beside a hand for a while, at about its depth."""
+    centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
+    radii[0] = rng.uniform(*_HELD, 3) * length_mm
+    power = np.full(N_PARTS, rng.choice([2.0, 8.0]))
+    mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(-1, 3)
+    way = rng.uniform(-np.pi, np.pi)
+    toward = np.array([np.cos(way), np.sin(way)])
+    reach = (joints[..., :2] @ toward).max() + np.hypot(*radii[0, :2]) + rng.uniform(*_HELD_ASIDE) * length_mm
+    middle = joints.mean(axis=(0, 1))
+    place = np.array([*(middle[:2] + (reach - middle[:2] @ toward) * toward), middle[2]])
+    return np.broadcast_to(mesh + place, (len(joints), *mesh.shape))
 
 
 @dataclass(frozen=True)
@@ -164,16 +183,16 @@ class Loss:
                     discs[i] = np.concatenate([camera.project(centres), px], axis=1)
         return Loss(tuple(discs), faint, dropout)
 
-    def apply(self, depths: NDArray[np.float32], still: NDArray[np.float32], first: int, seeds: NDArray[np.uint64],
-              middle_px: Array, reach_px: Array) -> None:  # fmt: skip
-        """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W) mm; middle_px (n, 2)
-        and reach_px (n,): where the animal is in the picture.
+    def apply(self, depths: NDArray[np.float32], still: NDArray[np.float32] | None, first: int,
+              seeds: NDArray[np.uint64], middle_px: Array, reach_px: Array) -> None:  # fmt: skip
+        """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W) mm, where anything is
+        lost in it; middle_px (n, 2) and reach_px (n,): where the animal is in the picture.
         """
-        height, width = still.shape
+        height, width = depths.shape[1:]
         v, u = np.mgrid[:height, :width]
         for k, depth in enumerate(depths):
             i = first + k
-            if self.faint_mm[i] > 0:
+            if still is not None and self.faint_mm[i] > 0:
                 lost = (depth > 0) & (still > 0) & (still - depth < self.faint_mm[i])
                 depth[lost] = still[lost]
             if self.dropout[i] > 0:
@@ -186,17 +205,18 @@ class Loss:
                 depth[np.hypot(u - u0, v - v0) < radius] = 0.0
 
 
-def visible_share(vertices: Array, things: Array, stage: Stage, rows: NDArray[np.int64]) -> Array:
+def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
     """Share (n,) of the animal's vertices (n, V, 3) that no thing (n, W, 3) hides, 1 in frames other than `rows`.
+
+    Camera frame.
 
     A vertex is hidden where it projects into the convex outline of an occluder, which lies nearer.
     """
     from scipy.spatial import Delaunay
 
-    share, T_camera_arena = np.ones(len(vertices)), stage.T_arena_camera.inverse()
+    share = np.ones(len(vertices))
     for i in rows:
-        shadow = stage.camera.project(T_camera_arena @ things[i])
-        animal = stage.camera.project(T_camera_arena @ vertices[i])
+        shadow, animal = camera.project(things[i]), camera.project(vertices[i])
         share[i] = 1.0 - float((Delaunay(shadow).find_simplex(animal) >= 0).mean())
     return share
 

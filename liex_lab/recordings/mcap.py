@@ -59,13 +59,25 @@ class McapFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
+        self._sure = (len(MAGIC), 0, True)  # behind the last whole record: where, chunks until there, `whole`
+
+    def go_on(self) -> int | None:
+        """See `MessageFile`."""
+        size = self.path.stat().st_size
+        if size < self.size:
+            return None
+        self.size, (_, n_chunks, self.whole) = size, self._sure
+        del self.chunks[n_chunks:]
+        self._last_chunk = (-1, memoryview(b""))
+        return n_chunks
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
-        """Every whole message of the wanted channels, in file order."""
+        """Every whole message of the wanted channels, in file order; a second walk begins where the first was sure."""
         self._learn_ending()
-        at, footer = len(MAGIC), False
+        at, footer = self._sure[0], False
         while at + _RECORD.size <= self.size and not footer:
             opcode, start, end = self._record(at)
+            whole = end <= self.size and opcode != 0
             if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
                 end = self.resume(at)  # a size that cannot be; and no record has the opcode 0: these are zeros
             elif opcode == Opcode.CHUNK:
@@ -74,6 +86,8 @@ class McapFile(MessageFile):
                 data = memoryview(self.file.read(end - start))
                 yield from self._take(opcode, data, Place(-1, start, end - start), wanted)
             at, footer = end, opcode == Opcode.FOOTER
+            if whole and not footer:
+                self._sure = (at, len(self.chunks), self.whole)
             progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
 
@@ -87,6 +101,7 @@ class McapFile(MessageFile):
         """The schemas, channels and places of chunks that a finished file repeats: where the first ones are damaged,
         they are all that tells what the messages are. A repetition that is damaged itself teaches nothing.
         """
+        self.starts = []
         try:
             ending = self.size - _FOOTER.size - len(MAGIC)
             self.file.seek(max(0, ending))

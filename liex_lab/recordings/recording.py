@@ -53,10 +53,11 @@ class Recording:
         step_ns: int | None = None,
         stored: NDArray[np.int64] | None = None,
         faults: NDArray[np.uint8] | None = None,
+        grow: Callable[[], Recording | None] | None = None,
     ) -> None:
         """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from its parent.
 
-        faults (n,): which stamps were moved and why, see `Settled`.
+        faults (n,): which stamps were moved and why, see `Settled`; grow: see `grown`.
         """
         self.name, self.format, self.camera = name, format, camera
         self.times_ns = np.ascontiguousarray(times_ns, np.int64)
@@ -71,6 +72,7 @@ class Recording:
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
         self._digest: str | None = None
         self._whole: Recording | None = None
+        self._grow = grow
         self._closed = False
         if not len(self.times_ns):
             raise RecordingError(f"{name} holds no frame; a recording has at least one")
@@ -169,9 +171,22 @@ class Recording:
             read=lambda number: change(read(number)), sources=self._sources, problems=self.problems,
             truncated=self.truncated, n_whole=self.n_whole, metadata=self.metadata, step_ns=self._step_ns,
             stored=self._stored, close=self.close, faults=self._faults,
+            grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
         )  # fmt: skip
         other._whole, other.optics = self._whole or self, optics
         return other
+
+    def grown(self) -> Recording | None:
+        """The same recording with what was written to its files since it was opened, read on from where it ended.
+
+        It takes this one's place, which is used no more. None where the format has to be opened anew for that.
+        """
+        more = None if self._grow is None else self._grow()
+        if more is not None:
+            more.camera = self.camera
+            if self._close is not None:
+                self._close.detach()  # the files go on being read
+        return more
 
     def digest(self, progress: Progress = silent) -> str:
         """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in order of name.

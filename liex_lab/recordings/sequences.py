@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,15 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
+from liex_lab.camera import Camera
 from liex_lab.errors import RecordingError
 from liex_lab.geometry import SE3
 from liex_lab.recordings import hazards
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.hand_world import FRAME_NS, NYU_SENSOR, HandSession, HandWorld
 from liex_lab.recordings.hazards import Event, Loss
 from liex_lab.recordings.sensors import Sensor
-from liex_lab.recordings.synthetic import Cast, SyntheticSession
+from liex_lab.recordings.synthetic import Cast, SyntheticSession, TrueRecording
 from liex_lab.recordings.worlds import RenderedWorld, World
 
 Array = NDArray[np.float64]
@@ -37,24 +41,36 @@ SEQUENCES = {
 }
 
 
-class TestSequence(SyntheticSession):
-    """A recording with its truth (see `SyntheticSession`) and what happens in it: events, in order of their start."""
+class TestSequence(TrueRecording):
+    """A recording with its truth and what happens in it: events, in order of their start; scene: without the losses."""
 
     __test__ = False
 
-    def __init__(self, base: SyntheticSession, cast: Cast, times_ns: NDArray[np.int64], events: list[Event], loss: Loss,
-                 name: str) -> None:  # fmt: skip
-        super().__init__(name, base.stage, cast, times_ns)
-        self.events, self._loss = events, loss
+    def __init__(self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str) -> None:
+        super().__init__(name=name, format="synthetic", camera=scene.camera, times_ns=scene.times_ns.copy(),
+                         read=lambda index: self.depths(index, index + 1)[0])  # fmt: skip
+        for fact in _TRUTH:
+            setattr(self, fact, getattr(scene, fact))
+        self.scene, self.events, self._loss = scene, events, loss
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth (n, H, W) mm of frames start to stop."""
-        depths = super().depths(start, stop)
-        camera, joints = self.stage.camera, self.joints_camera
-        middle = joints.mean(axis=1)
+        depths = self.scene.depths(start, stop)
+        camera, middle = self.camera, self.joints_camera.mean(axis=1)
         reach = 1.2 * self.spine_mm * camera.fx / middle[:, 2]
-        self._loss.apply(depths, self.stage.still, start, self.cast.seeds, camera.project(middle), reach)
+        still = self.scene.stage.still if isinstance(self.scene, SyntheticSession) else None
+        self._loss.apply(depths, still, start, self.scene.cast.seeds, camera.project(middle), reach)
         return depths
+
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        for start in range(first, len(self), n_frames):
+            stop = min(start + n_frames, len(self))
+            depths = self.depths(start, stop)
+            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+
+
+_TRUTH = ("skeleton", "surface", "spine_mm", "pose", "joints_camera", "joints_arena", "T_arena_camera", "floor")
 
 
 def tracking_sequence(
@@ -68,12 +84,10 @@ def tracking_sequence(
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
-    if not isinstance(world, RenderedWorld):
-        raise RecordingError(f"there are no test sequences of a {world.skeleton.name}; mouse and fish have them")
-    kind, habits = SEQUENCES[name], world.habits
+    sensor, step_ns, floats = _setting(world, sensor)
+    kind = SEQUENCES[name]
     n, own_seed = n_frames or kind.n_frames, [kind.seed if seed is None else seed]
-    rng, step_ns = np.random.default_rng([*own_seed, 1]), habits.frame_ns
-    sensor = sensor or habits.sensors[0]
+    rng = np.random.default_rng([*own_seed, 1])
     events: list[Event] = []
     steps, pace = np.ones(n, np.int64), np.ones(n, np.int64)
     if kind.hazards:
@@ -82,16 +96,59 @@ def tracking_sequence(
     rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
     base = world.motion(own_seed, int(rows[-1]) + 1, sensor=sensor, noise=kind.noise,
                         erosion_px=kind.erosion_px * sensor.stride, spine_mm=spine_mm)  # fmt: skip
-    assert isinstance(base, SyntheticSession)  # a rendered world's
     times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(step_ns)
-    cast = _taken(base.cast, rows)
-    joints, length = cast.pose.joints(base.skeleton), base.spine_mm
-    loss = Loss.draw(rng, events, base.camera, base.T_arena_camera.inverse() @ joints, length, habits.floats)
-    if kind.hazards:
-        things = hazards.draw_things(rng, events, base.stage, joints, length, habits)
-        cast = replace(cast, things=things, shown=np.ones(n, np.bool_), thing_faces=hazards.TWO_FACES)
-        events = sorted([*events, *_hidden(base, cast, events)], key=lambda event: (event.start, event.stop))
-    return TestSequence(base, cast, times, events, loss, f"track-{name}-{base.skeleton.name}-{own_seed[0]}")
+    loss = Loss.draw(rng, events, base.camera, base.joints_camera[rows], base.spine_mm, floats)
+    title = f"track-{name}-{base.skeleton.name}-{own_seed[0]}"
+    place = _hands if isinstance(base, HandSession) else _animals
+    scene, hidden = place(rng, world, base, rows, times, events, title)
+    return TestSequence(scene, sorted([*events, *hidden], key=lambda event: (event.start, event.stop)), loss, title)
+
+
+def _setting(world: World, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
+    """The camera, the nanoseconds between its frames, and whether the animal floats."""
+    if isinstance(world, HandWorld):
+        return sensor or NYU_SENSOR, FRAME_NS, True
+    if isinstance(world, RenderedWorld):
+        return sensor or world.habits.sensors[0], world.habits.frame_ns, world.habits.floats
+    raise RecordingError(f"there are no test sequences of a {world.skeleton.name}; mouse, fish and hand have them")
+
+
+def _hands(
+    rng: np.random.Generator, world: World, base: TrueRecording, rows: NDArray[np.int64], times: NDArray[np.int64],
+    events: list[Event], title: str,
+) -> tuple[HandSession, list[Event]]:  # fmt: skip
+    """Some moments of a hand, with things before and beside it, and when it is hidden."""
+    assert isinstance(base, HandSession)
+    cast, hidden = base.cast[rows], list[Event]()
+    if events:
+        arena = hazards.draw_things(rng, events, base.T_arena_camera.translation, base.joints_arena[rows],
+                                    base.spine_mm, hazards.beside_hand)  # fmt: skip
+        things = base.T_arena_camera.inverse() @ arena
+        cast = replace(cast, thing=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES)
+        hidden = _hidden(base.camera, cast.hand, things, events)
+    return HandSession(title, base.skeleton, base.sensor, cast, times), hidden
+
+
+def _animals(
+    rng: np.random.Generator, world: World, base: TrueRecording, rows: NDArray[np.int64], times: NDArray[np.int64],
+    events: list[Event], title: str,
+) -> tuple[SyntheticSession, list[Event]]:  # fmt: skip
+    """As `_hands` of an animal."""
+    assert isinstance(base, SyntheticSession)
+    assert isinstance(world, RenderedWorld)
+    cast, stage, habits, hidden = _taken(base.cast, rows), base.stage, world.habits, list[Event]()
+
+    def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
+        return hazards.beside_animal(rng, stage, joints, length_mm, habits.things)
+
+    if events:
+        things = hazards.draw_things(rng, events, base.T_arena_camera.translation, base.joints_arena[rows],
+                                     base.spine_mm, beside, habits.floats)  # fmt: skip
+        cast = replace(cast, things=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES)
+        surface, T_camera_arena = Surface.of(base.skeleton), base.T_arena_camera.inverse()
+        body = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[:, : surface.n_trunk_vertices]
+        hidden = _hidden(base.camera, T_camera_arena @ body, T_camera_arena @ things, events)
+    return SyntheticSession(title, stage, cast, times), hidden
 
 
 def _taken(cast: Cast, rows: NDArray[np.int64]) -> Cast:
@@ -104,10 +161,9 @@ def _taken(cast: Cast, rows: NDArray[np.int64]) -> Cast:
     )  # fmt: skip
 
 
-def _hidden(base: SyntheticSession, cast: Cast, events: list[Event]) -> list[Event]:
-    """The stretches in which the occluder hides the animal."""
-    surface, one = Surface.of(base.skeleton), cast.things.shape[1] // 2
-    vertices = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[:, : surface.n_trunk_vertices]
+def _hidden(camera: Camera, body: Array, things: Array, events: list[Event]) -> list[Event]:
+    """The stretches in which the occluder hides the animal; meshes (n, V, 3) mm in the camera frame."""
     spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
     rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
-    return hazards.hidden_spans(hazards.visible_share(vertices[:, ::4], cast.things[:, :one], base.stage, rows))
+    one = things.shape[1] // 2
+    return hazards.hidden_spans(hazards.visible_share(body[:, ::4], things[:, :one], camera, rows))

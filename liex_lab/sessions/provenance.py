@@ -42,7 +42,7 @@ class Provenance:
     not deliver, and stamps that were moved; problems: sentences about the recording; subject: any of subject_id, group,
     cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin; optics: what was undone
     of lens and water, for then `camera` is the ideal one; arena: the shape of the floor; zones: those that a person has
-    drawn on it.
+    drawn on it; replay_depth, replay_candidates: what the replay is to hold.
     """
 
     name: str
@@ -66,6 +66,8 @@ class Provenance:
     optics: dict[str, Any] = field(default_factory=dict)
     arena: Arena = UNKNOWN
     zones: Sequence[Zone] = ()
+    replay_depth: bool = True
+    replay_candidates: bool = False
 
     @staticmethod
     def of(recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any) -> Provenance:
@@ -83,6 +85,7 @@ class Provenance:
             "subject": {name: str(value) for name, value in subject.items() if value},
             "session_start_time": stated.session_start_time or told.get("session_start_time") or "",
             "optics": recording.optics,
+            "replay_depth": plan.replay.depth, "replay_candidates": plan.replay.candidates,
         }  # fmt: skip
         return Provenance(**{**known, **more})
 

@@ -20,9 +20,12 @@ from liex_lab.recordings.rvl import rvl_message
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rows import Rows, frame_count, stop_times, stretches
+from liex_lab.sessions.rrd_body import log_body, send_body
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from liex_lab.tracking.observations import Observations
 
 Array = NDArray[np.float64]
 DepthBatch = Sequence[NDArray[np.uint16]]
@@ -34,9 +37,12 @@ SKELETON = "arena/skeleton"
 ROOT = "arena/root"
 UNCERTAINTY = "arena/uncertainty"
 FLOOR = "arena/floor"
+CANDIDATES = "arena/candidates"
 ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
+_LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
+_PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
+_NOISY_PNG = (16, 1, 17, 2)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
 _BLOCK = 8192  # frames of small things sent in one go
-RAW_UP_TO = 300  # frames; beyond it depth is stored as RVL, which is half the size
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
 # Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
@@ -53,7 +59,6 @@ class ReplayWriter:
 
     def __init__(self, path: Path, origin: Provenance, blueprint: Any = None) -> None:
         self._origin = origin
-        self._encoded = origin.n_frames is None or origin.n_frames > RAW_UP_TO
         self._first_ns: int | None = None
         self._stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
         self._stream.set_log_time_enabled(False)
@@ -68,7 +73,9 @@ class ReplayWriter:
         self._first_ns = first_ns
 
     def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
-        """Depth (H, W) uint16 mm of consecutive frames."""
+        """Depth (H, W) uint16 mm of consecutive frames; nothing where the replay is to be without depth."""
+        if not self._origin.replay_depth:
+            return
         if self._first_ns is None:
             self._first_ns = int(times_ns[0])
             self._log_depth_kind(depth[0])
@@ -76,23 +83,24 @@ class ReplayWriter:
         index = np.asarray(frame_index, np.int64)
         for start in range(0, len(depth), 8):  # larger calls were slower and hold more memory
             part = slice(start, start + 8)
-            if self._encoded:
-                blobs = [rvl_message(image) for image in depth[part]]
-                columns = rr.EncodedDepthImage.columns(blob=blobs)
-            else:
-                images = np.stack(depth[part])
-                columns = rr.DepthImage.columns(buffer=images.view(np.uint8).reshape(len(images), -1))
+            blobs, kinds = zip(*(packed(image) for image in depth[part]), strict=True)
+            columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
             self._stream.send_columns(DEPTH, _timeline(index[part], elapsed[part]), [*columns])
             self._n_sent += 1
         self._stream.flush()
 
     def finish(
-        self, rows: Rows, kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
-    ) -> None:
-        """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the ethogram's vocabulary."""
+        self, rows: Rows, kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str],
+        candidates: Observations | None = None,
+    ) -> None:  # fmt: skip
+        """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the ethogram's vocabulary;
+        candidates: what single frames thought possible, where that is to be seen, too.
+        """
         index, elapsed = rows.frame_index, rows.track.times_ns - rows.track.times_ns[:1]
         self._log_skeleton(rows, index, elapsed)
         self._log_root(rows, index, elapsed)
+        if candidates is not None:
+            self._log_candidates(candidates, index, elapsed)
         scalars = [("error/predicted", "predicted error (mm)", 0xEE6677, rows.track.predicted_error_mm)]
         for name, label, colour in (
             ("speed_mm_s", "speed (mm/s)", 0x4477AA),
@@ -171,12 +179,7 @@ class ReplayWriter:
             "meter": MM_PER_UNIT, "colormap": "viridis", "point_fill_ratio": 0.25,
             "depth_range": colour_range(first, self._origin.floor_distance_mm),
         }  # fmt: skip
-        if self._encoded:
-            kind: Any = rr.EncodedDepthImage.from_fields(media_type=rr.components.MediaType.RVL, **look)
-        else:
-            height, width = first.shape
-            layout = rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U16)
-            kind = rr.DepthImage.from_fields(format=layout, **look)
+        kind = rr.EncodedDepthImage.from_fields(**look)
         self._stream.log(DEPTH, kind, static=True)
 
     def _log_skeleton(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
@@ -194,10 +197,13 @@ class ReplayWriter:
             self._stream.log(f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True)
         look = rr.Ellipsoids3D.from_fields(colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003)
         self._stream.log(UNCERTAINTY, look, static=True)
+        girth = float(self._origin.animal_size.get("girth", 1.0))
+        carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
         for start in range(0, track.n_frames, _BLOCK):
             part = slice(start, start + _BLOCK)
             when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
+            send_body(self._stream, track, part, when, carriers)
             self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
             self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
@@ -234,6 +240,21 @@ class ReplayWriter:
         xyzw = np.roll(so3.quaternion(track.root_rotation[seen]), -1, axis=-1)
         columns = rr.Transform3D.columns(translation=track.root_mm[seen] / 1000.0, quaternion=xyzw)
         self._stream.send_columns(ROOT, _timeline(index[seen], elapsed[seen]), [*columns])
+
+    def _log_candidates(self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+        """The bones of every pose that a frame thought possible, each rank in its colour."""
+        edges = np.array(seen.skeleton.edges, np.int64).reshape(-1, 2)
+        for h, colour in zip(range(seen.known.shape[1]), cycle(PALETTE), strict=False):
+            entity = f"{CANDIDATES}/{h + 1}"
+            look = rr.LineStrips3D.from_fields(radii=0.0008, colors=_rgba([colour]))
+            self._stream.log(entity, look, static=True)
+            for start in range(0, len(seen), _BLOCK):
+                part = slice(start, start + _BLOCK)
+                known = seen.known[part, h]
+                joints = seen[part].joints(range(seen.skeleton.n_joints))[known, h] / MM_PER_UNIT
+                strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
+                when = _timeline(index[part], elapsed[part])
+                self._stream.send_columns(entity, when, [*strips.partition(np.where(known, len(edges), 0))])
 
     def _log_worst(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frames with the largest predicted error, as notes to jump to."""
@@ -275,6 +296,20 @@ class ReplayWriter:
         elapsed = np.rint(np.array(times) * 1e9).astype(np.int64)
         self._stream.send_columns(entity, _timeline(np.array(frames), elapsed),
                                   [*rr.StateChange.columns(state=list(words))])  # fmt: skip
+
+
+def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
+    """A depth picture (H, W) without loss, and how: RVL, which takes half of what raw pictures do and is quick; where
+    noise makes that large, PNG if it is smaller (Huffman's code alone: noise has no runs to look for).
+    """
+    import cv2
+
+    rvl = rvl_message(depth)
+    if len(rvl) > _LARGE * depth.size:
+        png = cv2.imencode(".png", depth, _NOISY_PNG)[1].ravel()
+        if len(png) < _PACKED_FURTHER * len(rvl):
+            return png, "image/png"
+    return rvl, "application/rvl"
 
 
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:

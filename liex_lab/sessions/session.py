@@ -28,9 +28,11 @@ FILES = (
     "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
     "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "transitions.parquet",
     "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap", "observations.npz",
+    "replay.rbl", "foxglove.json",
 )  # fmt: skip
 _OPTIONAL = {
     "kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet", "observations.npz",
+    "replay.rbl", "foxglove.json",
 }  # fmt: skip
 
 
@@ -90,7 +92,8 @@ class Session:
     @property
     def name(self) -> str:
         """The session's id."""
-        return str(self.metadata["session_id"])
+        with reading_from(self.path / "session.json"):
+            return str(self.metadata["session_id"])
 
     def file(self, name: str) -> Path:
         """Where a file of the session lies: the corrected one where there is one, else the session's own."""

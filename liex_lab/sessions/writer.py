@@ -7,6 +7,7 @@ import os
 import platform
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.memory import peak_memory_mb
+from liex_lab.memory import give_back, peak_memory_mb
 from liex_lab.sessions import tables
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.observations import Observations
 
 INDEX, TIMES = "frame_index", "frame_time_ns"
+_BEHIND = 4  # batches of 16 frames that the logs may be behind, both together
 Kept = TypeVar("Kept")
 
 BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json as known so far -> a Rerun blueprint
@@ -70,6 +72,7 @@ class SessionWriter:
         self._started, self._seconds = time.perf_counter(), 0.0
         self._held = TrackBuffer(origin.skeleton, 0)
         self._flips: Sequence[Flip] = ()
+        self._candidates: Observations | None = None
         self._keepsakes = Keepsakes()
         self._done = False
         self._folder = part_folder(path)
@@ -77,12 +80,12 @@ class SessionWriter:
         before = self._checkpoint.seen.read()
         self._index: list[int] = before.get(INDEX, np.zeros(0, np.int64)).tolist()
         self._times_ns: list[int] = before.get(TIMES, np.zeros(0, np.int64)).tolist()
-        self._logging: list[Future[None]] = []
-        self._loggers = ThreadPoolExecutor(len(LOGS))
+        self._logging: deque[Future[None]] = deque()
+        self._loggers = {log: ThreadPoolExecutor(1) for log in LOGS}  # each writes in order, and beside the other
         try:
             self._open_logs(blueprint)
         except BaseException:
-            self._loggers.shutdown()
+            self._stop_logging()
             self._checkpoint.leave(keep=True)
             raise
 
@@ -138,11 +141,10 @@ class SessionWriter:
         for start in range(0, len(frames), 16):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [to_millimetres(frame.depth) for frame in frames[part]]
-            self._settle()
-            self._logging = [
-                self._loggers.submit(self._replay.add, index[part], times[part], depth),
-                self._loggers.submit(self._mcap.add, times[part], depth),
-            ]
+            self._settle(_BEHIND)
+            replay, messages = (self._loggers[log] for log in LOGS)
+            self._logging.append(replay.submit(self._replay.add, index[part], times[part], depth))
+            self._logging.append(messages.submit(self._mcap.add, times[part], depth))
             for image in depth:
                 self._keepsakes.add(image)
         self._index += index
@@ -158,11 +160,14 @@ class SessionWriter:
         kept = self._checkpoint.seen.read()
         return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (INDEX, TIMES)))
 
-    def _settle(self) -> None:
-        """Wait until the logs have written what they were given; what went wrong is raised here."""
-        waiting, self._logging = self._logging, []
-        for one in waiting:
-            one.result()
+    def _settle(self, behind: int = 0) -> None:
+        """Wait until the logs are at most so many batches behind; what went wrong is raised here."""
+        while len(self._logging) > behind:
+            self._logging.popleft().result()
+
+    def _stop_logging(self) -> None:
+        for logger in self._loggers.values():
+            logger.shutdown(cancel_futures=True)
 
     def _take_down(self) -> None:
         """A checkpoint: everything so far need not be done again. Only what `seen` was given for can go on."""
@@ -185,6 +190,7 @@ class SessionWriter:
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
         """The track of all frames so far, what was found out about its flips, and what it was made of."""
         self.track, self._flips = tracked.track, tracked.flips
+        self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
 
     @property
@@ -237,9 +243,10 @@ class SessionWriter:
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
         of_track.write_measured(self._folder, results, columns)
+        give_back()
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
         problems = self._document["problems"]
-        self._replay.finish(rows, kinematics, bouts, words, problems)
+        self._replay.finish(rows, kinematics, bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
         self._checkpoint.join_logs()
         self.note(actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {}))
@@ -292,13 +299,13 @@ class SessionWriter:
                 old.rename(self.path)
             raise
         self._done = True
-        self._loggers.shutdown()
+        self._stop_logging()
         self._checkpoint.tidy(self.path)
         shutil.rmtree(old, ignore_errors=True)
 
     def _abandon(self, keep: bool) -> None:
         """Close what is open; keep: what there is a checkpoint of."""
-        self._loggers.shutdown(cancel_futures=True)
+        self._stop_logging()
         for log in (self._replay, self._mcap):
             try:
                 log.abandon()

@@ -13,7 +13,8 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
     """How unlikely it is, in nats, that an animal of this length mm gets from joints (J, 3) mm to others in dt s.
 
     The middle and the posture about it move by standard deviations of levels[1] and levels[2] lengths a second, and are
-    measured to levels[0] of the predicted errors mm; at most `ceiling`.
+    measured to levels[0] of the predicted errors mm. Animals seldom dart, but they do: costs above levels[3] nats grow
+    as logarithms; at most `ceiling`.
     """
     n = joints_a.shape[0]
     shift, bend, middle = 0.0, 0.0, np.zeros(3)
@@ -30,7 +31,7 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
     seen = levels[0] ** 2 * (error_a * error_a + error_b * error_b)
     cost = 0.5 * shift / (seen + (levels[1] * length * dt) ** 2)
     cost += 0.5 * bend * bend / (seen + (levels[2] * length * dt) ** 2)
-    return min(cost, ceiling)
+    return min(levels[3] * np.log1p(cost / levels[3]), ceiling)
 
 
 @njit(cache=True)

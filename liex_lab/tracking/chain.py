@@ -24,19 +24,18 @@ class ChainTuning:
 
     score_mm: this much of the metric's score weighs one nat, up to score_most of them; none: passing all hypotheses of
     a frame by; ceiling: the most a leap costs; error_factor: of the predicted errors, as standard deviations; shift and
-    bend: how fast, in lengths a second, middle and posture move by themselves. Found on sequences of the mouse.
+    bend: how fast, in lengths a second, middle and posture move by themselves; tail: from so many nats on, a leap's
+    price grows as a logarithm.
     """
 
-    score_mm: float = 2.0
-    score_most: float = 8.0
-    none: float = 5.0
-    ceiling: float = 12.0
-    error_factor: float = 0.4
-    shift: float = 4.0
-    bend: float = 1.5
-
-
-TUNING = ChainTuning()
+    score_mm: float
+    score_most: float
+    none: float
+    ceiling: float
+    error_factor: float
+    shift: float
+    bend: float
+    tail: float
 
 
 class Chain:
@@ -46,12 +45,12 @@ class Chain:
     one thing is another as soon as what follows says so.
     """
 
-    def __init__(self, skeleton: Skeleton, length_mm: float, tuning: ChainTuning = TUNING) -> None:
+    def __init__(self, skeleton: Skeleton, length_mm: float, tuning: ChainTuning) -> None:
         self._length, self._tuning = length_mm, tuning
         self._score_mm = tuning.score_mm * skeleton.relative_size
         n = skeleton.n_joints
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
-        self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend])
+        self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend, tuning.tail])
 
     def path(self, seen: Observations, told: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """(n,) the hypothesis of each frame that lies on the curve, or NONE.

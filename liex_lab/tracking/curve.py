@@ -14,8 +14,9 @@ from liex_lab.camera import Camera
 from liex_lab.geometry import SE3
 from liex_lab.tracking.chain import NONE, Chain
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
-from liex_lab.tracking.smoother import MOTION, Curve, Motion, smooth
+from liex_lab.tracking.smoother import Curve, Motion, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.tuning import Tuning
 
 Array = NDArray[np.float64]
 
@@ -42,10 +43,14 @@ class Subject:
 
 
 def track_whole(
-    subject: Subject, seen: Observations, corrections: Sequence[Flip] = (), motion: Motion = MOTION
+    subject: Subject, seen: Observations, corrections: Sequence[Flip] = (), tuning: Tuning | None = None
 ) -> Tracked:
-    """The track of a recording from what was seen in all of its frames; corrections: what a human says of flips."""
-    chain = Chain(subject.skeleton, subject.length_mm)
+    """The track of a recording from what was seen in all of its frames; corrections: what a human says of flips.
+
+    tuning: None takes the animal's own.
+    """
+    tuning = tuning or Tuning.of(subject.skeleton.name)
+    chain, motion = Chain(subject.skeleton, subject.length_mm, tuning.chain), tuning.motion
     path = chain.path(seen)
     doubt = chain.doubt(seen, path)
     pose, error = seen.pose(path), seen.along(seen.error_mm, path)
@@ -71,9 +76,7 @@ def _put(pose: Pose, rows: NDArray[np.bool_] | NDArray[np.int64], other: Pose) -
     pose.angles[rows], pose.scale[rows] = other.angles, other.scale
 
 
-def _turn_round(
-    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], pose: Pose, span: Flip
-) -> None:
+def _turn_round(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], pose: Pose, span: Flip) -> None:
     """Exchange head and tail of the poses in a span: by the other hypothesis of a frame where there is one."""
     for t in range(span.start, span.stop):
         if path[t] == NONE:
@@ -97,9 +100,7 @@ def _smoothed(subject: Subject, seen: Observations, pose: Pose, error: Array, mo
     return Curve.join(parts)
 
 
-def _admitted(
-    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve
-) -> NDArray[np.int64]:
+def _admitted(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve) -> NDArray[np.int64]:
     """(n,) of frames that were passed by, the hypothesis that lies on the curve all the same; NONE elsewhere."""
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
     for h in range(seen.score.shape[1]):
@@ -132,10 +133,8 @@ def to_track(
     track.angles_rad[there], track.scale[there] = pose.angles[there], pose.scale[there]
     sd = curve.error_mm / _ERROR_PER_SD
     track.sd_mm[there] = (sd[:, None] * np.array(subject.joint_share))[there]
-    track.sd_root[there] = np.concatenate([np.repeat(curve.sd_turn[:, None], 3, 1), np.repeat(sd[:, None], 3, 1)], 1)[
-        there
-    ]
-    track.sd_angles_rad[there] = (curve.sd_turn[:, None, None] * skeleton.axes)[there]
+    track.sd_root[there] = _spread_of_root(curve)[there]
+    track.sd_angles_rad[there] = (curve.sd_bend[:, None] * skeleton.axes)[there]
     track.sd_angles_rad[:, 0] = np.where(there[:, None], 0.0, np.nan)
     track.predicted_error_mm[there] = curve.error_mm[there]
     track.p_flip[there] = doubt[there]
@@ -146,13 +145,22 @@ def to_track(
     return track
 
 
+def _spread_of_root(curve: Curve) -> Array:
+    """Standard deviations (n, 6) of the root in its own frame, rad and mm: what its middle may be off, and what a turn
+    about the middle moves the root.
+    """
+    root = curve.pose.root
+    lever = np.einsum("nij,ni->nj", root.rotation, curve.joints[:, 0] - curve.joints.mean(axis=1))
+    moved = np.cross(np.eye(3), lever[:, None]) * curve.sd_turn[:, :, None]  # (n, axis turned about, axis moved along)
+    place = np.einsum("nij,ni->nj", root.rotation**2, curve.sd_middle_mm**2) + (moved**2).sum(axis=1)
+    return np.concatenate([curve.sd_turn, np.sqrt(place)], axis=1)
+
+
 # a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
 _ERROR_PER_SD = 1.4
 
 
-def _add_sight(
-    track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
-) -> None:
+def _add_sight(track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]) -> None:
     """What was seen of the animal where it was measured."""
     rows, taken = np.flatnonzero(measured), path[measured]
     track.n_foreground_px[rows] = seen.n_px[rows, taken]
@@ -164,9 +172,10 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     """What each frame says by itself, without its neighbours."""
     path = np.where(seen.known[:, 0], 0, NONE)
     pose, error = seen.pose(path), seen.along(seen.error_mm, path)
-    length = subject.length_mm
-    curve = Curve(pose, joints_of(subject.skeleton, pose), error, MOTION.middle_error * error,
-                  MOTION.turn_error * error / length, path >= 0)  # fmt: skip
+    moves = Tuning.of(subject.skeleton.name).motion.packed
+    turn, bend = (group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend))
+    curve = Curve(pose, joints_of(subject.skeleton, pose), error, moves.place_error * error[:, None], turn, bend,
+                  path >= 0)  # fmt: skip
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
 
 

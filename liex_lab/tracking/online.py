@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from liex_lab.tracking.chain import NONE, Chain
 from liex_lab.tracking.curve import Subject, to_track
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.smoother import MOTION, Motion, smooth
+from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.track import Track
+from liex_lab.tracking.tuning import Tuning
 
 _WINDOW = 48  # frames that have a say in the present one
 
@@ -21,9 +22,10 @@ class OnlineTracker:
     With lag 0 a row is told at once, from the past alone.
     """
 
-    def __init__(self, subject: Subject, lag: int = 0, motion: Motion = MOTION) -> None:
-        self._subject, self._lag, self._motion = subject, lag, motion
-        self._chain = Chain(subject.skeleton, subject.length_mm)
+    def __init__(self, subject: Subject, lag: int = 0, tuning: Tuning | None = None) -> None:
+        tuning = tuning or Tuning.of(subject.skeleton.name)
+        self._subject, self._lag, self._motion = subject, lag, tuning.motion
+        self._chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)

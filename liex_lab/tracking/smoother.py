@@ -11,43 +11,68 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.tracking import _filter as kernels
+from liex_lab.tracking import _smooth as kernels
 from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Motion:
-    """How an animal moves and how single frames err; lengths over the animal's, errors over the predicted one.
+class Wandering:
+    """How one coordinate moves and how frames err in it.
 
-    middle_error, turn_error: standard deviation along one axis of the joints' middle, and of rotations times the
-    animal's length, over the predicted mean joint error; middle_jerk (lengths^2/s^3) and turn_jerk (rad^2/s^3):
-    densities of the accelerations; scale_rate (1/s^3) of the logarithm of the size; freedom of the t distribution of
-    errors; reject: off by more than this many predicted errors is not measured at all; lasting: the share of an error
-    that neighbouring frames have in common and no smoother takes away.
+    error: standard deviation times the animal's length over the predicted mean joint error; drive: density of the noise
+    that drives the velocity, rad^2/s^3; fade: seconds within which a velocity dies away by itself.
     """
 
-    middle_error: float = 0.7
-    turn_error: float = 2.4
-    middle_jerk: float = 10.0
-    turn_jerk: float = 60.0
-    scale_jerk: float = 1.0
-    freedom: float = 6.0
-    reject: float = 4.0
-    lasting: float = 0.7
+    error: float
+    drive: float
+    fade: float
 
 
-MOTION = Motion()
-_PASSES = 3
+@dataclass(frozen=True)
+class Motion:
+    """How an animal moves and how single frames err; errors are over the predicted mean joint error.
+
+    place_error: of the joints' middle, along the animal, to its side, and up; place_drive (lengths^2/s^3): in the level
+    and up; place_fade s. turn: of the base's rotation, about its own x, y and z axis; bend: of the other joints' angles
+    about theirs; size: of the logarithm of the bones' scale. freedom of the t distribution of errors; reject: off by
+    more than this many predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
+    have in common and no smoother takes away; honest: what is left of an error over what the filter says is left.
+    """
+
+    place_error: tuple[float, float, float]
+    place_drive: tuple[float, float]
+    place_fade: float
+    turn: tuple[Wandering, Wandering, Wandering]
+    bend: tuple[Wandering, Wandering, Wandering]
+    size: Wandering
+    freedom: float
+    reject: float
+    lasting: float
+    honest: float
+
+    @property
+    def packed(self) -> kernels.Moves:
+        """For the kernels."""
+
+        def rows(*moves: Wandering) -> Array:
+            return np.array([[m.error, m.drive, m.fade] for m in moves])
+
+        level, up = self.place_drive
+        return kernels.Moves(
+            np.array(self.place_error), np.array([level, level, up]), self.place_fade, rows(*self.turn),
+            rows(*self.bend), rows(self.size)[0], self.freedom, self.reject, self.lasting,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Curve:
     """A smoothed curve of n frames.
 
-    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error; sd_middle_mm and sd_turn (n,):
-    along one axis, of the joints' middle and of rotations; used (n,): frames whose measurement it goes by.
+    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error; sd_middle_mm (n, 3): of the
+    joints' middle along the arena's axes; sd_turn (n, 3) of the base's rotation about its own axes and sd_bend (n, 3)
+    of the other joints' about theirs, rad; used (n,): frames whose measurement it goes by.
     """
 
     pose: Pose
@@ -55,6 +80,7 @@ class Curve:
     error_mm: Array
     sd_middle_mm: Array
     sd_turn: Array
+    sd_bend: Array
     used: NDArray[np.bool_]
 
     def __getitem__(self, rows: slice) -> Curve:
@@ -74,16 +100,16 @@ class Curve:
     def unknown(n: int, n_joints: int) -> Curve:
         """A curve of frames in which nothing was measured."""
         nan = np.full((n, n_joints, 3, 3), np.nan)
-        pose = Pose(SE3(nan[:, 0], nan[:, 0, 0]), nan[..., 0], nan[:, 0, 0, 0])
-        none = nan[:, 0, 0, 0]
-        return Curve(pose, nan[..., 0], none, none, none, np.zeros(n, np.bool_))
+        axes, none = nan[:, 0, 0], nan[:, 0, 0, 0]
+        pose = Pose(SE3(nan[:, 0], axes), nan[..., 0], none)
+        return Curve(pose, nan[..., 0], none, axes, axes, axes, np.zeros(n, np.bool_))
 
 
-_ROWS = ("joints", "error_mm", "sd_middle_mm", "sd_turn", "used")
+_ROWS = ("joints", "error_mm", "sd_middle_mm", "sd_turn", "sd_bend", "used")
 
 
 def smooth(
-    skeleton: Skeleton, seconds: Array, pose: Pose, error_mm: Array, length_mm: float, motion: Motion = MOTION
+    skeleton: Skeleton, seconds: Array, pose: Pose, error_mm: Array, length_mm: float, motion: Motion
 ) -> Curve:  # fmt: skip
     """The curve through measured poses (n), NaN where none is, with predicted errors error_mm (n,) at times (n,) s.
 
@@ -91,73 +117,44 @@ def smooth(
     very far off nothing. Before the first measurement the curve stands still.
     """
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
-    if not known.any():
-        return Curve.unknown(len(seconds), skeleton.n_joints)
-    joints = joints_of(skeleton, pose)
-    weight, used = np.ones(len(seconds)), known.copy()
-    curve = _run(skeleton, seconds, pose, joints, error_mm, length_mm, motion, weight, used)
-    for _ in range(_PASSES):
-        off = np.linalg.norm(joints - curve.joints, axis=-1).mean(axis=1) / error_mm
-        weight = np.where(known, (motion.freedom + 1.0) / (motion.freedom + np.nan_to_num(off) ** 2), 1.0)
-        used = known & ~(off > motion.reject)
-        if not used.any():
-            used = known
-        curve = _run(skeleton, seconds, pose, joints, error_mm, length_mm, motion, weight, used)
-    return curve
-
-
-def _run(
-    skeleton: Skeleton, seconds: Array, pose: Pose, joints: Array, error_mm: Array, length_mm: float, motion: Motion,
-    weight: Array, used: NDArray[np.bool_],
-) -> Curve:  # fmt: skip
-    """One pass of the smoother, with each measurement's variance divided by its weight."""
     n = len(seconds)
-    start = int(np.argmax(used))
-    variance = np.where(used, error_mm**2 / weight, np.inf)
-    fast = 1.0 - motion.lasting**2
-    middle = _Group(seconds, motion.middle_error**2 * fast * variance, motion.middle_jerk * length_mm**2, start)
-    turn = _Group(seconds, (motion.turn_error / length_mm) ** 2 * fast * variance, motion.turn_jerk, start)
-    size = _Group(seconds, (motion.turn_error / length_mm) ** 2 * fast * variance, motion.scale_jerk, start)
-    centre, _ = middle.vectors(joints.mean(axis=1), used)
-    rotation = turn.rotations(pose.root.rotation, used)
-    angles, _ = turn.vectors(pose.angles.reshape(n, -1), used)
-    scale = np.exp(size.vectors(np.log(pose.scale)[:, None], used)[0][:, 0])
-    made = Pose(SE3(rotation, np.zeros((n, 3))), angles.reshape(pose.angles.shape), scale)
-    made.root.translation[:] = centre - joints_of(skeleton, made).mean(axis=1)
-    lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
-    relative = 0.5 * middle.variance / motion.middle_error**2
-    relative += 0.5 * turn.variance * (length_mm / motion.turn_error) ** 2
-    return Curve(
-        made, joints_of(skeleton, made), np.sqrt(lasting**2 + relative),
-        np.sqrt(middle.variance + (motion.middle_error * lasting) ** 2),
-        np.sqrt(turn.variance + (motion.turn_error * lasting / length_mm) ** 2), used,
+    if not known.any():
+        return Curve.unknown(n, skeleton.n_joints)
+    seen = kernels.Poses(pose.root.rotation, pose.root.translation, pose.angles, np.log(pose.scale),
+                         joints_of(skeleton, pose))  # fmt: skip
+    made = kernels.Poses(*(np.zeros(values.shape) for values in seen))
+    spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
+    used = np.zeros(n, np.bool_)
+    body = body_of(skeleton, length_mm)
+    kernels.smooth_poses(seconds, seen, error_mm, known, body, motion.packed, made, spread, used)
+    return _curve(seconds, error_mm, length_mm, motion, made, spread, used)
+
+
+def body_of(skeleton: Skeleton, length_mm: float) -> kernels.Body:
+    """A skeleton for the kernels."""
+    free = np.argwhere(skeleton.axes)
+    return kernels.Body(
+        skeleton.parents, skeleton.offsets, skeleton.rest, np.asarray(skeleton.axes.any(axis=1)), free[free[:, 0] > 0],
+        float(length_mm), skeleton.tip,
     )  # fmt: skip
 
 
-class _Group:
-    """Coordinates that share their gains; see `_filter`."""
-
-    def __init__(self, seconds: Array, r: Array, q: float, start: int) -> None:
-        n = len(seconds)
-        self._times, self._start = seconds, start
-        self._forward, self._back = np.zeros((n, 2)), np.zeros((n, 2, 2))
-        filtered, predicted, smoothed = np.zeros((3, n, 2, 2))
-        kernels.gains(seconds, r, q, start, self._forward, self._back, filtered, predicted, smoothed)
-        smoothed[:start] = smoothed[start]
-        self.variance = smoothed[:, 0, 0]
-
-    def vectors(self, y: Array, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Smoothed vectors (n, m) and their rates."""
-        ahead, out, rate = np.zeros((3, *y.shape))
-        args = self._times, y, used, self._start, self._forward, self._back, ahead, out, rate
-        kernels.run_vectors(*args)
-        out[: self._start], rate[: self._start] = out[self._start], 0.0
-        return out, rate
-
-    def rotations(self, y: Array, used: NDArray[np.bool_]) -> Array:
-        """Smoothed rotations (n, 3, 3)."""
-        ahead, out, rate = np.zeros(y.shape), np.zeros(y.shape), np.zeros((len(y), 3))
-        args = self._times, y, used, self._start, self._forward, self._back, ahead, out, rate
-        kernels.run_rotations(*args)
-        out[: self._start] = out[self._start]
-        return out
+def _curve(
+    seconds: Array, error_mm: Array, length_mm: float, motion: Motion, made: kernels.Poses, spread: kernels.Spread,
+    used: NDArray[np.bool_],
+) -> Curve:  # fmt: skip
+    """What the kernels made, and how far off it may be: what the filter leaves, and what lasts over many frames."""
+    lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
+    middle = np.diagonal(spread.middle, axis1=1, axis2=2)
+    place, moves = np.array(motion.place_error), motion.packed
+    # of a frame's predicted error, what the middle's errors and what the bends' are of it
+    relative = 0.5 * middle.sum(axis=1) / (place**2).sum()
+    relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2
+    sd_middle = np.sqrt(middle + (place**2).mean() * lasting[:, None] ** 2)
+    turn, bend = (
+        np.sqrt(left + (group[:, 0] * lasting[:, None] / length_mm) ** 2)
+        for left, group in ((spread.turn, moves.turn), (spread.bend, moves.bend))
+    )
+    pose = Pose(SE3(made.rotation, made.place), made.angles, np.exp(made.log_scale))
+    error = motion.honest * np.sqrt(lasting**2 + relative)
+    return Curve(pose, made.joints, error, motion.honest * sd_middle, motion.honest * turn, motion.honest * bend, used)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
+import tempfile
 import time
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -17,14 +19,13 @@ from liex_lab.recordings.recording import Recording
 SAMPLE = find_sample("mouse_walk.mcap")
 _PRELOADED = ["pandas", "rerun", "foxglove", "cv2", "pyarrow.parquet", "scipy.spatial", "liex_lab.pipelines.session",
               "liex_lab.dashboards.report", "liex_lab.behaviour", "liex_lab.sessions.mcap", "liex_lab.tracking.tracker",
-              "liex_lab.pipelines.scale"]  # fmt: skip
+              "liex_lab.pipelines.long"]  # fmt: skip
 _KINDS = {".parquet", ".csv", ".toml"}
-REFUSED = "refused.json"
 
 
 def long_sample(n_frames: int, broken_at: int = -1) -> Recording:
     """The bundled sample over and over, so that measuring it takes a while."""
-    from liex_lab.pipelines.scale import looped
+    from liex_lab.pipelines.long import looped
 
     with open_recording(SAMPLE) as short:
         recording = looped(short, n_frames)
@@ -40,7 +41,7 @@ def long_sample(n_frames: int, broken_at: int = -1) -> Recording:
     return recording
 
 
-def run_here(out: str, n_frames: int, broken_at: int, jumping: bool) -> None:
+def run_here(out: str, told: str, n_frames: int, broken_at: int, jumping: bool) -> None:
     """What `liex run` does, in a process forked off one with everything imported; stages and refusals are told."""
     from liex_lab.api import run_session
 
@@ -59,7 +60,7 @@ def run_here(out: str, n_frames: int, broken_at: int, jumping: bool) -> None:
     try:
         run_session(long_sample(n_frames, broken_at), Plan.load("mouse"), out, overwrite=True, progress=tell)
     except (LiexError, OSError) as error:
-        (folder / REFUSED).write_text(json.dumps(str(error)))
+        Path(told).write_text(json.dumps(str(error)))
         raise SystemExit(1) from None
 
 
@@ -75,17 +76,22 @@ def begin(out: Path, n_frames: int, broken_at: int = -1, jumping: bool = False) 
     """Start such a process; every one uses both cores."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
-    process = context.Process(target=run_here, args=(str(out), n_frames, broken_at, jumping))
+    process = context.Process(target=run_here, args=(str(out), str(_refusal_of(out)), n_frames, broken_at, jumping))
     process.start()
     return process
 
 
 def refusal(out: Path) -> str:
     """What the last run said against going on; empty where it said nothing."""
-    path = out / REFUSED
+    path = _refusal_of(out)
     said = str(json.loads(path.read_text())) if path.is_file() else ""
     path.unlink(missing_ok=True)
     return said
+
+
+def _refusal_of(out: Path) -> Path:
+    """Where a run tells what it says against going on: not on its own disk, which may be full."""
+    return Path(tempfile.gettempdir()) / f"refused-{os.getpid()}-{'-'.join(out.parts[-2:])}.json"
 
 
 def tables_of(folder: Path) -> dict[str, bytes]:

@@ -59,18 +59,18 @@ def workers(n: int, seed: int) -> dict[str, Any]:
             "studies_whole_after_retry": again}  # fmt: skip
 
 
-# how a recording is broken, and what of the reason a person needs to read
+# how a recording is broken, and what the reason has to say
 BROKEN = {
     "missing": "there is no recording",
-    "empty file": "empty",
-    "cut short": "cut",
-    "no mcap": "MCAP",
-    "no depth": "no frame|holds no|no depth",
-    "text": "MCAP",
-    "8 bit": "8",
+    "empty file": "is empty",
+    "cut short": "is cut short or damaged, 75 whole frames",
+    "no mcap": "is named like an MCAP file but holds something else",
+    "no depth": "holds no depth pictures",
+    "text": "is named like an MCAP file but holds something else",
+    "8 bit": "expected 16-bit depth, got an 8-bit",
     "no animal": "no animal",
-    "one frame": "frame",
-    "dark": "depth|read",
+    "one frame": "no animal",
+    "dark": "depth",
 }
 
 
@@ -88,12 +88,14 @@ def broken(n: int, n_frames: int, n_workers: int) -> dict[str, Any]:
     study = _study(folder, names)
     found = run_study(study, workers=n_workers)
     told = {name: _said(one) for name, one in zip(BROKEN, found, strict=False)}
+    right = [name for name, said in told.items() if BROKEN[name] in str(said["reason"])]
     for name in BROKEN:
         shutil.copy(SAMPLE, raw / _file_of(name).replace(".png", ".mcap"))
     study.write_text(study.read_text().replace(".png", ".mcap"))
     after = run_study(study, workers=n_workers, retry=True)
     shutil.rmtree(folder)
-    return {"done": _count(found, "done"), "failed": _count(found, "failed"), "reasons": told,
+    return {"done": _count(found, "done"), "failed": _count(found, "failed"),
+            "with_the_right_reason": len(right), "reasons": told,
             "done_after_they_were_mended_and_tried_again": _count(after, "done")}  # fmt: skip
 
 
@@ -130,7 +132,7 @@ def _break(raw: Path, sample: bytes) -> None:
     for name, content in contents.items():
         (raw / _file_of(name)).write_bytes(content)
     cv2.imwrite(str(raw / _file_of("8 bit")), np.zeros((20, 20), np.uint8))
-    floor = np.full((40, 120, 160), 700, np.uint16)
+    floor = np.full((40, 48, 64), 700, np.uint16)
     for name, depth in (("no animal", floor), ("one frame", floor[:1]), ("dark", 0 * floor)):
         write_mcap(raw / _file_of(name), depth)
     write_mcap(raw / _file_of("no depth"), floor[:0])

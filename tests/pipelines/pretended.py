@@ -57,3 +57,16 @@ def pretended_run(
     }  # fmt: skip
     (folder / "session.json").write_text(json.dumps(document))
     return folder
+
+
+def shared_task(n: int) -> list[tuple[int, int]]:
+    """A session's task that shares its stretches: each one's number, and the process that did it."""
+    from liex_lab.pipelines.cohort import Workers
+
+    return list(Workers().each(stretch, range(n)))
+
+
+def stretch(number: int) -> tuple[int, int]:
+    """Stands in for `stretches.look_at`."""
+    time.sleep(0.2)
+    return number, os.getpid()

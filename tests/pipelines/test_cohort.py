@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from liex_lab.pipelines import cohort
 from liex_lab.pipelines.slurm import SlurmTable
 from liex_lab.pipelines.study_one import measure_one
 from liex_lab.pipelines.study_state import standing, standings
@@ -19,7 +20,7 @@ from liex_lab import api, cli
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.progress import Board
 from liex_lab.study import Study
-from tests.pipelines.pretended import pretended_run
+from tests.pipelines.pretended import pretended_run, shared_task
 
 BROKEN = ("empty", "torn", "full", "fault", "deadly", "missing")
 
@@ -107,6 +108,13 @@ def test_workers_share_the_cores(finished: tuple[Path, str, int]) -> None:
     done = next(one for one in standings(Study.load(finished[0])) if one.state == "done")
     told = json.loads((done.session.folder / "session.json").read_text())["threads"]
     assert int(told) == max(1, len(os.sched_getaffinity(0)) // 2)
+
+
+def test_all_workers_share_the_stretches_of_one_session() -> None:
+    with cohort._client(2, 2, 1, None, None) as client:
+        found = client.submit(shared_task, 6, pure=False).result(timeout=120)
+    assert sorted(number for number, _ in found) == list(range(6))
+    assert len({process for _, process in found}) == 2, "the worker that steps aside does its share"
 
 
 def one_session(tmp_path: Path, name: str = "good") -> Path:

@@ -15,6 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from liex_lab.camera import Camera, Distortion
 from liex_lab.recordings import open_recording
+from liex_lab.recordings.mcap import McapFile
 from tests.recordings.asking import opened_or_refused, refusal
 from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times, write_camera, write_mcap
 
@@ -206,3 +207,43 @@ def test_colour_topics_are_not_depth(path: Path) -> None:
     sentence = refusal(path)
     assert "no depth pictures" in sentence
     assert "/colour (foxglove.RawImage, protobuf)" in sentence
+
+
+@pytest.mark.parametrize("use_chunks", [True, False])
+def test_a_file_that_is_still_being_written_is_read_on_from_where_it_ended(path: Path, use_chunks: bool) -> None:
+    whole = write_mcap(path, STORED, use_chunks=use_chunks).read_bytes()
+    growing = path.with_name("growing.mcap")
+    growing.write_bytes(whole[: len(whole) // 3])
+    recording = open_recording(growing)
+    first = len(recording)
+    for share in (0.5, 0.7, 1.0):
+        with growing.open("ab") as file:
+            file.write(whole[growing.stat().st_size : int(share * len(whole))])
+        more = recording.grown()
+        assert more is not None
+        assert len(more) >= len(recording)
+        recording = more
+        for index in range(len(recording)):
+            np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
+    assert first < len(recording) == len(STORED)
+    assert not recording.truncated
+    growing.write_bytes(whole[: len(whole) // 2])
+    assert recording.grown() is None, "another file in its place is opened anew"
+    recording.close()
+
+
+def test_reading_on_does_not_read_again_what_was_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = open_recording(write_mcap(path, STORED))
+    looked_at: list[int] = []
+    record = McapFile._record
+
+    def looked(self: McapFile, at: int) -> tuple[int, int, int]:
+        looked_at.append(at)
+        return record(self, at)
+
+    monkeypatch.setattr(McapFile, "_record", looked)
+    more = recording.grown()
+    assert more is not None
+    assert len(more) == len(STORED)
+    assert min(looked_at, default=1 << 40) > 0.5 * path.stat().st_size
+    more.close()

@@ -79,8 +79,8 @@ def test_holes_are_unread_and_an_occluder_is_nearer_than_the_animal(hard):
 def test_a_faint_animal_is_lost_in_the_floor_where_it_is_low(hard):
     (span, *_) = spans(hard, "faint")
     i = (span.start + span.stop) // 2
-    above = hard.stage.still - hard.frame(i).depth
-    inside = (hard.frame(i).depth > 0) & (hard.stage.still > 0)
+    above = hard.scene.stage.still - hard.frame(i).depth
+    inside = (hard.frame(i).depth > 0) & (hard.scene.stage.still > 0)
     lowest = hard._loss.faint_mm[i]
     assert lowest > 0.15 * hard.spine_mm
     assert not ((above > 1.0) & (above < lowest - 1.0) & inside).any()
@@ -105,3 +105,15 @@ def test_other_animals_have_them_too():
     fish = tracking_sequence(world_of(Skeleton.load("fish")), "hard", seed=1, n_frames=120)
     assert fish.skeleton.name == "fish"
     assert np.median(np.diff(fish.times_ns)) == 20_000_000
+
+
+def test_a_hand_goes_from_gesture_to_gesture_behind_a_bar_that_passes():
+    hand = tracking_sequence(world_of(Skeleton.load("hand")), "hard", seed=2, n_frames=150)
+    assert {event.kind for event in hand.events} >= {"occluder", "hidden"}
+    steps = np.diff(hand.times_ns) * 1e-9
+    speed = np.linalg.norm(np.diff(hand.joints_camera, axis=0), axis=-1) / steps[:, None]
+    assert 100.0 < np.quantile(speed, 0.9) < 1500.0  # mm/s, three times as fast as people gesture at the most
+    (hidden, *_) = spans(hand, "hidden")
+    middle = (hidden.start + hidden.stop) // 2
+    seen = beside(hand, middle, 0.2 * hand.spine_mm)
+    assert np.mean((seen > 0) & (seen < hand.joints_camera[middle, :, 2].min() - 20.0)) > 0.4

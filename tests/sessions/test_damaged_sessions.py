@@ -124,6 +124,13 @@ def test_any_value_anywhere_in_an_unfinished_session(part: Path, name: str, data
         held.leave(keep=False)
 
 
+def test_a_session_that_lacks_a_part_of_session_json_is_read_or_refused(whole: Path, copy: Path) -> None:
+    document = json.loads((whole / "session.json").read_text())
+    for name in document:
+        (copy / "session.json").write_text(json.dumps({key: value for key, value in document.items() if key != name}))
+        read_all(copy)
+
+
 @settings(max_examples=60, deadline=None)
 @given(document=ANYTHING)
 def test_any_json_instead_of_a_failure(document: Any) -> None:

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import re
 import struct
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 import liex_lab.sessions.rrd as replay
+from liex_lab.body.pose import Pose
+from liex_lab.body.surface import Surface
+from liex_lab.camera import Camera
+from liex_lab.geometry import SE3, so3
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
+from liex_lab.sessions import Session
+from liex_lab.sessions.rrd_body import BODY, body_parts
+from liex_lab.tracking.curve import Subject
+from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.track import Tracked
 from tests.oracles.rvl import unpack_rvl
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -88,26 +101,94 @@ def test_the_worst_frames_can_be_jumped_to(session):
     assert error.loc[columns["frame"]].min() >= error.drop(columns["frame"]).max()
 
 
-def test_short_recordings_hold_the_depth_as_it_is(session):
+def unpacked(blob, kind):
+    """A depth picture by other people's code."""
+    if kind == "image/png":
+        return cv2.imdecode(blob, cv2.IMREAD_UNCHANGED)
+    width, height = struct.unpack("<II", blob.tobytes()[12:20])
+    return unpack_rvl(np.frombuffer(blob.tobytes()[20:], "<u4"), width * height).reshape(height, width)
+
+
+def test_depth_is_held_as_it_is(session):
     columns = columns_of(session, replay.DEPTH)
     assert columns["frame"] == list(range(len(MOUSE.times_s)))
-    assert columns["DepthImage:meter"] == [[1000.0]]
+    assert columns["EncodedDepthImage:meter"] == [[1000.0]]
+    kinds = [row[0] for row in columns["EncodedDepthImage:media_type"]]
     for row in (0, 50):
-        pixels = np.asarray(columns["DepthImage:buffer"][row], np.uint8).view("<u2").ravel()
-        np.testing.assert_array_equal(pixels, MOUSE.frame(row).depth.ravel())
+        blob = np.asarray(columns["EncodedDepthImage:blob"][row][0], np.uint8)
+        np.testing.assert_array_equal(unpacked(blob, kinds[row]), MOUSE.frame(row).depth)
 
 
-def test_long_recordings_hold_the_depth_as_rvl(tmp_path, strict, monkeypatch):
-    monkeypatch.setattr(replay, "RAW_UP_TO", 10)
-    session = write(tmp_path / "long.liex", WalkingMouse(steady(0.5)))
-    columns = columns_of(session, replay.DEPTH)
-    assert len(columns["EncodedDepthImage:blob"]) == 15
-    assert columns["EncodedDepthImage:media_type"] == [["application/rvl"]]
-    blob = np.asarray(columns["EncodedDepthImage:blob"][7][0], np.uint8).tobytes()
-    width, height = struct.unpack("<II", blob[12:20])
-    depth = MOUSE.frame(7).depth
-    assert (height, width) == depth.shape
-    np.testing.assert_array_equal(unpack_rvl(np.frombuffer(blob[20:], "<u4"), depth.size), depth.ravel())
+def test_a_noisy_frame_takes_less_than_180_kilobytes_and_without_depth_next_to_nothing(tmp_path):
+    large = Camera(575.8, 575.8, 319.5, 239.5, 640, 480, source="typical PrimeSense")
+    mouse = WalkingMouse(steady(24 / 30), camera=large)
+    rng = np.random.default_rng(5)
+
+    def noisy(frame):
+        noise = rng.normal(0.0, 1.0, frame.depth.shape) * (frame.depth > 0)  # on top of 1 mm that is there already
+        return replace(frame, depth=np.maximum(frame.depth + noise, 0).astype(np.float32))
+
+    sizes = {}
+    for depth in (True, False):
+        place = tmp_path / f"{depth}.liex"
+        with Session.create(place, mouse.provenance(replay_depth=depth)) as writer:
+            for frames, track in mouse.chunks(12):
+                writer.add([noisy(frame) for frame in frames], track)
+            writer.close()
+        sizes[depth] = (place / "session.rrd").stat().st_size / 24
+    assert sizes[True] < 180_000
+    assert sizes[False] < 12_000  # of so short a session most is the scene and the body, which are there once
+
+
+def test_whatever_the_noise_the_picture_comes_out_as_it_went_in():
+    rng = np.random.default_rng(8)
+    kinds = set()
+    for sd_mm, step_mm in ((0.5, 1), (6.0, 5)):  # a camera that tells steps of 5 mm apart has large ones all over
+        depth = (step_mm * np.rint((700.0 + rng.normal(0.0, sd_mm, (120, 160))) / step_mm)).astype(np.uint16)
+        blob, kind = replay.packed(depth)
+        kinds.add(kind)
+        np.testing.assert_array_equal(unpacked(blob, kind), depth)
+    assert kinds == {"application/rvl", "image/png"}
+
+
+def test_the_body_moves_with_the_joints_that_carry_it(session):
+    parts = body_parts(MOUSE.skeleton)
+    assert {part.joint for part in parts} == {0, 1, 2, 3}
+    surface, track = Surface.of(MOUSE.skeleton), MOUSE.track()
+    for row in (0, 75):
+        posed = Pose(track.root, track.angles_rad, track.scale)[np.array([row])]
+        trunk = surface.vertices(posed, parallel=False)[0, : surface.n_trunk_vertices] / 1000.0
+        for part in parts:
+            columns = columns_of(session, f"{BODY}/{MOUSE.skeleton.names[part.joint]}")
+            x, y, z, w = columns["Transform3D:quaternion"][row][0]
+            rotation = so3.exp(2.0 * np.arctan2(np.linalg.norm([x, y, z]), w) * np.array([x, y, z])
+                               / max(np.linalg.norm([x, y, z]), 1e-12))  # fmt: skip
+            local = part.vertices / 1000.0 * columns["Transform3D:scale"][row][0]
+            placed = local @ rotation.T + columns["Transform3D:translation"][row][0]
+            off = np.linalg.norm(placed[:, None] - trunk[None], axis=-1).min(axis=1)
+            assert off.max() < 1e-5, "this mouse is straight, so its parts lie on its skin"
+    lost = columns_of(session, f"{BODY}/rump")["Transform3D:scale"][20][0]
+    assert lost == [0.0, 0.0, 0.0]
+
+
+def test_every_candidate_is_there_when_it_is_asked_for(tmp_path, strict):
+    mouse = WalkingMouse(steady(0.5))
+    seen = Observations.empty(mouse.skeleton, mouse.times_ns)
+    track = mouse.track()
+    for h in (0, 2):
+        seen.put_pose(h, Pose(SE3(track.root_rotation, track.root_mm + 10.0 * h), track.angles_rad, track.scale))
+        seen.score[:, h] = 1.0
+    subject = Subject(mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 9.0, 0.5, (1.0,) * 5)
+    with Session.create(tmp_path / "c.liex", mouse.provenance(replay_candidates=True)) as writer:
+        for frames, _ in mouse.chunks(15):
+            writer.add(frames)
+        writer.take(Tracked(track, ()), seen, subject)
+        session = writer.close()
+    for h, shown in enumerate([True, False, True, False]):
+        strips = columns_of(session, f"{replay.CANDIDATES}/{h + 1}")["LineStrips3D:strips"]
+        assert [len(row) for row in strips[:2]] == [4 * shown] * 2
+    first = columns_of(session, f"{replay.CANDIDATES}/3")["LineStrips3D:strips"][0][0][0]
+    np.testing.assert_allclose(first, (track.joints_mm[0, 0] + 20.0) / 1000.0, atol=1e-5)
 
 
 def test_joints_are_metres_in_the_arena_and_vanish_with_the_animal(session):
@@ -145,9 +226,28 @@ def test_the_colours_spread_over_the_floor_and_an_animal_on_it():
     assert replay.colour_range(np.zeros((4, 4), np.uint16), 700.0)[1] > 700
 
 
-def test_a_blueprint_travels_inside(tmp_path, strict):
+def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict):
     from liex_lab.dashboards.blueprint import replay_blueprint
+    from liex_lab.dashboards.views import write_views
+    from mcap.reader import make_reader
     from rerun.chunk import RrdReader
 
-    session = write(tmp_path / "laid_out.liex", WalkingMouse(steady(0.5)), blueprint=replay_blueprint)
+    session = write(tmp_path / "laid_out.liex", WalkingMouse(steady(0.5)), blueprint=replay_blueprint,
+                    problems=["It was dark."])  # fmt: skip
     assert len(RrdReader(session.path / "session.rrd").blueprints()) == 1
+    write_views(session.path)
+    assert len(RrdReader(session.path / "replay.rbl").blueprints()) == 1
+    layout = json.loads((session.path / "foxglove.json").read_text())
+    with (session.path / "session.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    named = set(re.findall(r'"(/[a-z]+(?:/[a-z]+)?)', json.dumps(layout)))
+    assert named, "the layout shows topics"
+    assert named <= topics
+    assert panels_of(layout["layout"]) == sorted(layout["configById"])
+
+
+def panels_of(node):
+    """The panels of a layout's tree, in order."""
+    return [node] if isinstance(node, str) else sorted(panels_of(node["first"]) + panels_of(node["second"]))

@@ -133,7 +133,7 @@ def test_a_long_recording_is_smoothed_in_blocks_that_nobody_sees(measured, monke
     seen = told(SECONDS, measured)
     whole = track_whole(SUBJECT, seen).track
     monkeypatch.setattr("liex_lab.tracking.curve._BLOCK", 40)
-    monkeypatch.setattr("liex_lab.tracking.curve._MARGIN", 60)
+    monkeypatch.setattr("liex_lab.tracking.curve.MARGIN", 60)
     parts = track_whole(SUBJECT, seen).track
     np.testing.assert_allclose(parts.joints_mm, whole.joints_mm, atol=0.02)
 
