@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -14,23 +14,30 @@ from liex_lab.dashboards.app_data import StudyData
 from liex_lab.pipelines.listing import list_sessions
 from playwright.sync_api import Page, expect
 
+from liex_lab.api import correct_session
+from liex_lab.sessions import Session
+from liex_lab.sessions.corrections import Correction, read_log
 from tests.dashboards import copies
 from tests.dashboards.conftest import Watched
 
 N_SESSIONS = 200
-SOON_S = 20.0  # from the study file to the list on the screen; measured: 3 s on two quiet cores
+SOON_S = 20.0  # from the study file to the list on the screen; measured: 4.5 s on two cores that had other work
 KEY = "sub-m003_ses-01"
+
+
+def correct(folder: Path, what: Sequence[Correction], undo: Sequence[int], author: str) -> None:
+    correct_session(folder, what, undo=undo, author=author)
 
 
 class Served:
     """A dashboard that answers, and how its replay was asked for."""
 
     def __init__(self, study: Path) -> None:
-        self.began = time.monotonic()
+        self.study, self.began = study, time.monotonic()
         self.asked: list[tuple[Path, float]] = []
         data = StudyData(*list_sessions(study))
         data.warm()
-        app = make_app(data, show_replay=lambda replay, at_s: self.asked.append((replay, at_s)))
+        app = make_app(data, show_replay=lambda replay, at_s: self.asked.append((replay, at_s)), correct=correct)
         ready = threading.Event()
 
         def told(port: int) -> None:
@@ -42,7 +49,7 @@ class Served:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(tmp_path_factory: pytest.TempPathFactory) -> Served:
     return Served(copies.study(tmp_path_factory.mktemp("study"), N_SESSIONS))
 
 
@@ -97,6 +104,43 @@ def test_an_ethogram_leads_to_the_frame_and_its_replay(served: Served, watched: 
     assert replay.name == "session.rrd"
     assert shown_s == pytest.approx(float(page.locator("#moment").input_value()))
     assert f"--at {shown_s:.3f}" in page.locator("#replay-command").inner_text()
+    tools = page.locator(".modebar-btn").evaluate_all("buttons => buttons.map(one => one.dataset.title)")
+    assert "Download plot as a PNG" in tools
+    assert not any("hare" in tool or "loud" in tool for tool in tools), tools  # it would send the figure away
+    watched.nothing_went_wrong()
+
+
+def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(served: Served, watched: Watched) -> None:
+    page, key = watched.page, "sub-m004_ses-01"
+    page.goto(f"{served.address}/session/{key}?t=2.5")
+    page.get_by_text("Correct this session").click()
+    page.locator("#correct-joint").click()
+    page.get_by_role("option", name="nose").click()
+    page.wait_for_selector("#frame-picture image")
+    page.locator("#frame-picture").scroll_into_view_if_needed()
+    picture = page.locator("#frame-picture .nsewdrag").bounding_box()
+    assert picture is not None
+    page.mouse.click(picture["x"] + picture["width"] * 0.52, picture["y"] + picture["height"] * 0.45)
+    expect(page.locator("#correct-u")).not_to_have_value("")
+    u, v = (float(page.locator(f"#correct-{name}").input_value()) for name in "uv")
+    page.get_by_role("button", name="Put it under the pixel").click()
+    page.get_by_text("1: nose of frame").wait_for()
+    page.locator("#correct-action").click()
+    page.get_by_role("option", name="pause").click()
+    page.get_by_role("button", name="Rename the bout").click()
+    page.get_by_text("is pause").wait_for()
+    folder = next(served.study.parent.rglob("sub-m004/ses-01/behav"))
+    session = Session.open(folder)
+    row = int((session.frames["time_s"] - 2.5).abs().to_numpy().argmin())
+    poses = session.table("poses", None, [int(session.frames["frame_index"].iloc[row])]).set_index("joint")
+    assert (poses.loc["nose", "u_px"], poses.loc["nose", "v_px"]) == pytest.approx((u, v), abs=1.5)
+    assert "pause" in set(session.bouts["action"])
+    page.get_by_role("button", name="Take back").last.click()
+    expect(page.get_by_role("button", name="Take back")).to_have_count(1)
+    assert "pause" not in set(Session.open(folder).bouts["action"])
+    assert len(read_log(folder).entries) == 3
+    page.get_by_role("button", name="Cut that bout to the span").click()
+    expect(page.get_by_role("alert")).to_contain_text("fill in from, to")
     watched.nothing_went_wrong()
 
 
