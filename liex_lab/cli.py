@@ -164,7 +164,7 @@ def convert(
 @app.command()
 def train(
     animal: Annotated[
-        str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml file; or: actions.")
+        str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking.")
     ],
     variant: VariantName = "default",
     out: Annotated[
@@ -174,7 +174,7 @@ def train(
     n_images: Annotated[
         int | None, typer.Option("--images", min=512, help="Pictures to train on, for a quick look.")
     ] = None,
-    of: Annotated[str, typer.Option("--animal", help="Of `train actions`: whose actions, fish or mouse.")] = "mouse",
+    of: Annotated[str, typer.Option("--animal", help="Of `train actions` and `tracking`: which animal.")] = "mouse",
     sessions: Annotated[
         list[Path] | None, typer.Option("--session", help="Of `train actions`: a labelled session; repeatable.")
     ] = None,
@@ -189,7 +189,7 @@ def train(
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
 
     `liex train actions` makes the model that names actions: from sessions that people labelled, or, without any, from
-    virtual animals that act.
+    virtual animals that act. `liex train tracking` finds what the tracker believes of an animal.
     """
     if animal == "actions":
         from liex_lab.pipelines.actions import train_actions
@@ -202,6 +202,13 @@ def train(
         if report:
             _tell_numbers(report, None)
         typer.echo(f"model: {model}")
+        return
+    if animal == "tracking":
+        from liex_lab.pipelines.tracking_fit import train_tracking
+
+        with progress_bar() as progress:
+            table = train_tracking(of, out or Path(f"{of}-tracking.toml"), progress=progress)
+        typer.echo(f"table for tunings.toml: {table}")
         return
     from liex_lab.pipelines.train import train_model
 
@@ -336,6 +343,20 @@ def evaluate_tracking(
     _tell_numbers(result, json_file)
 
 
+@evaluate.command("live")
+def evaluate_live(
+    animal: AnimalName = "fish",
+    n_frames: Annotated[int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")] = 1500,
+    json_file: JsonFile = None,
+) -> None:
+    """How late skeletons are while a virtual animal is filmed."""
+    from liex_lab.pipelines.evaluate_live import evaluate_live as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, n_frames=n_frames, progress=progress)
+    _tell_numbers(result, json_file)
+
+
 @evaluate.command("statistics")
 def evaluate_statistics(
     n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
@@ -444,7 +465,7 @@ def show(
 ) -> None:
     """Open a session's replay in Rerun."""
     from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, show_replay
+    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
 
     replay = Session.open(session).path / "session.rrd"
     if at_s is not None:
@@ -457,7 +478,8 @@ def show(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
-    command = [sys.executable, "-m", "rerun", str(replay), "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
+    shown = [str(file) for file in replays_with(replay)]
+    command = [sys.executable, "-m", "rerun", *shown, "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
 
 

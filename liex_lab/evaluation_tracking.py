@@ -19,12 +19,14 @@ TRACKING_PROTOCOL = (
     "frames late (online_lag_frames); smoothed: the default tracker over the whole sequence. mean and p95: over the "
     "frames in which the row has a pose, bridged ones included; lost_rate: share of frames without one. "
     "ratio_to_single and p95_ratio_to_single: over the frames in which this row and the single frames both have a "
-    "pose. longest_flip_frames: most frames in a row whose base-to-tip direction is more than 90 degrees from the "
+    "pose. in_view_ratio and in_view_p95_ratio: over all frames in which at least half of the animal is seen, where a "
+    "frame without a pose counts as an error of half the animal's length, for both, so that nobody gains by giving up "
+    "frames. longest_flip_frames: most frames in a row whose base-to-tip direction is more than 90 degrees from the "
     "true one. interval90_coverage: share of joint coordinates within 1.645 sd of the truth. recovery_frames: after "
     "the end of an occlusion (the bar has passed, or less than half of the animal is hidden again), frames until the "
     "error is below 0.12 of its length, the worst of them. frames_per_s: on this machine, reading excluded."
 )
-_NEAR = 0.12
+_NEAR, _LOST = 0.12, 0.5  # of the animal's length
 _Z90 = 1.645
 
 
@@ -62,6 +64,14 @@ class Followed:
         inside = np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm[..., None]
         return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)[..., None]]
 
+    def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
+        """Errors, mm, of the frames in which at least half of the animal is seen; half its length without a pose."""
+        seen = np.ones(len(self.joints), np.bool_)
+        for event in events:
+            if event.kind == "hidden":
+                seen[event.start : event.stop] = False
+        return np.nan_to_num(self.error_mm, nan=_LOST * length_mm)[seen]
+
     def recovery(self, events: Sequence[Event], length_mm: float) -> list[int]:
         """After each time that something passed over the animal, or hid it, how many frames until it is found again."""
         near, found = self.error_mm < _NEAR * length_mm, []
@@ -80,12 +90,18 @@ def figures(
     seen, both = np.isfinite(error), np.isfinite(error) & np.isfinite(alone)
     if not both.any():
         return {"lost_rate": 1.0}
+    own, others = (
+        np.concatenate([row.in_view(happened, length_mm) for row, happened in zip(some, events, strict=True)])
+        for some in (rows, single)
+    )
     recovery = [n for row, happened in zip(rows, events, strict=True) for n in row.recovery(happened, length_mm)]
     return {
         "mean_joint_error_mm": float(error[seen].mean()),
         "p95_joint_error_mm": float(np.quantile(error[seen], 0.95)),
         "ratio_to_single": float(error[both].mean() / alone[both].mean()),
         "p95_ratio_to_single": float(np.quantile(error[both], 0.95) / np.quantile(alone[both], 0.95)),
+        "in_view_ratio": float(own.mean() / others.mean()),
+        "in_view_p95_ratio": float(np.quantile(own, 0.95) / np.quantile(others, 0.95)),
         "lost_rate": float(1.0 - seen.mean()),
         "longest_flip_frames": max(row.longest_flip for row in rows),
         "interval90_coverage": float(np.concatenate([row.covered for row in rows]).mean()),

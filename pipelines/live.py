@@ -45,8 +45,8 @@ def follow_live(
 ) -> tuple[dict[str, Any], Tracked]:  # fmt: skip
     """Skeletons as frames come, shown in a viewer; returns latencies and the track of the whole, smoothed.
 
-    Latency: from when a frame was there to when its skeleton was told, of those frames that came when all before them
-    had been told.
+    Latency: from when a frame was there to when its skeleton was told, of every frame from the first on that came when
+    all before it had been told: until then what was missed while learning is made up for.
     """
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.online import OnlineTracker
@@ -59,15 +59,15 @@ def follow_live(
     tracker = build_tracker(_as_recording(arriving, held), plan)
     online = OnlineTracker(tracker.subject)
     view = viewer(tracker, arriving) if viewer else None
-    seen, latency, worked_until = [], [], time.perf_counter()
+    seen, latency, worked_until, keeping_up = [], list[float](), time.perf_counter(), False
     for arrival in _chained(held, frames):
-        waited = arrival.at_s >= worked_until
+        keeping_up = keeping_up or arrival.at_s >= worked_until
         seen.append(tracker.observe([arrival.frame]))
         row: Track | None = online.add(seen[-1])
         if view is not None and row is not None:
             view.show(arrival.frame, row)
         worked_until = time.perf_counter()
-        if waited:
+        if keeping_up:
             latency.append(worked_until - arrival.at_s)
         progress(len(seen), None, "following")
     if view is not None:

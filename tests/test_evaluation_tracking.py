@@ -56,3 +56,14 @@ def test_recovery_counts_from_the_end_of_the_worst_occlusion():
 
 def test_a_row_that_never_finds_the_animal_has_only_that_to_say():
     assert figures([followed(np.full(N, np.nan))], [followed(np.zeros(N))], [[]], 40.0) == {"lost_rate": 1.0}
+
+
+def test_who_gives_up_frames_in_view_gains_nothing_by_it():
+    sure, shy = np.full(N, 4.0), np.full(N, 1.0)
+    shy[10:20] = np.nan
+    events = [Event("hidden", 10, 15)]
+    result = figures([followed(shy)], [followed(sure)], [events], 40.0)
+    # of 35 frames in view five have no pose, which is an error of 20 mm
+    assert result["in_view_ratio"] == pytest.approx((30 * 1.0 + 5 * 20.0) / 35 / 4.0)
+    assert result["in_view_p95_ratio"] == pytest.approx(5.0)
+    assert result["ratio_to_single"] == pytest.approx(0.25)

@@ -52,10 +52,16 @@ class Chain:
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
         self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend, tuning.tail])
 
-    def path(self, seen: Observations, told: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+    def joints(self, seen: Observations) -> NDArray[np.float32]:
+        """Positions (n, H, some, 3) mm of the joints that chains are told by."""
+        return seen.joints(self._joints)
+
+    def path(
+        self, seen: Observations, told: NDArray[np.int64] | None = None, joints: NDArray[np.float32] | None = None
+    ) -> NDArray[np.int64]:
         """(n,) the hypothesis of each frame that lies on the curve, or NONE.
 
-        told (m,): of the first m frames it is known already.
+        told (m,): of the first m frames it is known already; joints: those of `joints`, where they are at hand.
         """
         n, h = seen.score.shape
         emission = self._emission(seen)
@@ -65,8 +71,8 @@ class Chain:
         cost, parent = np.full((n, h), np.inf), np.full((n, h, 2), NONE, np.int64)
         live = np.zeros((_BEAM, 2), np.int64)
         n_live = kernels.extend_all(
-            0, n, live, 0, seen.seconds, seen.joints(self._joints), seen.error_mm, emission, idle, self._levels,
-            self._length, self._tuning.ceiling, cost, parent,
+            0, n, live, 0, seen.seconds, self.joints(seen) if joints is None else joints, seen.error_mm, emission, idle,
+            self._levels, self._length, self._tuning.ceiling, cost, parent,
         )  # fmt: skip
         path = np.full(n, NONE, np.int64)
         if n_live:
@@ -77,7 +83,7 @@ class Chain:
         """What each hypothesis (n, H) costs by itself."""
         return np.minimum(seen.score.astype(float) / self._score_mm, self._tuning.score_most)
 
-    def doubt(self, seen: Observations, path: NDArray[np.int64]) -> Array:
+    def doubt(self, seen: Observations, path: NDArray[np.int64], joints: NDArray[np.float32] | None = None) -> Array:
         """(n,) probability that head and tail are exchanged on this path: forward and backward through two states.
 
         What a frame says is the difference between its hypothesis and the same thing turned round; between frames, how
@@ -92,7 +98,7 @@ class Chain:
         doubt = np.zeros(len(path))
         if not len(used):
             return doubt
-        joints = seen.joints(self._joints)
+        joints = self.joints(seen) if joints is None else joints
         one, two = joints[used, path[used]], joints[used, path[used] ^ 1]
         two = np.where(np.isfinite(two), two, one[:, ::-1])
         error = seen.error_mm[used, path[used]].astype(float)

@@ -115,16 +115,18 @@ def _admitted(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], c
 
 
 def to_track(
-    subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array, ahead: bool = False
+    subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array, ahead: bool = False,
+    told: slice = slice(None),
 ) -> Track:  # fmt: skip
     """A curve as rows of a track: measured, bridged over a short time, or missing.
 
-    ahead: the curve also goes on for a short time after the last measurement.
+    ahead: the curve also goes on for a short time after the last measurement; told: only these rows.
     """
     skeleton = subject.skeleton
-    track = Track.empty(skeleton, seen.times_ns)
     measured = curve.used & (path >= 0)
-    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
+    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)[told]
+    measured, seen, path, curve, doubt = measured[told], seen[told], path[told], curve[told], doubt[told]
+    track = Track.empty(skeleton, seen.times_ns)
     there = measured | bridged
     pose, camera = curve.pose, subject.camera
     in_camera = subject.T_arena_camera.inverse() @ curve.joints[there]

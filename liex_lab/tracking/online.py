@@ -12,7 +12,8 @@ from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.track import Track
 from liex_lab.tracking.tuning import Tuning
 
-_WINDOW = 48  # frames that have a say in the present one
+# frames that have a say in which hypothesis is the animal, and before the one that is told in where exactly it is
+_WINDOW, _BEFORE = 48, 20
 
 
 class OnlineTracker:
@@ -29,6 +30,7 @@ class OnlineTracker:
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._joints: NDArray[np.float32] | None = None  # of the window's hypotheses, those that the chain goes by
 
     def add(self, seen: Observations) -> Track | None:
         """The rows that can be told once the next frames are known, None where there are none yet."""
@@ -47,19 +49,24 @@ class OnlineTracker:
     def _take(self, frame: Observations) -> None:
         """Move the window on by one frame."""
         joined = frame if self._seen is None else Observations.join([self._seen, frame])
+        joints = self._chain.joints(frame)
+        joints = joints if self._joints is None else np.concatenate([self._joints, joints])
         gone = max(0, len(joined) - _WINDOW)
-        self._seen, self._told = joined[gone:], self._told - gone
+        self._seen, self._joints, self._told = joined[gone:], joints[gone:], self._told - gone
         self._path = np.append(self._path[gone:], NONE)
 
     def _tell(self, n: int) -> Track:
         """The rows of the n frames after those that were told."""
         assert self._seen is not None
         seen, told = self._seen, self._told
-        path = self._chain.path(seen, self._path[:told])
+        path = self._chain.path(seen, self._path[:told], self._joints)
         self._path[told : told + n] = path[told : told + n]
+        doubt = self._chain.doubt(seen, path, self._joints)
+        first = max(0, told - _BEFORE)
+        if (path[first:] == NONE).all():  # what is known of the animal lies further back
+            first = 0
+        seen, path, doubt, told = seen[first:], path[first:], doubt[first:], told - first
         pose, error = seen.pose(path), seen.along(seen.error_mm, path)
         curve = smooth(self._subject.skeleton, seen.seconds, pose, error, self._subject.length_mm, self._motion)
-        doubt = self._chain.doubt(seen, path)
-        track = to_track(self._subject, seen, path, curve, doubt, ahead=True)
         self._told += n
-        return track[told : told + n]
+        return to_track(self._subject, seen, path, curve, doubt, ahead=True, told=slice(told, told + n))

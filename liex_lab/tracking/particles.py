@@ -26,7 +26,8 @@ _AVERAGING_PASSES = 10
 
 @dataclass(frozen=True)
 class Wander:
-    """What the paper leaves open: how far base joints wander, and how the metric weighs; lengths at home size.
+    """What the paper leaves open: how far base joints wander, and how the metric weighs; lengths of an animal of the
+    reference length.
 
     turn_rad and shift_mm: standard deviations of a Brownian step of delta_s, Eq. 6; sigma_mm of Eq. 12.
     """
@@ -36,6 +37,11 @@ class Wander:
     shift_mm: float = 4.0
     delta_s: float = 1.0 / 30.0
     sigma_mm: float = 2.0
+
+    @staticmethod
+    def of(name: str) -> Wander:
+        """That of an animal: a fish goes and turns three times as far, by its length, between two frames of a mouse."""
+        return Wander(turn_rad=0.45, shift_mm=12.0) if name == "fish" else Wander()
 
 
 @dataclass
@@ -60,7 +66,7 @@ class ParticleFilter:
         how: Wander | None = None,
     ) -> None:  # fmt: skip
         self._estimator, self._scene, self._size, self._rng = estimator, scene, size, rng
-        self._how = how or Wander()
+        self._how = how or Wander.of(estimator.skeleton.name)
         self._particles: _Particles | None = None
         self._last_ns = 0
 

@@ -38,7 +38,8 @@ class Motion:
     and up; place_fade s. turn: of the base's rotation, about its own x, y and z axis; bend: of the other joints' angles
     about theirs; size: of the logarithm of the bones' scale. freedom of the t distribution of errors; reject: off by
     more than this many predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
-    have in common and no smoother takes away; honest: what is left of an error over what the filter says is left.
+    have in common and no smoother takes away; honest: what is left of an error over what the filter says is left, at
+    some of the latter over the animal's length (pairs, in rising order; between them by the logarithm).
     """
 
     place_error: tuple[float, float, float]
@@ -50,7 +51,7 @@ class Motion:
     freedom: float
     reject: float
     lasting: float
-    honest: float
+    honest: tuple[tuple[float, float], ...]
 
     @property
     def packed(self) -> kernels.Moves:
@@ -156,5 +157,9 @@ def _curve(
         for left, group in ((spread.turn, moves.turn), (spread.bend, moves.bend))
     )
     pose = Pose(SE3(made.rotation, made.place), made.angles, np.exp(made.log_scale))
-    error = motion.honest * np.sqrt(lasting**2 + relative)
-    return Curve(pose, made.joints, error, motion.honest * sd_middle, motion.honest * turn, motion.honest * bend, used)
+    error = np.sqrt(lasting**2 + relative)
+    honest = np.interp(
+        np.log(error / length_mm), *np.array([(np.log(said), factor) for said, factor in motion.honest]).T
+    )
+    each = honest[:, None]
+    return Curve(pose, made.joints, honest * error, each * sd_middle, each * turn, each * bend, used)

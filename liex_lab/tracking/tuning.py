@@ -42,11 +42,12 @@ class Tuning:
         motion["size"] = Wandering(*motion["size"])
         for name in ("place_error", "place_drive"):
             motion[name] = tuple(motion[name])
+        motion["honest"] = tuple((said, factor) for said, factor in motion["honest"])
         return Tuning(ChainTuning(**table["chain"]), Motion(**motion))
 
     def to_toml(self, name: str) -> str:
         """Its table in TOML."""
-        lines = [f"[{name}.chain]", *(f"{key} = {value:.4g}" for key, value in asdict(self.chain).items())]
+        lines = [f"[{name}.chain]", *(f"{key} = {_text(value)}" for key, value in asdict(self.chain).items())]
         lines += ["", f"[{name}.motion]"]
         for key, value in asdict(self.motion).items():
             rows = [list(row.values()) for row in value] if key in ("turn", "bend") else value
@@ -57,4 +58,4 @@ class Tuning:
 
 def _text(value: Any) -> str:
     """A number, or lists of them, in TOML."""
-    return f"[{', '.join(map(_text, value))}]" if isinstance(value, list | tuple) else f"{value:.4g}"
+    return f"[{', '.join(map(_text, value))}]" if isinstance(value, list | tuple) else repr(float(f"{value:.4g}"))

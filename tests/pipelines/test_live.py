@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 
 import numpy as np
 import pytest
+from liex_lab.pipelines.evaluate_live import _to_and_fro
 from liex_lab.pipelines.live import follow_live, open_live
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.arriving import growing, received, replayed
+from liex_lab.recordings.arriving import Arrival, _stamped, growing, received, replayed
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 
 ADDRESS = "synthetic:walk?seed=3&frames=24&sensor=primesense-qvga&spine_mm=70"
@@ -81,3 +84,38 @@ def test_where_nobody_sends_or_writes_that_is_said():
 
     with pytest.raises(RecordingError, match="no such file"):
         growing(nothing, patience_s=0.1)
+
+
+def test_what_does_not_greet_as_a_sender_does_is_told_apart():
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def hang_up() -> None:
+        with server, server.accept()[0] as link:
+            link.sendall(b"HTTP/1.1 400 Bad Request")
+
+    thread = threading.Thread(target=hang_up)
+    thread.start()
+    with pytest.raises(RecordingError, match="does not send depth frames"):
+        received("127.0.0.1", server.getsockname()[1])
+    thread.join()
+
+
+def test_a_first_frame_that_is_long_in_the_making_ends_nothing(monkeypatch):
+    monkeypatch.setattr("liex_lab.recordings.arriving._GREETING_S", 0.2)
+    whole = open_recording(ADDRESS)
+
+    def read(index: int) -> np.ndarray:
+        if index == 0:
+            time.sleep(0.5)
+        return whole.frame(index).depth
+
+    slow = Recording(name="slow", format="test", camera=whole.camera, times_ns=whole.times_ns[:5].copy(), read=read)
+    came = list(replayed(slow, speed=4.0).frames)
+    assert [arrival.frame.index for arrival in came] == list(range(5))
+    assert came[-1].at_s - came[0].at_s > 0.8 * slow.duration_s / 4.0, "nor is its pace lost"
+
+
+def test_frames_go_to_and_fro_and_keep_the_time_when_they_came():
+    frames = [Arrival(DepthFrame(k, k, np.zeros((2, 2), np.float32)), at) for k, at in enumerate((0.0, 0.1, 0.2))]
+    assert [_to_and_fro(k, 3) for k in range(8)] == [0, 1, 2, 2, 1, 0, 0, 1]
+    assert [arrival.at_s for arrival in _stamped(iter(frames))] == [0.0, 0.1, 0.2]

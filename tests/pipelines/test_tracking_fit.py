@@ -1,0 +1,70 @@
+"""`liex train tracking`: numbers that are changed are kept where tracks come nearer to the truth."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.tracking_fit import Seen, changed, honesty, search
+
+from liex_lab.recordings.hazards import Event
+from liex_lab.tracking.curve import track_whole
+from liex_lab.tracking.tuning import Tuning
+from tests.tracking.stories import MOUSE, SUBJECT, noisy, told, walk
+
+SECONDS = np.arange(80) / 30.0
+
+
+@pytest.fixture(scope="module")
+def measured() -> list[Seen]:
+    truth = walk(SECONDS)
+    made = []
+    for kind, seed, sd_mm in (("easy", 1, 0.8), ("hard", 2, 2.0)):
+        seen = told(SECONDS, noisy(truth, np.random.default_rng(seed), sd_mm))
+        made.append(Seen(kind, seen, SUBJECT, truth.joints(MOUSE), [Event("hidden", 10, 12)]))
+    return made
+
+
+def error(measured: list[Seen], tuning: Tuning) -> float:
+    tracks = [track_whole(each.subject, each.seen, (), tuning).track for each in measured]
+    return float(np.mean([each.errors(track.joints_mm).mean() for each, track in zip(measured, tracks, strict=True)]))
+
+
+def flat(value: object) -> list[float]:
+    if isinstance(value, dict):
+        return [x for each in value.values() for x in flat(each)]
+    if isinstance(value, list | tuple):
+        return [x for each in value for x in flat(each)]
+    return [float(value)]  # type: ignore[arg-type]
+
+
+def test_one_number_is_changed_at_a_time_and_none_of_those_that_are_found_otherwise():
+    rng, tuning = np.random.default_rng(0), Tuning.of("mouse")
+    for _ in range(60):
+        other = changed(tuning, rng)
+        before, after = flat(asdict(tuning)), flat(asdict(other))
+        assert sum(a != b for a, b in zip(before, after, strict=True)) == 1
+        assert other.motion.honest == tuning.motion.honest
+        assert other.chain.ceiling == tuning.chain.ceiling
+
+
+def test_a_search_mends_what_was_set_wrong(measured):
+    good = Tuning.of("mouse")
+    bad = replace(good, motion=replace(good.motion, reject=0.6))
+    found = search(measured, bad, 40, np.random.default_rng(3))
+    assert error(measured, found) < 0.9 * error(measured, bad)
+    assert search(measured, good, 0, np.random.default_rng(3)) == good
+
+
+def test_an_honest_track_covers_nine_in_ten(measured):
+    wrong = replace(Tuning.of("mouse").motion, honest=((0.03, 0.3),))
+    tuning = Tuning(Tuning.of("mouse").chain, wrong)
+    knots = honesty(measured, tuning)
+    assert [said for said, _ in knots] == sorted(said for said, _ in knots)
+    assert [factor for _, factor in knots] == sorted(factor for _, factor in knots)
+    mended, off = replace(tuning, motion=replace(wrong, honest=knots)), []
+    for each in measured:
+        track = track_whole(each.subject, each.seen, (), mended).track
+        off.append((np.abs(track.joints_mm - each.truth) / track.sd_mm[..., None]).ravel())
+    assert 0.85 < np.mean(np.concatenate(off) < 1.645) < 0.96
