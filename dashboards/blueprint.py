@@ -30,29 +30,38 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     """A Rerun blueprint from the content of session.json; handed to `Session.create` as `blueprint`."""
     import rerun.blueprint as rrb
 
+    from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
+
+    # with corrections, what they are made of is left out of the views, but is still there to be looked at
+    corrected = bool(session.get("corrections"))
+    at = corrected_entity if corrected else str
+    measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []
     body_m = float(session["animal"].get("spine_mm") or session["animal"]["home_length_mm"]) / 1000.0
     scene = rrb.Spatial3DView(
         origin="arena",
-        contents=["$origin/**", "- /arena/camera/image/overlay/**"],
+        contents=["$origin/**", f"- /{OVERLAY}/**", f"- /{corrected_entity(OVERLAY)}/**",
+                  *(f"- /arena/{name}/**" for name in measured)],
         name="3D: the animal, followed (metres)",
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
             position=body_m * np.array([0.8, -2.6, 2.2]),
             look_target=[0.0, 0.0, 0.0],
             eye_up=[0.0, 0.0, 1.0],
-            tracking_entity="/arena/skeleton/joints",
+            tracking_entity=f"/{at(SKELETON)}/joints",
         ),
         line_grid=rrb.LineGrid3D(visible=False),
     )
     picture = rrb.Spatial2DView(
-        origin="arena/camera/image", contents=["$origin/**"], name="depth with the fitted skeleton"
+        origin="arena/camera/image",
+        contents=["$origin/**", *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected)],
+        name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
-    lanes = rrb.StateTimelineView(origin="ethogram", name="actions (predicted) and frames to distrust (tracking)")
+    lanes = rrb.StateTimelineView(origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)")
     swims = session["animal"]["joints"][0] == "head"
     shown = ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
     curves = rrb.Horizontal(
-        *(rrb.TimeSeriesView(origin=f"kinematics/{name}", name=_NAMES[name]) for name in shown),
-        rrb.TimeSeriesView(origin="error/predicted", name="predicted error"),
+        *(rrb.TimeSeriesView(origin=at(f"kinematics/{name}"), name=_NAMES[name]) for name in shown),
+        rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),
         rrb.TextLogView(origin="log", name="what to look at: click to jump there"),
         column_shares=[*(2.0 for _ in shown), 2.0, 1.6],
     )

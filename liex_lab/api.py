@@ -71,10 +71,12 @@ def correct_session(
     what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`, everything is made
     again. author: "" takes who is logged in. What was measured stays as it is; see `liex_lab.sessions.corrections`.
     """
+    from liex_lab.dashboards.blueprint import replay_blueprint
     from liex_lab.dashboards.views import write_views
     from liex_lab.pipelines.correct import correct_session as job
 
-    return job(session, what, undo=undo, author=author, report=write_views, progress=progress)
+    return job(session, what, undo=undo, author=author, blueprint=replay_blueprint, report=write_views,
+               progress=progress)  # fmt: skip
 
 
 def follow_live(

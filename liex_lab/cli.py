@@ -465,7 +465,7 @@ def show(
 ) -> None:
     """Open a session's replay in Rerun."""
     from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, show_replay
+    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
 
     replay = Session.open(session).path / "session.rrd"
     if at_s is not None:
@@ -478,7 +478,8 @@ def show(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
-    command = [sys.executable, "-m", "rerun", str(replay), "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
+    shown = [str(file) for file in replays_with(replay)]
+    command = [sys.executable, "-m", "rerun", *shown, "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
 
 

@@ -14,7 +14,7 @@ from liex_lab.pipelines.session import measure_behaviour
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
-from liex_lab.sessions.corrections import FOLDER, LOG, BoutEdit, Correction, Log, basis, read_log
+from liex_lab.sessions.corrections import FOLDER, LOG, REPLAY, BoutEdit, Correction, Log, basis, read_log
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Session
     from liex_lab.sessions.applying import CorrectedTrack
     from liex_lab.sessions.results import Results
-    from liex_lab.sessions.writer import ReportMaker
+    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
 _BUSY = ".correcting"
 _AS_BEFORE = ("kinematics", "zones")  # tables that edits of bouts do not change
@@ -35,6 +35,7 @@ def correct_session(
     *,
     undo: Sequence[int] = (),
     author: str = "",
+    blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
@@ -63,7 +64,7 @@ def correct_session(
         try:
             if log.standing:
                 progress(0, None, "measuring what was corrected")
-                log = _apply(raw, log, part)
+                log = _apply(raw, log, part, blueprint)
             (part / LOG).write_text(log.to_json(), encoding="utf-8")
             _put(part)
         finally:
@@ -74,13 +75,16 @@ def correct_session(
     return raw.path
 
 
-def _apply(raw: Session, log: Log, folder: Path) -> Log:
-    """Write the tables that are others than the session's own; returns the log that lists them."""
+def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | None) -> Log:
+    """Write the tables that are others than the session's own, and a replay to be shown with the session's own; returns
+    the log that lists them.
+    """
     from liex_lab.sessions.applying import corrected_track
     from liex_lab.sessions.evidence import provenance_of
     from liex_lab.sessions.place import file_facts
     from liex_lab.sessions.results import Results
     from liex_lab.sessions.rows import Rows
+    from liex_lab.sessions.rrd import ReplayWriter
     from liex_lab.sessions.tracks import skeleton_of
 
     skeleton = skeleton_of(raw)
@@ -97,7 +101,12 @@ def _apply(raw: Session, log: Log, folder: Path) -> Log:
         written = {name: table for name, table in written.items() if name not in _AS_BEFORE}
     results.write_measured(folder, written, behaviour.vocabulary.columns)
     facts |= {"corrections": _told(log), "actions": dict(behaviour.actions)}
-    return replace(log, files=file_facts(folder, {}), facts=facts)
+    replay = folder / REPLAY
+    made = blueprint({**raw.metadata, **facts}) if blueprint is not None else None
+    ReplayWriter(replay, origin, made, corrected=True).finish(
+        rows, behaviour.kinematics, behaviour.bouts, list(behaviour.actions), ()
+    )
+    return replace(log, files=file_facts(folder, {REPLAY: replay}), facts=facts)
 
 
 def _told(log: Log) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def _corrections(session: Session) -> Iterator[Finding]:
     if not wrong:
         authors = ", ".join(sorted({entry.author for entry in log.standing}))
         told = f"{len(log.standing)} corrections ({authors}) stand beside it"
-        yield Finding("ok", f"{told}, and their {len(log.files)} tables are as they were written")
+        yield Finding("ok", f"{told}, and their {len(log.files)} files are as they were written")
 
 
 def _logs(session: Session) -> Iterator[Finding]:

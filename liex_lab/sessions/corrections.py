@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
 
-FOLDER, LOG = "corrected", "corrections.json"
+FOLDER, LOG, REPLAY = "corrected", "corrections.json", "corrected.rrd"
 SCHEMA_VERSION = 1
 FACTS = {"frames", "actions", "action_model", "unresolved_actions", "corrections"}  # sections that may change
 EDITS = ("add", "rename", "recut", "delete")

@@ -55,18 +55,24 @@ _BONE, _JOINT = [255, 255, 255, 255], [255, 80, 60, 255]
 
 
 class ReplayWriter:
-    """Writes `session.rrd`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`."""
+    """Writes `session.rrd`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`.
 
-    def __init__(self, path: Path, origin: Provenance, blueprint: Any = None) -> None:
+    corrected: a replay of what people corrected, to be shown with that one: it has neither depth nor the scene, and its
+    own entities (see `corrected_entity`).
+    """
+
+    def __init__(self, path: Path, origin: Provenance, blueprint: Any = None, *, corrected: bool = False) -> None:
         self._origin = origin
         self._first_ns: int | None = None
-        self._stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
-        self._stream.set_log_time_enabled(False)
+        stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
+        stream.set_log_time_enabled(False)
+        self._stream: Any = _Renamed(stream) if corrected else stream
         self._path, self._n_sent, self._checked, self._n_found = path, 0, 0, 0
         self._stream.save(path)
         if blueprint is not None:
             self._stream.send_blueprint(blueprint)
-        self._log_scene()
+        if not corrected:
+            self._log_scene()
 
     def go_on(self, first_ns: int) -> None:
         """The file continues another one, whose first frame was at `first_ns`."""
@@ -296,6 +302,30 @@ class ReplayWriter:
         elapsed = np.rint(np.array(times) * 1e9).astype(np.int64)
         self._stream.send_columns(entity, _timeline(np.array(frames), elapsed),
                                   [*rr.StateChange.columns(state=list(words))])  # fmt: skip
+
+
+def corrected_entity(entity: str) -> str:
+    """Where the replay of corrections keeps what the session's own keeps at `entity`: below the same camera."""
+    for above in (f"{IMAGE}/", "arena/"):
+        if entity.startswith(above):
+            return f"{above}corrected/{entity.removeprefix(above)}"
+    return f"corrected/{entity}"
+
+
+class _Renamed:
+    """A Rerun stream whose entities are those of corrections."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._to = stream
+
+    def log(self, entity: str, *what: Any, **how: Any) -> None:
+        self._to.log(corrected_entity(entity), *what, **how)
+
+    def send_columns(self, entity: str, *what: Any, **how: Any) -> None:
+        self._to.send_columns(corrected_entity(entity), *what, **how)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._to, name)
 
 
 def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:

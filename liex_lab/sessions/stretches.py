@@ -59,9 +59,8 @@ class StretchWriter:
         shutil.rmtree(self._folder, ignore_errors=True)
         (self._folder / _SEEN).mkdir(parents=True)
         self._seen = Columns(self._folder / _SEEN)
-        self._replay, self._mcap = (
-            kind(self._folder / log, origin) for kind, log in zip((ReplayWriter, McapWriter), LOGS, strict=True)
-        )
+        replay, messages = (self._folder / log for log in LOGS)
+        self._replay, self._mcap = ReplayWriter(replay, origin), McapWriter(messages, origin)
         if first_ns is not None:
             self._replay.go_on(first_ns)
 

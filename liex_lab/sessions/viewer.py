@@ -39,6 +39,18 @@ def has_screen() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+def replays_with(replay: Path) -> list[Path]:
+    """What is opened for a session's replay: where there are corrections theirs first, for the first layout holds."""
+    from liex_lab.sessions.corrections import REPLAY
+    from liex_lab.sessions.session import Session
+
+    try:
+        corrected = Session.open(replay.parent).file(REPLAY)
+    except LiexError:  # a replay that lies somewhere by itself
+        return [replay]
+    return [corrected, replay] if corrected.is_file() else [replay]
+
+
 def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     """Open a .rrd in a window at a time, s since its first frame.
 
@@ -58,7 +70,8 @@ def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     while time.monotonic() < ends and process.poll() is None:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            client.open(str(replay.resolve()))
+            for file in replays_with(replay):
+                client.open(str(file.resolve()))
             client.set_time("time", duration=at_s, play_state="paused")
             return Shown(process, client)
         except Exception as error:  # not up yet; what it raises then is not documented

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes.util
 import importlib.util
+import shutil
 import socket
 import time
 from pathlib import Path
@@ -13,7 +14,9 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.blueprint import replay_blueprint
 
+from liex_lab.api import correct_session
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import joint_move
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(2.0), speed_mm_s=220.0)
@@ -94,3 +97,24 @@ def test_the_skeleton_moved_as_the_track_says(pictures, session: Session) -> Non
     assert cosine > 0.995
     assert np.linalg.norm(seen) > 60.0
 
+
+
+def test_what_was_corrected_is_shown_in_place_of_what_was_measured(session: Session, tmp_path: Path) -> None:
+    from liex_lab.sessions.viewer import show_replay
+
+    folder = Path(shutil.copytree(session.path, tmp_path / session.path.name))
+    place = session.poses.loc[MOMENTS[0] * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float) + np.array([0, 0, 30.0])
+    correct_session(folder, [joint_move(session, MOMENTS[0], "nose", place)])
+    shown = show_replay(folder / "session.rrd", MOMENTS[0] / 30, headless=True)
+    try:
+        ends, origins = time.monotonic() + 20.0, set[str]()
+        while time.monotonic() < ends and "/corrected/kinematics/speed_mm_s" not in origins:
+            time.sleep(0.5)
+            views = shown.client.get_state().views
+            origins = {view.origin for view in views}
+        assert {"/corrected/ethogram", "/corrected/kinematics/speed_mm_s"} <= origins
+        assert not [report for view in views for report in view.reports]
+        (recording,) = shown.client.get_state().recordings
+        assert recording.timelines, "both files are one recording"
+    finally:
+        shown.close()
