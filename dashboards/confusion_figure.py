@@ -29,7 +29,7 @@ def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
         panels[k].set_title(f"{title}: {share:.1%} ({100 * low:.1f} to {100 * high:.1f})", fontsize=9)
         _matrix(panels[k], np.asarray(result["confusion"][name], float), words, first=k == 0)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=_DPI)
+    figure.savefig(path, dpi=_DPI, bbox_inches="tight")
     return path
 
 

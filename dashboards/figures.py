@@ -21,7 +21,8 @@ WIDTH, LEFT, RIGHT = 920, 116, 22  # shared by all figures over time, so that th
 ARENA = "the arena"  # the outline that needs no name
 _MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
-ACTION_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933")
+ACTION_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933",
+                  "#EE8866", "#44BB99", "#882255")  # fmt: skip
 _VIRIDIS = np.array(
     [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
      [170, 220, 50], [253, 231, 37]], float

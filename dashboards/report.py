@@ -220,7 +220,17 @@ def methods(session: Session) -> list[str]:
     )
     if undone := _optics(session):
         first += f" {undone[0].upper()}{undone[1:]}."
-    return [first, *_behaviour_methods(session)]
+    return [first, *_by_hand(session), *_behaviour_methods(session)]
+
+
+def _by_hand(session: Session) -> list[str]:
+    """What people corrected, as a methods section has to say it."""
+    told = session.metadata.get("corrections")
+    if not told:
+        return []
+    kinds = {"flip": "head and tail exchanged over a stretch", "joint": "joints placed", "bout": "edits of bouts"}
+    parts = ", ".join(f"{text}: {told[kind]}" for kind, text in kinds.items() if told.get(kind))
+    return [f"After measurement, {told['n']} corrections were made by hand by {', '.join(told['authors'])} ({parts})."]
 
 
 def _behaviour_methods(session: Session) -> list[str]:

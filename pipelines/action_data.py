@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
 from liex_lab.pipelines.acted import Scenario
 
 from liex_lab.recordings import fish_acts, mouse_acts
@@ -20,6 +21,7 @@ _TRAIN_FISH, _TEST_FISH = (101, 102, 103, 104, 105), (106, 107)
 _TRAIN_SET, _TEST_SET = tuple(range(201, 225)), tuple(range(301, 307))
 _FAST_SET = {"fish": tuple(range(225, 233))}
 _SECONDS, _FAST_SECONDS = 40.0, 20.0
+_TEST_SECONDS = 300.0  # of a test recording, about: fewer minutes are fewer of the same recordings
 _FAST_SHARE = 1.0 / 6.0  # of every test recording is filmed by a faster camera as well
 
 
@@ -48,8 +50,9 @@ def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
     """Uncut recordings, so many minutes in all, of individuals whose traits no other has; fast: the beginnings of the
     same ones, by a faster camera.
     """
-    seconds = 60.0 * minutes / len(_TEST_SET)
-    usual = [Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET]
+    n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
+    seconds = 60.0 * minutes / n
+    usual = [Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET[:n]]
     return [replace(one, rate_hz=FAST_HZ, filmed_s=_FAST_SHARE * seconds) for one in usual] if fast else usual
 
 

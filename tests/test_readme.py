@@ -47,8 +47,8 @@ def test_the_list_of_columns_is_the_columns_own() -> None:
 def test_every_verb_and_every_setting_exists() -> None:
     verbs = re.findall(r"^\| `(\w+)", section("The verbs"), re.MULTILINE)[1:]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
-    known = "cohort compare convert correct dashboard demo doctor evaluate export info live run show suggest train "
-    known += "verify"
+    known = "cohort compare convert correct dashboard demo doctor evaluate export info live report run show suggest "
+    known += "train verify"
     assert sorted(verbs) == sorted(known.split())
     assert all(verb in told for verb in verbs)
     plan = tomllib.loads(re.sub(r"^# (\w+) =$", r"\1 = 0", Plan.load("mouse").to_toml(), flags=re.MULTILINE))

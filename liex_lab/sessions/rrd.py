@@ -46,7 +46,8 @@ _BLOCK = 8192  # frames of small things sent in one go
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
 # Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
-PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xDDCC77)
+PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xEE8866,
+           0x44BB99, 0x882255)  # fmt: skip
 _FLAG_COLOURS = {"doubtful": 0xCCBB44, "not_found": 0xEE6677, "no_depth": 0xBBBBBB, "corrected": 0x4477AA}
 _WALL, _WORST = 0x9AA0A6, 12
 _HOLDS_95 = 2.795  # standard deviations of a Gaussian in space

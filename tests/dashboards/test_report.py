@@ -203,5 +203,6 @@ def test_a_session_without_any_pose_has_a_report_too(tmp_path):
 
 
 def test_the_replay_and_the_report_give_an_action_the_same_colour():
-    for k in range(len(figures.ACTION_COLOURS)):
+    assert len(figures.ACTION_COLOURS) == len(PALETTE)
+    for k in range(len(PALETTE)):
         assert int(figures.action_colour(k)[1:], 16) == PALETTE[k]
