@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote
 
-from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_update
-from liex_lab.dashboards import app_groups, app_session, app_study, app_tables
+from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc, html
+from liex_lab.dashboards import app_correct, app_groups, app_session, app_study, app_tables
+from liex_lab.dashboards.app_correct import Correct
 from liex_lab.dashboards.app_data import StudyData
 from liex_lab.dashboards.app_frames import Frames
 from liex_lab.dashboards.app_guard import LOOPBACK, add_downloads, guard
@@ -32,10 +33,13 @@ _POLICY = (
 )
 
 
-def make_app(data: StudyData, *, token: str = "", show_replay: ShowReplay | None = None) -> Dash:
+def make_app(
+    data: StudyData, *, token: str = "", show_replay: ShowReplay | None = None, correct: Correct | None = None
+) -> Dash:
     """The dashboard of a study, not yet served. token: what every visitor has to know; empty on this machine alone.
 
     show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the command is shown.
+    correct: adds corrections to the session in a folder, or takes some back; None: the pages only show.
     """
     app = Dash(
         "liex_lab_dashboard", assets_folder=str(_ASSETS), serve_locally=True, suppress_callback_exceptions=True,
@@ -43,10 +47,12 @@ def make_app(data: StudyData, *, token: str = "", show_replay: ShowReplay | None
         compress=False,
     )  # fmt: skip
     app.layout = _shell(data)
-    _register(app, data, may_show=show_replay is not None)
+    _register(app, data, may_show=show_replay is not None, may_correct=correct is not None)
     app_study.register(app, data)
     app_groups.register(app, data)
     app_session.register(app, data, Frames(), show_replay)
+    if correct is not None:
+        app_correct.register(app, data, correct)
     hashes: list[str] = []
 
     def policy() -> str:
@@ -98,7 +104,7 @@ def _shell(data: StudyData) -> html.Div:
     ])  # fmt: skip
 
 
-def _page(data: StudyData, path: str, search: str, may_show: bool) -> list[Any]:
+def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
     try:
         if path in ("", "/"):
             return app_study.sessions_page(data)
@@ -110,7 +116,7 @@ def _page(data: StudyData, path: str, search: str, may_show: bool) -> list[Any]:
             key = unquote(path.removeprefix("/session/"))
             if key not in {entry.key for entry in data.done}:
                 return app_session.failed_page(data, key)
-            return app_session.session_page(data, key, _moment(search), may_show=may_show)
+            return app_session.session_page(data, key, _moment(search), correcting="corrections=" in search, **may)
     except LiexError as error:
         return [html.H1("This cannot be shown"), html.P(str(error))]
     return [html.H1("No such page"), html.P(dcc.Link("Sessions", href="/"))]
@@ -124,7 +130,7 @@ def _moment(search: str) -> float:
     return at_s if 0.0 <= at_s < 1e9 else 0.0
 
 
-def _register(app: Dash, data: StudyData, *, may_show: bool) -> None:
+def _register(app: Dash, data: StudyData, **may: bool) -> None:
     """The pages themselves, and the sorting and filtering of every table."""
 
     @app.callback(
@@ -134,26 +140,21 @@ def _register(app: Dash, data: StudyData, *, may_show: bool) -> None:
     def route(path: str | None, search: str | None, tabs: list[dict[str, str]]) -> tuple[Any, list[str]]:
         here = "/" if (path or "/").startswith("/session") else path or "/"
         marks = ["here" if tab["href"] == here else "" for tab in tabs]
-        return _page(data, path or "/", search or "", may_show), marks
+        return _page(data, path or "/", search or "", **may), marks
 
     @app.callback(
-        Output({"part": "order", "table": MATCH}, "data"),
-        Input({"part": "sort", "table": MATCH, "column": ALL}, "n_clicks"),
-        State({"part": "order", "table": MATCH}, "data"), prevent_initial_call=True,
-    )  # fmt: skip
-    def sort(n_clicks: list[int], order: dict[str, Any]) -> Any:
-        if not any(n_clicks) or not isinstance(ctx.triggered_id, dict):
-            return no_update
-        column = ctx.triggered_id["column"]
-        return {"column": column, "down": order["column"] == column and not order["down"]}
-
-    @app.callback(
-        Output({"part": "rows", "table": MATCH}, "children"),
+        Output({"part": "cells", "table": MATCH}, "data"),
         Input({"part": "filter", "table": MATCH}, "value"), Input({"part": "order", "table": MATCH}, "data"),
         State({"part": "filter", "table": MATCH}, "id"),
     )  # fmt: skip
     def fill(words: str | None, order: dict[str, Any], asked: dict[str, str]) -> Any:
+        name = asked["table"]
         try:
-            return app_tables.fill(asked["table"], app_tables.find(data, asked["table"]), words or "", order)
+            return app_tables.fill(name, app_tables.find(data, name), words or "", order)
         except LiexError as error:
-            return html.P(str(error))
+            return app_tables.sentence(name, str(error))
+
+    app.clientside_callback(
+        ClientsideFunction("liex", "draw"), Output({"part": "rows", "table": MATCH}, "className"),
+        Input({"part": "cells", "table": MATCH}, "data"),
+    )  # fmt: skip

@@ -6,7 +6,9 @@ from typing import Any
 
 from dash import dcc, html
 
-_GRAPH = {"displaylogo": False, "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"], "responsive": True}
+# Plotly's toolbar has a button that sends the figure to its makers: it is taken out, and has no address to send it to
+_GRAPH = {"displaylogo": False, "responsive": True, "showSendToCloud": False, "plotlyServerURL": "",
+          "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d", "sendDataToCloud"]}  # fmt: skip
 
 
 def aria(**names: str) -> dict[str, Any]:

@@ -249,6 +249,8 @@ def frame_picture(
         y += [uv[a, 1], uv[b, 1], None]
     fill = ["#ffffff"] * (len(uv) - 1) + [RED]
     data = [
+        {"type": "heatmap", "z": np.zeros((h, w), np.uint8), "x0": left, "dx": 1, "y0": top, "dy": 1, "opacity": 0,
+         "showscale": False, "hoverinfo": "none"},  # so that every pixel can be clicked
         {"type": "scatter", "mode": "lines", "x": x, "y": y, "line": {"color": "#fff", "width": 2},
          "hoverinfo": "skip"},
         {"type": "scatter", "mode": "markers", "x": uv[:, 0], "y": uv[:, 1], "text": [text(name) for name in names],
@@ -257,7 +259,7 @@ def frame_picture(
     ]  # fmt: skip
     hidden = {"showgrid": False, "zeroline": False, "showticklabels": False, "ticks": ""}
     return {"data": data, "layout": _layout(
-        380, images=[picture], showlegend=False, margin={"l": 4, "r": 4, "t": 4, "b": 4},
+        380, images=[picture], showlegend=False, hoverdistance=5, margin={"l": 4, "r": 4, "t": 4, "b": 4},
         xaxis={**hidden, "range": [left - 0.5, left + w - 0.5], "constrain": "domain"},
         yaxis={**hidden, "range": [top + h - 0.5, top - 0.5], "scaleanchor": "x", "constrain": "domain"},
     )}  # fmt: skip

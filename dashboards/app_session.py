@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 from dash import ALL, Dash, Input, Output, Patch, State, ctx, dcc, html, no_update
+from liex_lab.dashboards import app_correct
 from liex_lab.dashboards import app_plots as plots
 from liex_lab.dashboards.app_data import StudyData, shown_words
 from liex_lab.dashboards.app_frames import Frames
@@ -34,8 +35,10 @@ _MOVED = (("speed_mm_s", "speed", "mm/s"), ("heading_rad", "heading", "rad"), ("
           ("bend_rad", "bend", "rad"), ("tail_beat_hz", "tail beat", "Hz"), ("length_mm", "length", "mm"))  # fmt: skip
 
 
-def session_page(data: StudyData, key: str, at_s: float, *, may_show: bool) -> list[Any]:
-    """A session at a moment (s since its first frame)."""
+def session_page(
+    data: StudyData, key: str, at_s: float, *, may_show: bool, may_correct: bool, correcting: bool = False
+) -> list[Any]:
+    """A session at a moment (s since its first frame). correcting: the form for corrections is open."""
     session, one = data.session(key), data.ethograms([key])[key]
     entry, curves = data.entries[key], traces(session)
     words = shown_words([one])
@@ -67,6 +70,7 @@ def session_page(data: StudyData, key: str, at_s: float, *, may_show: bool) -> l
             html.Div([graph("around", plots.empty("Reading the frames ...", 380), "curves around the moment"),
                       _replay(may_show)]),
         ]),
+        *([app_correct.panel(session, correcting)] if may_correct else []),
         html.H2("Bouts"), block(f"bouts/{key}", "Bouts of the session"),
         *_more(data, key, session),
     ]  # fmt: skip
@@ -163,11 +167,11 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
     @app.callback(
         Output("moment", "value"),
         Input("whole", "clickData"), Input("around", "clickData"),
-        Input({"part": "step", "by": ALL, "to": ALL}, "n_clicks"), Input({"part": "moment", "at": ALL}, "n_clicks"),
+        Input({"part": "step", "by": ALL, "to": ALL}, "n_clicks"),
         State("moment", "value"), State("session-key", "data"), State("session-unit-s", "data"),
         prevent_initial_call=True,
     )  # fmt: skip
-    def move(whole: Any, around: Any, _steps: Any, _rows: Any, at_s: float | None, key: str, unit_s: float) -> Any:
+    def move(whole: Any, around: Any, _steps: Any, at_s: float | None, key: str, unit_s: float) -> Any:
         asked = ctx.triggered_id
         if not ctx.triggered[0]["value"]:
             return no_update
@@ -175,8 +179,6 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
             return round(float(whole["points"][0]["x"]) * unit_s, 4)
         if asked == "around":
             return round(float(around["points"][0]["x"]), 4)
-        if asked["part"] == "moment":
-            return float(asked["at"])
         return round(moved_to(data.session(key), at_s or 0.0, asked["by"], int(asked["to"])), 4)
 
     @app.callback(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -78,7 +79,7 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
     rows = table.rows
     wanted = words.lower().split()
     if wanted and len(rows):
-        texts = [rows[name].astype(str).str.lower() for name in table.shown if name in rows]
+        texts = [rows[name].map(_searched) for name in table.shown if name in rows]
         lines = texts[0]
         for more in texts[1:]:
             lines = lines + "\n" + more
@@ -86,6 +87,11 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
     if column in rows:
         rows = rows.sort_values(column, ascending=not down, kind="stable", na_position="last")
     return rows
+
+
+def _searched(value: Any) -> str:
+    """What a cell is found by: its value, and of a state the word that is shown."""
+    return f"{value} {STATES.get(str(value), '')}".lower()
 
 
 def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
@@ -103,7 +109,8 @@ def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
     return html.Div(className="table-block", children=[
         html.Div(tools, className="tools"),
         dcc.Store(id={"part": "order", "table": name}, data={"column": "", "down": False}),
-        html.Div(id={"part": "rows", "table": name}, className="scroll", role="region", tabIndex=0,
+        dcc.Store(id={"part": "cells", "table": name}),
+        html.Div(id={"part": "rows", "table": name}, className="scroll", role="region", tabIndex="0",
                  **aria(label=caption)),
     ])  # fmt: skip
 
@@ -113,27 +120,30 @@ def csv_address(name: str) -> str:
     return f"/csv/{quote(name, safe='')}.csv"
 
 
-def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> list[Any]:
-    """The table itself, with a button in every heading that sorts by it."""
+def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str, Any]:
+    """What the page's script draws: headings that sort, cells as texts with what they are, and how many rows."""
     rows = arranged(table, words, order["column"], order["down"])
     heads = [
-        html.Th(
-            html.Button([title, html.Span(_arrow(column, order), **aria(hidden="true"))],
-                        id={"part": "sort", "table": name, "column": column}, n_clicks=0, type="button"),
-            className="n" if _numeric(table.rows, column) else None, scope="col",
-            **aria(sort=_sorted(column, order)),
-        )
+        {"column": column, "title": title, "sort": _sorted(column, order), "numeric": _numeric(table.rows, column)}
         for column, title in table.shown.items()
-    ]  # fmt: skip
-    body = [html.Tr([_cell(table, row, column) for column in table.shown]) for row in
-            records(rows.head(MOST_ROWS))]  # fmt: skip
+    ]
     n, total = len(rows), len(table.rows)
     said = f"{n:,} rows" if n == total else f"{n:,} of {total:,} rows"
     said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
-    return [
-        html.Table([html.Thead(html.Tr(heads)), html.Tbody(body)]),
-        html.P(said, className="muted", role="status"),
-    ]
+    return {
+        "name": name, "place": _place(name), "heads": heads, "said": said,
+        "rows": [[_cell(table, row, column) for column in table.shown] for row in records(rows.head(MOST_ROWS))],
+    }  # fmt: skip
+
+
+def sentence(name: str, text: str) -> dict[str, Any]:
+    """In place of a table, why there is none."""
+    return {"name": name, "place": _place(name), "heads": [], "rows": [], "said": text}
+
+
+def _place(name: str) -> str:
+    """The id of a table's element on the page, as Dash writes it."""
+    return json.dumps({"part": "rows", "table": name}, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
 def as_csv(table: pd.DataFrame) -> Iterator[str]:
@@ -185,23 +195,22 @@ def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
-def _cell(table: Table, row: dict[str, Any], column: str) -> html.Td:
+def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
+    """A cell: its text and, where it is more than that, its kind and where it leads."""
     value = row.get(column, "")
     if column == "state":
-        return html.Td(html.Span(STATES.get(str(value), str(value)), className=f"state is-{value}"))
+        return {"kind": "state", "text": STATES.get(str(value), str(value)), "to": str(value)}
     if column == "reason" and "remedy" in row:
         texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
-        return html.Td("; ".join(one for one in texts if one not in ("", "nan", "new")), className="said")
+        return {"kind": "said", "text": "; ".join(one for one in texts if one not in ("", "nan", "new"))}
     if column in _LONG:
-        return html.Td(str(value), className="said")
+        return {"kind": "said", "text": str(value)}
     known = f"{100 * value:.3g} %" if column.endswith("_share") and _finite(value) else number(value)
     if column == table.link and column == "start_s":
-        goes = html.Button(known, id={"part": "moment", "at": f"{float(value):.4f}"}, n_clicks=0, type="button",
-                           className="link", title="look at this moment")  # fmt: skip
-        return html.Td(goes, className="n")
-    if column == table.link and (row.get("state", "done") in DONE):
-        return html.Td(dcc.Link(known, href=session_address(str(value))))
-    return html.Td(known, className="n" if _numeric(table.rows, column) else None)
+        return {"kind": "moment", "text": known, "to": round(float(value), 4)}
+    if column == table.link and row.get("state", "done") in DONE:
+        return {"kind": "link", "text": known, "to": session_address(str(value))}
+    return {"text": known}
 
 
 def _finite(value: Any) -> bool:
@@ -210,10 +219,6 @@ def _finite(value: Any) -> bool:
 
 def _numeric(rows: pd.DataFrame, column: str) -> bool:
     return column in rows and rows[column].dtype.kind in "iuf"
-
-
-def _arrow(column: str, order: dict[str, Any]) -> str:
-    return "" if order["column"] != column else " ▼" if order["down"] else " ▲"
 
 
 def _sorted(column: str, order: dict[str, Any]) -> str:

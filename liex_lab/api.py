@@ -160,7 +160,11 @@ def serve_dashboard(
     data.warm(progress)
     alone = host in LOOPBACK
     token = "" if alone else secrets.token_urlsafe(24)
-    app = make_app(data, token=token, show_replay=show_replay if alone else None)
+
+    def correct(folder: Path, what: Sequence[Correction], undo: Sequence[int], author: str) -> None:
+        correct_session(folder, what, undo=undo, author=author)
+
+    app = make_app(data, token=token, show_replay=show_replay if alone else None, correct=correct)
     serve(app, host, port, lambda found: told(address(host, found, token)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from liex_lab.sessions.failure import write_failure
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 GROUPS = ("control", "<b>drug</b> %{y}")  # a name that must not be taken for markup, nor for a part of a template
-_OWN = ("session.json", "summary.csv", "sessions.parquet")
+_OWN = ("session.json", "summary.csv", "sessions.parquet", "report.html")
 FAILED, WAITING = 1, 2  # the places of the sessions that are not done
 
 
@@ -54,6 +55,7 @@ def _copy(first: Session, place: Path, name: str, animal: str, summary: pd.DataF
     for path in first.path.iterdir():
         if path.is_file() and path.name not in _OWN:
             os.link(path, place / path.name)
+    shutil.copy(first.path / "report.html", place)
     missed = {"n_gaps": 1, "n_missing": 6}  # as a recording that was read would say
     about = first.metadata | {"session_id": name, "frames": first.metadata["frames"] | missed}
     (place / "session.json").write_text(json.dumps(about), encoding="utf-8")
