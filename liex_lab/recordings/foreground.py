@@ -82,6 +82,7 @@ class Scene:
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
         background, spread, near = learn_background(sample)
+        _check_background(sample, background)
         grid = recording.camera.every(stride)
         seen = find_floor(background, grid)
         floor = seen if stride == 1 else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
@@ -250,3 +251,17 @@ class Scene:
             for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
                 values *= self.stride * factor
         return crops
+
+
+def _check_background(sample: NDArray[np.float32], background: NDArray[np.float32]) -> None:
+    """Refuse a sample (n, H, W) mm of frames from which no background (H, W) mm can be learned."""
+    n = len(sample)
+    if not (sample > 0).any():
+        raise EstimationError(
+            f"no depth was read in {n} frames spread over the recording; check the camera, its range and its cable"
+        )
+    if not (background > 0).any():
+        raise EstimationError(
+            f"a background is what keeps coming back, and {n} frame{'' if n == 1 else 's'} cannot tell; record some "
+            "seconds at least"
+        )

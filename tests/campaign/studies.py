@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -28,6 +29,7 @@ def workers(n: int, seed: int) -> dict[str, Any]:
     rng, killed, done, same, again = random.Random(seed), 0, 0, 0, 0
     expected: dict[str, dict[str, bytes]] = {}
     given_up: dict[str, int] = {}
+    figures: dict[str, Any] = {}
     while killed < n or not expected:
         folder = Path(tempfile.mkdtemp(prefix="liex-workers-"))
         study = _study(folder, [(f"m{k}", "rawdata/walk.mcap") for k in range(_N_SESSIONS)])
@@ -55,8 +57,10 @@ def workers(n: int, seed: int) -> dict[str, Any]:
             subprocess.run([*command, "--retry"], capture_output=True, check=False)
             again += all(one.state == "done" for one in standings(Study.load(study)))
         shutil.rmtree(folder)
-    return {"workers_killed": killed, "sessions_done": done, "equal_tables": same, "given_up": given_up,
-            "studies_whole_after_retry": again}  # fmt: skip
+        figures = {"workers_killed": killed, "sessions_done": done, "equal_tables": same, "given_up": given_up,
+                   "studies_whole_after_retry": again}  # fmt: skip
+        print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
+    return figures
 
 
 # how a recording is broken, and what the reason has to say
@@ -69,8 +73,8 @@ BROKEN = {
     "text": "is named like an MCAP file but holds something else",
     "8 bit": "expected 16-bit depth, got an 8-bit",
     "no animal": "no animal",
-    "one frame": "no animal",
-    "dark": "depth",
+    "one frame": "1 frame cannot tell",
+    "dark": "no depth was read",
 }
 
 

@@ -141,3 +141,14 @@ def test_the_long_axis_and_area_of_a_box_are_its_own():
     scale = (600.0 - 25.0) / 300.0
     assert area == pytest.approx(40 * 16 * scale**2, rel=0.03)
     assert abs(np.sin(angle)) < 0.02
+
+
+@pytest.mark.parametrize(("n", "depth_mm", "says"), [(1, 700, "1 frame cannot tell"), (30, 0, "no depth was read")])
+def test_a_recording_that_shows_no_background_is_told_why(n: int, depth_mm: int, says: str) -> None:
+    pictures = np.full((60, 80), depth_mm, np.float32)
+    still = Recording(
+        name="still", format="test", camera=Camera(80.0, 80.0, 40.0, 30.0, 80, 60),
+        times_ns=np.arange(n, dtype=np.int64) * 10**8, read=lambda row: pictures,
+    )  # fmt: skip
+    with pytest.raises(EstimationError, match=says):
+        Scene.learn(still, (40.0, 115.0))
