@@ -18,8 +18,10 @@ from liex_lab.pipelines.build import build_scene, plan_of
 from liex_lab.pipelines.evaluate import estimator_of
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.evaluation_tracking import Followed
+from liex_lab.geometry import SE3, so3
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings.hazards import Event
 from liex_lab.recordings.sequences import tracking_sequence
@@ -36,16 +38,20 @@ SEEDS = {"easy": (101, 102, 103, 104), "hard": (101, 102, 103, 104, 105, 106, 10
 _EASY_WEIGHT = 2.0  # never worse than single frames where these are good
 _STEP = 0.5  # sd of the logarithm of a number that is changed
 _BINS, _Z90, _FACTORS = 6, 1.645, (0.6, 3.0)
+_FOUND_OTHERWISE = ("ceiling", "lasting", "honest", "honest_root", "honest_bend")
 _CHUNK = 32
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A sequence as it was measured: what frames say, of whom, and the true joints (n, J, 3) mm in the same arena."""
+    """A sequence as it was measured: what frames say, of whom, and the true poses (n) and joints (n, J, 3) mm in the
+    same arena.
+    """
 
     kind: str
     seen: Observations
     subject: Subject
+    pose: Pose
     truth: Array
     events: Sequence[Event]
 
@@ -61,7 +67,7 @@ def train_tracking(
     """Write an animal's table for `tunings.toml`."""
     measured = [measure(animal, kind, seed, n_frames, progress) for kind, seeds in SEEDS.items() for seed in seeds]
     tuning = search(measured, Tuning.of(animal), n_tries, np.random.default_rng(0), progress)
-    tuning = replace(tuning, motion=replace(tuning.motion, honest=honesty(measured, tuning)))
+    tuning = honest_about_roots(measured, with_motion(tuning, honest=honesty(measured, tuning)))
     out.write_text(tuning.to_toml(animal), encoding="utf-8")
     return out
 
@@ -77,7 +83,8 @@ def measure(animal: str, kind: str, seed: int, n_frames: int | None, progress: P
         progress(frames[0].index, len(recording), f"measuring {recording.name}")
         parts.append(tracker.observe(frames))
     T = scene.floor.T_arena_camera @ recording.T_arena_camera.inverse()
-    return Seen(kind, Observations.join(parts), tracker.subject, T @ recording.joints_arena, recording.events)
+    pose = recording.pose.moved(scene.floor.T_arena_camera)
+    return Seen(kind, Observations.join(parts), tracker.subject, pose, T @ recording.joints_arena, recording.events)
 
 
 def search(
@@ -102,7 +109,7 @@ def changed(tuning: Tuning, rng: np.random.Generator) -> Tuning:
     factor = float(np.exp(rng.normal(0.0, _STEP)))
     part = "chain" if rng.random() < 0.35 else "motion"
     values: Any = getattr(tuning, part)
-    names = [field.name for field in fields(values) if field.name not in ("ceiling", "lasting", "honest")]
+    names = [field.name for field in fields(values) if field.name not in _FOUND_OTHERWISE]
     name = str(rng.choice(names))
     return replace(tuning, **{part: replace(values, **{name: _scaled(getattr(values, name), factor, rng)})})
 
@@ -144,9 +151,14 @@ def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: Tuning) -> 
     return total
 
 
+def with_motion(tuning: Tuning, **changes: Any) -> Tuning:
+    """The same with something else in its motion."""
+    return replace(tuning, motion=replace(tuning.motion, **changes))
+
+
 def honesty(measured: Sequence[Seen], tuning: Tuning) -> tuple[tuple[float, float], ...]:
     """How many times larger errors are than the filter says, by what it says: see `Motion.honest`."""
-    plain = replace(tuning, motion=replace(tuning.motion, honest=((1.0, 1.0),)))
+    plain = with_motion(tuning, honest=((1.0, 1.0),))
     said, off = [], []
     for each in measured:
         track = _track(each, plain)
@@ -161,3 +173,28 @@ def honesty(measured: Sequence[Seen], tuning: Tuning) -> tuple[tuple[float, floa
         least = float(np.clip(np.quantile(z[rows], 0.9) / _Z90, least, _FACTORS[1]))  # larger errors err more
         knots.append((round(float(np.median(x[rows])), 5), round(least, 3)))
     return tuple(knots)
+
+
+def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
+    """The same with the `honest_root` and `honest_bend` by which nine errors in ten lie within their intervals."""
+    plain = with_motion(tuning, honest_root=(1.0,) * 6, honest_bend=(1.0,) * 3)
+    roots, bends = [], []
+    for each in measured:
+        track = _track(each, plain)
+        there, true = track.posed, each.pose
+        off = SE3(track.root_rotation[there], track.root_mm[there]).inverse() @ SE3(
+            true.root.rotation[there], true.root.translation[there]
+        )
+        roots.append(np.concatenate([so3.log(off.rotation), off.translation], axis=1) / track.sd_root[there])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            bends.append((track.angles_rad - true.angles)[there, 1:] / track.sd_angles_rad[there, 1:])
+    moves = each.subject.skeleton.axes[1:]
+    root = _nine_in_ten(np.concatenate(roots))
+    z = np.concatenate(bends)
+    bend = [_nine_in_ten(z[:, moves[:, a], a].reshape(-1, 1))[0] if moves[:, a].any() else 1.0 for a in range(3)]
+    return with_motion(tuning, honest_root=tuple(root), honest_bend=tuple(bend))
+
+
+def _nine_in_ten(z: Array) -> list[float]:
+    """By how much the standard deviations of columns (n, k) of errors over them are too small."""
+    return np.round(np.quantile(np.abs(z), 0.9, axis=0) / _Z90, 3).tolist()

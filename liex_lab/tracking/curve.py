@@ -66,7 +66,7 @@ def track_whole(
         _put(pose, taken, seen.pose(admitted)[taken])
         error = np.where(taken, seen.along(seen.error_mm, admitted), error)
         curve = _smoothed(subject, seen, pose, error, motion)
-    track = to_track(subject, seen, path, curve, doubt)
+    track = to_track(subject, seen, path, curve, doubt, tuning=tuning)
     flips = _flips(seen, track)
     return Tracked(track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))))
 
@@ -116,7 +116,7 @@ def _admitted(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], c
 
 def to_track(
     subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array, ahead: bool = False,
-    told: slice = slice(None),
+    told: slice = slice(None), tuning: Tuning | None = None,
 ) -> Track:  # fmt: skip
     """A curve as rows of a track: measured, bridged over a short time, or missing.
 
@@ -135,8 +135,10 @@ def to_track(
     track.angles_rad[there], track.scale[there] = pose.angles[there], pose.scale[there]
     sd = curve.error_mm / _ERROR_PER_SD
     track.sd_mm[there] = (sd[:, None] * np.array(subject.joint_share))[there]
-    track.sd_root[there] = _spread_of_root(curve)[there]
-    track.sd_angles_rad[there] = (curve.sd_bend[:, None] * skeleton.axes)[there]
+    motion = (tuning or Tuning.of(skeleton.name)).motion
+    track.sd_root[there] = (_spread_of_root(curve) * motion.honest_root)[there]
+    bend = curve.sd_bend * motion.honest_bend
+    track.sd_angles_rad[there] = (bend[:, None] * skeleton.axes)[there]
     track.sd_angles_rad[:, 0] = np.where(there[:, None], 0.0, np.nan)
     track.predicted_error_mm[there] = curve.error_mm[there]
     track.p_flip[there] = doubt[there]

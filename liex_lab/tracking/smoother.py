@@ -39,7 +39,9 @@ class Motion:
     about theirs; size: of the logarithm of the bones' scale. freedom of the t distribution of errors; reject: off by
     more than this many predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
     have in common and no smoother takes away; honest: what is left of an error over what the filter says is left, at
-    some of the latter over the animal's length (pairs, in rising order; between them by the logarithm).
+    some of the latter over the animal's length (pairs, in rising order; between them by the logarithm). honest_root,
+    honest_bend: the same of the base's rotation and place about and along its own axes, and of the other joints' angles
+    about theirs, over what that leaves.
     """
 
     place_error: tuple[float, float, float]
@@ -52,6 +54,8 @@ class Motion:
     reject: float
     lasting: float
     honest: tuple[tuple[float, float], ...]
+    honest_root: tuple[float, float, float, float, float, float] = (1.0,) * 6
+    honest_bend: tuple[float, float, float] = (1.0,) * 3
 
     @property
     def packed(self) -> kernels.Moves:

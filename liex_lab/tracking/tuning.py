@@ -40,7 +40,7 @@ class Tuning:
         for group in ("turn", "bend"):
             motion[group] = tuple(Wandering(*row) for row in motion[group])
         motion["size"] = Wandering(*motion["size"])
-        for name in ("place_error", "place_drive"):
+        for name in ("place_error", "place_drive", "honest_root", "honest_bend"):
             motion[name] = tuple(motion[name])
         motion["honest"] = tuple((said, factor) for said, factor in motion["honest"])
         return Tuning(ChainTuning(**table["chain"]), Motion(**motion))

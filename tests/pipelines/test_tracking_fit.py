@@ -6,8 +6,9 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.tracking_fit import Seen, changed, honesty, search
+from liex_lab.pipelines.tracking_fit import Seen, changed, honest_about_roots, honesty, search
 
+from liex_lab.geometry import so3
 from liex_lab.recordings.hazards import Event
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.tuning import Tuning
@@ -22,7 +23,7 @@ def measured() -> list[Seen]:
     made = []
     for kind, seed, sd_mm in (("easy", 1, 0.8), ("hard", 2, 2.0)):
         seen = told(SECONDS, noisy(truth, np.random.default_rng(seed), sd_mm))
-        made.append(Seen(kind, seen, SUBJECT, truth.joints(MOUSE), [Event("hidden", 10, 12)]))
+        made.append(Seen(kind, seen, SUBJECT, truth, truth.joints(MOUSE), [Event("hidden", 10, 12)]))
     return made
 
 
@@ -68,3 +69,17 @@ def test_an_honest_track_covers_nine_in_ten(measured):
         track = track_whole(each.subject, each.seen, (), mended).track
         off.append((np.abs(track.joints_mm - each.truth) / track.sd_mm[..., None]).ravel())
     assert 0.85 < np.mean(np.concatenate(off) < 1.645) < 0.96
+
+
+def test_roots_and_bends_are_covered_as_well(measured):
+    tuning = honest_about_roots(measured, Tuning.of("mouse"))
+    turned, placed, bent = [], [], []
+    for each in measured:
+        track = track_whole(each.subject, each.seen, (), tuning).track
+        off = track.root.inverse() @ each.pose.root
+        turned.append(np.abs(so3.log(off.rotation)) / track.sd_root[:, :3])
+        placed.append(np.abs(off.translation) / track.sd_root[:, 3:])
+        free = MOUSE.axes[1:]
+        bent.append((np.abs(track.angles_rad - each.pose.angles)[:, 1:][:, free]) / track.sd_angles_rad[:, 1:][:, free])
+    for z in (turned, placed, bent):
+        assert 0.85 < np.mean(np.concatenate(z) < 1.645) < 0.95
