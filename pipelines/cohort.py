@@ -163,6 +163,7 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
     count = max(1, min(workers or (cores + 1) // 2, n_tasks))
     return LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # any port: another study's may have the usual one
         memory_limit=0, local_directory=scratch, silence_logs=50, security=Security.temporary(),
         env=worker_environment(threads or max(1, cores // count)),
     )  # fmt: skip

@@ -8,13 +8,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker
-from liex_lab.pipelines.crew import Processes
+from liex_lab.pipelines.crew import Crew, Done, Processes, Work
 from liex_lab.pipelines.long import looped
 from liex_lab.pipelines.stretches import CHUNK, Stretch, look_side_by_side
 
@@ -99,16 +99,33 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+class _Timed:
+    """A crew that takes down when each stretch came, and how many frames it has."""
+
+    def __init__(self, crew: Crew) -> None:
+        self._crew = crew
+        self.came: list[tuple[float, int]] = []
+
+    def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
+        """See `Crew`."""
+        for done in self._crew.each(do, works):
+            self.came.append((time.perf_counter(), done.stop - done.start if isinstance(done, Stretch) else 0))
+            yield done
+
+
 def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
-    """Frames a second that are read, looked at and written by one process and by two, of one core each."""
+    """Frames a second that are read, looked at and written by one process and by two, of one core each, once each
+    process has done its first stretch: they take some seconds to begin.
+    """
     plan, found = Plan.load("mouse"), {}
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
         whole = Stretch(str(recording), plan, tracker, build_provenance(opened, plan, tracker), folder, 0, len(opened))
     for count in (1, 2):
-        began = time.perf_counter()
-        look_side_by_side(Processes(count, threads=1), whole, folder / f"stretches-{count}.liex", silent)
-        found[count] = whole.stop / (time.perf_counter() - began)
+        crew = _Timed(Processes(count, threads=1))
+        look_side_by_side(crew, whole, folder / f"stretches-{count}.liex", silent)
+        (begun, _), later = crew.came[count - 1], crew.came[count:]
+        found[count] = sum(n for _, n in later) / (later[-1][0] - begun)
     return {"looking_frames_per_s": {str(count): rate for count, rate in found.items()},
             "looking_two_processes_over_one": found[2] / found[1]}  # fmt: skip
 

@@ -69,7 +69,7 @@ def measure_session(
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
-        if crew is not None and isinstance(recording, str | Path) and len(opened) > LENGTH:
+        if crew is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
             whole = Stretch(str(recording), plan, tracker, provenance, folder, 0, len(opened))
             look_side_by_side(crew, whole, folder, progress)
         with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
 
-LENGTH = 1000  # frames of a stretch: some seconds of work, which is what an interruption costs
+LENGTH = 500  # frames of a stretch: some seconds of work, which is what an interruption costs
 CHUNK = 32  # frames in memory at a time
 MEASURING = "measuring poses"
 

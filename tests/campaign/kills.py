@@ -8,6 +8,7 @@ import shutil
 import sys
 import tempfile
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from liex_lab.pipelines.stretches import MEASURING
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session
 from tests.campaign.runs import begin, refusal, tables_of, undisturbed
+
+_IN_THE_WORK = 0.6  # of the moments are counted from when poses are measured; the others from the very beginning
 
 
 def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
@@ -27,7 +30,12 @@ def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     while killed < n or not finished:
         began, process = time.monotonic(), begin(out, n_frames)
-        process.join(rng.uniform(0.0, 1.1 * usual_s) if killed < n else None)
+        if killed < n:
+            if rng.random() < _IN_THE_WORK:
+                _wait_for_the_work(process, out)
+            process.join(rng.uniform(0.0, 1.1 * usual_s))
+        else:
+            process.join()
         if process.is_alive():
             process.kill()
             process.join()
@@ -53,6 +61,17 @@ def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
         print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
     shutil.rmtree(scratch)
     return figures
+
+
+def _wait_for_the_work(process: BaseProcess, out: Path) -> None:
+    """Until poses are measured, or the process has ended."""
+    while process.is_alive():
+        try:
+            if json.loads((out / "stage.json").read_text())[0] == MEASURING:
+                return
+        except (OSError, ValueError):
+            pass
+        process.join(0.02)
 
 
 def _lost(out: Path) -> tuple[str, float]:

@@ -10,7 +10,7 @@ import pytest
 from liex_lab.tracking.tuning import Tuning
 
 
-@pytest.mark.parametrize("animal", ["mouse", "fish"])
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
 def test_a_tuning_is_the_table_that_it_writes(animal):
     tuning = Tuning.of(animal)
     assert Tuning.from_table(tomllib.loads(tuning.to_toml(animal))[animal]) == tuning
