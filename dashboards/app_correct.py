@@ -43,8 +43,8 @@ def panel(session: Session, opened: bool) -> html.Details:
     ]
     return html.Details(id="correct", className="correct", open=opened, children=[
         html.Summary("Correct this session"),
-        html.P("Corrections lie beside the session, never over it, and are applied whenever it is read; the replay "
-               "stays as measured.", className="muted"),
+        html.P("Corrections lie beside the session, never over it, and are applied whenever it is read.",
+               className="muted"),
         _row("a span of time", field("from", "Span from, s"), here[0], field("to", "to, s"), here[1], do("flip")),
         _row("bouts", choice("action", "Action", words), do("rename"), do("recut"),
              do("delete"), do("add")),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.dashboards.figures import ACTION_COLOURS
+from liex_lab.dashboards.figures import ACTION_COLOURS, action_colour
 
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError
@@ -31,12 +31,16 @@ _HELD = 6  # sessions whose tables stay in memory
 
 @dataclass(frozen=True)
 class Ethogram:
-    """A session's bouts as spans (n, 2) s with their words, the spans without a pose (m, 2) s, and how long it is."""
+    """A session's bouts as spans (n, 2) s with their words, the spans without a pose (m, 2) s, and how long it is.
+
+    vocabulary: all words that its ethogram could have, in the order of which report and replay colour them.
+    """
 
     spans_s: np.ndarray
     words: list[str]
     lost_s: np.ndarray
     duration_s: float
+    vocabulary: tuple[str, ...] = ()
 
 
 class StudyData:
@@ -177,9 +181,20 @@ def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
     return sorted(seconds, key=lambda word: (-seconds[word], word))
 
 
-def colours_of(words: Sequence[str]) -> dict[str, str]:
-    """A colour for each word, no two alike: those beyond the ninth share a grey."""
-    return {word: ACTION_COLOURS[k] if k < len(ACTION_COLOURS) else GREY for k, word in enumerate(words)}
+def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str, str]:
+    """A colour for each word, where it is free its own of report and replay; words beyond the last share a grey."""
+    own = {word: action_colour(k) for k, word in reversed(list(enumerate(vocabulary)))}
+    chosen: dict[str, str] = {}
+    for word in words:
+        if word in own and own[word] not in chosen.values():
+            chosen[word] = own[word]
+    free = iter([colour for colour in ACTION_COLOURS if colour not in chosen.values()])
+    return {word: chosen.get(word) or next(free, GREY) for word in words}
+
+
+def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
+    """The words of several vocabularies, in the order of the first that has them."""
+    return list(dict.fromkeys(word for one in ethograms for word in one.vocabulary))
 
 
 def raster(one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int) -> np.ndarray:
@@ -237,6 +252,7 @@ def _ethogram(session: Session) -> Ethogram:
     return Ethogram(
         bouts[["start_s", "stop_s"]].to_numpy(float), [str(word) for word in bouts["action"]],
         lost[["start_s", "stop_s"]].to_numpy(float), float(session.metadata["frames"]["duration_s"]),
+        tuple(session.metadata.get("actions") or {}),
     )  # fmt: skip
 
 

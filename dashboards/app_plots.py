@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from liex_lab.dashboards.app_data import GREY, NO_POSE, OTHER, Ethogram, colours_of, raster
+from liex_lab.dashboards.app_data import GREY, NO_POSE, OTHER, Ethogram, raster
 from liex_lab.dashboards.figures import Array, kept_rows, png_uri, shade
 from numpy.typing import NDArray
 
@@ -41,12 +41,13 @@ def empty(sentence: str, height: int = 160) -> dict[str, Any]:
     return {"data": [], "layout": _layout(height, annotations=[note], xaxis=hidden, yaxis=hidden)}
 
 
-def ethograms(ones: Mapping[str, Ethogram], words: Sequence[str]) -> dict[str, Any]:
-    """A row per session, coloured by what the animal did; words: those with a colour, the others share a grey."""
+def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict[str, Any]:
+    """A row per session, coloured by what the animal did; actions without a colour share a grey."""
     if not ones:
         return empty("No session is chosen, or none of those has an ethogram.")
     stop_s = max(max(one.duration_s for one in ones.values()), 1e-3)
     n_columns = min(_COLUMNS, max(120, _MOST_CELLS // len(ones)))
+    words = list(coloured)
     every = [*words, *sorted({word for one in ones.values() for word in one.words} - set(words))]
     rows = np.stack([raster(one, every, 0.0, stop_s, n_columns) for one in ones.values()])
     # as places of the colours: 0 no pose, 1 other actions, then the words
@@ -56,7 +57,7 @@ def ethograms(ones: Mapping[str, Ethogram], words: Sequence[str]) -> dict[str, A
     time_s = (np.arange(n_columns) + 0.5) * stop_s / n_columns
     named = np.array(["", NO_POSE, *every])  # of -1, -2 and the words
     place = np.where(rows == -1, 0, np.where(rows == -2, 1, rows + 2))
-    colours = [NO_POSE_COLOUR, GREY, *colours_of(words).values()]
+    colours = [NO_POSE_COLOUR, GREY, *coloured.values()]
     trace = {
         "type": "heatmap", "z": shown.astype(np.float32), "x": (time_s / size).astype(np.float32),
         "y": [text(key) for key in ones], "text": np.array([text(name) for name in named])[place].tolist(),
@@ -68,15 +69,15 @@ def ethograms(ones: Mapping[str, Ethogram], words: Sequence[str]) -> dict[str, A
     return {"data": [trace], "layout": _layout(_rows_height(len(ones)), xaxis=x, yaxis=_session_axis(len(ones)))}
 
 
-def time_budgets(shares: pd.DataFrame, words: Sequence[str]) -> dict[str, Any]:
+def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str, Any]:
     """A bar per session; shares: one row per session, `key`, a column `WORD_share` for each action."""
     if shares.empty:
         return empty("No session is chosen, or none of those has a summary.")
     actions = [str(name).removesuffix("_share") for name in shares if str(name).endswith("_share")]
     actions = [word for word in actions if f"{word}_s" in shares]  # other columns are shares of something else
-    known = [word for word in words if word in actions]
+    known = {word: colour for word, colour in coloured.items() if word in actions}
     rest = [f"{word}_share" for word in actions if word not in known]
-    parts = [(word, shares[f"{word}_share"].fillna(0.0), colour) for word, colour in colours_of(known).items()]
+    parts = [(word, shares[f"{word}_share"].fillna(0.0), colour) for word, colour in known.items()]
     parts.append((OTHER, shares[rest].fillna(0.0).sum(axis=1), GREY))
     keys = [str(key) for key in shares["key"]]
     data = [
@@ -156,12 +157,12 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
 
 
 def whole_session(
-    one: Ethogram, words: Sequence[str], traces: Sequence[tuple[str, Array, Array, str]]
+    one: Ethogram, coloured: Mapping[str, str], traces: Sequence[tuple[str, Array, Array, str]]
 ) -> dict[str, Any]:
     """A lane per action over a whole session, and curves below: (name with unit, time s (n,), values (n,), colour)."""
     n = 1200
     stop_s = max(one.duration_s, 1e-3)
-    colours = colours_of(words)
+    words = list(coloured)
     lanes = [*words, NO_POSE]
     z = np.full((len(lanes), n), np.nan, np.float32)
     for k, word in enumerate(words):
@@ -172,7 +173,7 @@ def whole_session(
     data: list[dict[str, Any]] = [{
         "type": "heatmap", "z": z, "x": x.astype(np.float32), "y": list(range(len(lanes))), "showscale": False,
         "zmin": -0.5, "zmax": len(lanes) - 0.5, "hoverongaps": False, "ygap": 3, "xaxis": "x", "yaxis": "y",
-        "colorscale": _steps([*(colours[word] for word in words), NO_POSE_COLOUR]),
+        "colorscale": _steps([*coloured.values(), NO_POSE_COLOUR]),
         "hovertemplate": f"%{{x:.2f}} {unit}<extra></extra>",
     }]  # fmt: skip
     heights = [22 * len(lanes) + 20, *[96] * len(traces)]

@@ -12,7 +12,7 @@ import numpy as np
 from dash import ALL, Dash, Input, Output, Patch, State, ctx, dcc, html, no_update
 from liex_lab.dashboards import app_correct
 from liex_lab.dashboards import app_plots as plots
-from liex_lab.dashboards.app_data import StudyData, shown_words
+from liex_lab.dashboards.app_data import StudyData, colours_of, shown_words
 from liex_lab.dashboards.app_frames import Frames
 from liex_lab.dashboards.app_parts import aria, download, graph
 from liex_lab.dashboards.app_tables import block, number, session_address, session_tables
@@ -41,11 +41,11 @@ def session_page(
     """A session at a moment (s since its first frame). correcting: the form for corrections is open."""
     session, one = data.session(key), data.ethograms([key])[key]
     entry, curves = data.entries[key], traces(session)
-    words = shown_words([one])
+    coloured = colours_of(shown_words([one]), one.vocabulary)
     who = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in entry.who.items() if value)
     frames = session.metadata["frames"]
     size = plots.time_unit(one.duration_s)[1]
-    whole = plots.whole_session(one, words, curves)
+    whole = plots.whole_session(one, coloured, curves)
     said = [html.Li(sentence) for sentence in warnings(session)]
     return [
         html.P([dcc.Link("Sessions", href="/"), " / ", entry.who.get("group") or "session"], className="kind"),

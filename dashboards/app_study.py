@@ -7,11 +7,12 @@ from typing import Any
 
 from dash import Dash, Input, Output, State, dcc, html, no_update
 from liex_lab.dashboards import app_plots as plots
-from liex_lab.dashboards.app_data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words
+from liex_lab.dashboards.app_data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
 from liex_lab.dashboards.app_parts import download, graph
 from liex_lab.dashboards.app_tables import STATES, block, csv_address, session_address
+from liex_lab.dashboards.figures import ACTION_COLOURS
 
-MOST_COLOURS = 9
+MOST_COLOURS = len(ACTION_COLOURS)
 
 
 def sessions_page(data: StudyData) -> list[Any]:
@@ -86,10 +87,10 @@ def register(app: Dash, data: StudyData) -> None:
     def draw(names: list[str] | None, sessions: list[str] | None) -> tuple[Any, Any, Any, float]:
         ones = data.ethograms(chosen_keys(data, names, sessions))
         words = shown_words(ones.values())
-        coloured = words[:MOST_COLOURS]
+        coloured = colours_of(words[:MOST_COLOURS], vocabulary_of(ones.values()))
         table = data.collected()
         table = table[table["key"].isin(ones)].set_index("key").reindex(list(ones)).reset_index()
-        marks = [*colours_of(coloured).items(), *([(OTHER, GREY)] if len(words) > MOST_COLOURS else []),
+        marks = [*coloured.items(), *([(OTHER, GREY)] if len(words) > MOST_COLOURS else []),
                  (NO_POSE, plots.NO_POSE_COLOUR)]  # fmt: skip
         key = [html.Li([html.I(style={"background": colour}), word.replace("_", " ")]) for word, colour in marks]
         size = plots.time_unit(max((one.duration_s for one in ones.values()), default=0.0))[1]

@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.dashboards import app_plots, app_tables
 from liex_lab.dashboards.app import address, make_app
-from liex_lab.dashboards.app_data import Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app_data import GREY, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app_session import moved_to
+from liex_lab.dashboards.figures import ACTION_COLOURS, action_colour
 from liex_lab.pipelines.listing import list_sessions
 from typer.testing import CliRunner
 
@@ -97,9 +98,14 @@ def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
 
 
 def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
-    colours = colours_of([f"w{k}" for k in range(12)])
-    assert len(set(list(colours.values())[:9])) == 9
-    assert len(set(list(colours.values())[9:])) == 1
+    n = len(ACTION_COLOURS)
+    colours = list(colours_of([f"w{k}" for k in range(n + 3)]).values())
+    assert len(set(colours[:n])) == n
+    assert set(colours[n:]) == {GREY}
+    words = ["rear", "run", "walk", "pause"]
+    assert colours_of(["walk", "rear", "unheard"], words) == {
+        "walk": action_colour(2), "rear": action_colour(0), "unheard": action_colour(1)
+    }  # fmt: skip
 
 
 def test_names_are_text_in_every_figure(data: StudyData) -> None:
@@ -107,9 +113,9 @@ def test_names_are_text_in_every_figure(data: StudyData) -> None:
     ones = {key: Ethogram(np.array([[0.0, 1.0]]), ["<i>x"], np.zeros((0, 2)), 2.0) for key in ("<b>s",)}
     shares = pd.DataFrame({"key": ["<b>s"], "<i>x_share": [0.5], "<i>x_s": [1.0]})
     figures = [
-        app_plots.groups(table, "mean_speed_mm_s", "<u>"), app_plots.ethograms(ones, ["<i>x"]),
-        app_plots.differences(data.stats("mean_speed_mm_s"), "<u>"), app_plots.time_budgets(shares, ["<i>x"]),
-        app_plots.whole_session(ones["<b>s"], ["<i>x"], [("<u>", np.arange(3.0), np.arange(3.0), "#000")]),
+        app_plots.groups(table, "mean_speed_mm_s", "<u>"), app_plots.ethograms(ones, {"<i>x": "#000"}),
+        app_plots.differences(data.stats("mean_speed_mm_s"), "<u>"), app_plots.time_budgets(shares, {"<i>x": "#000"}),
+        app_plots.whole_session(ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")]),
     ]  # fmt: skip
     for figure in figures:
         for item in figure["data"]:
