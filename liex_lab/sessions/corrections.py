@@ -8,6 +8,7 @@ the entries that stand. `Session.open` reads those; `Session.open(path, raw=True
 from __future__ import annotations
 
 import getpass
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -167,7 +168,14 @@ class Log:
             "entries": [entry.to_dict() for entry in self.entries],
             "files": {name: dict(facts) for name, facts in self.files.items()}, "facts": dict(self.facts),
         }  # fmt: skip
-        return json.dumps(document, indent=1, ensure_ascii=False, default=str, allow_nan=False) + "\n"
+        plain = json.loads(json.dumps(document, default=str, allow_nan=False))
+        return json.dumps({**plain, "sum": _sum(plain)}, indent=1, ensure_ascii=False) + "\n"
+
+
+def _sum(document: Mapping[str, Any]) -> str:
+    """The hash of a log's content, but for itself: what is read and merged into session.json's was written by us."""
+    stated = {key: value for key, value in document.items() if key != "sum"}
+    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
 
 
 def author_name() -> str:
@@ -209,14 +217,17 @@ def read_log(session: Path) -> Log:
                 f"{path} was written by a newer liex_lab (schema {version}, this one reads up to {SCHEMA_VERSION}); "
                 "upgrade with `pip install -U liex_lab`"
             )
+        if document["sum"] != _sum(document):
+            raise ValueError("its sum does not fit, so it was changed")
         entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
         files, facts = document.get("files", {}), document.get("facts", {})
-        if not all(isinstance(one, dict) for one in (files, facts, *files.values(), *facts.values())):
+        if not (isinstance(files, dict) and isinstance(facts, dict)
+                and all(isinstance(one, dict) for one in (*files.values(), *facts.values()))):  # fmt: skip
             raise TypeError("files and facts are tables of tables")
         if not set(facts) <= FACTS:
             raise ValueError(f"facts of {', '.join(sorted(set(facts) - FACTS))}")
         return Log(str(document["made_of"]), entries, files, facts)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise SessionError(
             f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it, or remove the folder "
             f"{FOLDER} to go on with what was measured"

@@ -141,7 +141,14 @@ def test_a_corrected_session_is_no_damaged_one_and_damage_to_its_corrections_is_
     assert any(state == "wrong" and "bouts.parquet was changed" in sentence for state, sentence in said())
     correct_session(session.path)  # makes them again
     assert not [sentence for state, sentence in said() if state == "wrong"]
-    (session.path / "corrected" / "corrections.json").write_text("{")
+    log = session.path / "corrected" / "corrections.json"
+    whole = json.loads(log.read_text())
+    wrong = {"facts": {"frames": {"n_frames": "x"}}, "entries": [7], "files": None, "schema_version": 1e999, "sum": "0"}
+    for name, value in wrong.items():
+        log.write_text(json.dumps({**whole, name: value}))
+        with pytest.raises(SessionError, match="is damaged"):
+            Session.open(session.path)
+    log.write_text("{")
     with pytest.raises(SessionError, match="is damaged"):
         Session.open(session.path)
     Session.open(session.path, raw=True)
