@@ -123,7 +123,7 @@ def doctor(
     with progress_bar() as progress:
         findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
     if as_json:
-        typer.echo(as_json(findings))
+        typer.echo(to_json(findings))
     else:
         print_report(findings)
 

@@ -33,7 +33,7 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
         keep_numbers(result, json_file)
     table = Table(show_header=False)
     for name, value in result.items():
-        said = as_json(value) if isinstance(value, dict) else str(value)
+        said = to_json(value) if isinstance(value, dict) else str(value)
         table.add_row(name, Text(f"{value:.4g}" if isinstance(value, float) else said))
     Console().print(table)
 
@@ -41,10 +41,10 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
 def keep_numbers(result: dict[str, Any], json_file: Path) -> None:
     """Write the numbers as JSON."""
     json_file.parent.mkdir(parents=True, exist_ok=True)
-    json_file.write_text(as_json(result) + "\n", encoding="utf-8")
+    json_file.write_text(to_json(result) + "\n", encoding="utf-8")
 
 
-def as_json(result: Any) -> str:
+def to_json(result: Any) -> str:
     """Plain values as indented JSON."""
     from liex_lab.evaluation import plain
 
