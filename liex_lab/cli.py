@@ -29,6 +29,7 @@ from liex_lab.cli_words import (
     TopicName,
     VariantName,
     tell_numbers,
+    to_json,
 )
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
