@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import subprocess
 import sys
@@ -14,12 +13,24 @@ from typing import Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 import liex_lab
 from liex_lab.cli_correct import correct
+from liex_lab.cli_evaluate import evaluate
 from liex_lab.cli_results import compare, export, report
-from liex_lab.cli_study import cohort, dashboard, scale, verify
+from liex_lab.cli_study import cohort, dashboard, verify
+from liex_lab.cli_words import (
+    JsonFile,
+    OutFolder,
+    PlanName,
+    RecordingPath,
+    SessionPath,
+    Settings,
+    TopicName,
+    VariantName,
+    tell_numbers,
+    to_json,
+)
 from liex_lab.errors import LiexError
 from liex_lab.progress import progress_bar
 
@@ -33,31 +44,14 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(correct, name="correct")
 app.command()(cohort)
 app.command()(dashboard)
 app.command()(verify)
-evaluate.command("scale")(scale)
 app.command()(compare)
 app.command()(export)
 app.command()(report)
-
-RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
-SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
-PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
-OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
-TopicName = Annotated[
-    str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
-]
-Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
-]
-AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")]
-VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
-RowName = Annotated[str, typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
 
 
 def _version(wanted: bool) -> None:
@@ -130,7 +124,7 @@ def doctor(
     with progress_bar() as progress:
         findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
     if as_json:
-        typer.echo(_json(findings))
+        typer.echo(to_json(findings))
     else:
         print_report(findings)
 
@@ -200,7 +194,7 @@ def train(
                 pose_model=pose_model, progress=progress,
             )  # fmt: skip
         if report:
-            _tell_numbers(report, None)
+            tell_numbers(report, None)
         typer.echo(f"model: {model}")
         return
     if animal == "tracking":
@@ -216,208 +210,6 @@ def train(
         path = out or Path(f"{Path(animal).stem}.npz")
         model = train_model(animal, variant, path, workers=workers, n_images=n_images, progress=progress)
     typer.echo(f"model: {model}")
-
-
-@evaluate.command("pose")
-def evaluate_pose(
-    animal: AnimalName = "mouse",
-    split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
-    variant: RowName = "default",
-    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
-    n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
-    spine_mm: Annotated[
-        float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Joint errors on a fixed split of rendered test frames."""
-    from liex_lab.pipelines.evaluate import evaluate_pose as measure
-
-    with progress_bar() as progress:
-        result = measure(animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("speed")
-def evaluate_speed(
-    animal: AnimalName = "mouse",
-    recordings: Annotated[
-        bool, typer.Option("--recordings", help="Measure how fast recordings of each format are read instead.")
-    ] = False,
-    json_file: JsonFile = None,
-) -> None:
-    """Frames per second on one and two cores, stage by stage, and the ratio to the paper's variant."""
-    with progress_bar() as progress:
-        if recordings:
-            from liex_lab.pipelines.evaluate_recordings import evaluate_recordings
-
-            result = evaluate_recordings(progress=progress)
-        else:
-            from liex_lab.pipelines.speed import evaluate_speed as measure
-
-            result = measure(animal, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("sizes")
-def evaluate_sizes(
-    animal: AnimalName = "mouse",
-    n_frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="Only this many frames for each size.")
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Joint errors of animals between 45 and 100 mm long, their size estimated and not given."""
-    from liex_lab.pipelines.evaluate import evaluate_sizes as measure
-
-    with progress_bar() as progress:
-        result = measure(animal, n_frames=n_frames, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("tables")
-def evaluate_tables(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")],
-    animals: Annotated[
-        list[str] | None, typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model.")
-    ] = None,
-    n_frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="Only this many frames of each split.")
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="See within minutes that everything runs; the numbers mean nothing.")
-    ] = False,
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Train and measure every row anew, which takes hours; use no kept result.")
-    ] = False,
-) -> None:
-    """Every row of the paper's Tables 1 to 3 and its figures, measured now or kept from earlier."""
-    from liex_lab.api import run_tables
-
-    with progress_bar() as progress:
-        written = run_tables(out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress)
-    for path in written:
-        typer.echo(path)
-
-
-@evaluate.command("actions")
-def evaluate_actions(
-    animal: AnimalName = "fish",
-    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
-    pose_model: Annotated[
-        str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
-    ] = None,
-    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
-
-    The recordings are rendered and measured first, which takes about half an hour for all 30 minutes on two cores. What
-    has been measured is kept in the cache folder (LIEX_CACHE), so that a job that was stopped goes on where it was.
-    """
-    from liex_lab.api import evaluate_actions as measure
-
-    figure = None if out is None else out / f"{animal}_confusion.png"
-    with progress_bar() as progress:
-        result = measure(
-            animal, model=model, pose_model=pose_model, minutes=minutes, figure=figure, progress=progress
-        )
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("tracking")
-def evaluate_tracking(
-    animal: AnimalName = "mouse",
-    sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
-    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
-    n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
-    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
-    from liex_lab.api import evaluate_tracking as measure
-
-    with progress_bar() as progress:
-        result = measure(animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("live")
-def evaluate_live(
-    animal: AnimalName = "fish",
-    n_frames: Annotated[int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")] = 1500,
-    json_file: JsonFile = None,
-) -> None:
-    """How late skeletons are while a virtual animal is filmed."""
-    from liex_lab.pipelines.evaluate_live import evaluate_live as measure
-
-    with progress_bar() as progress:
-        result = measure(animal, n_frames=n_frames, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("statistics")
-def evaluate_statistics(
-    n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
-    effect: Annotated[
-        float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
-    ] = 1.0,
-    json_file: JsonFile = None,
-) -> None:
-    """How often the comparison of groups is wrong on studies without an effect, and how often it finds one."""
-    from liex_lab.pipelines.evaluate_statistics import evaluate_statistics as measure
-
-    with progress_bar() as progress:
-        result = measure(n_studies, effect, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("report")
-def evaluate_report(
-    session: SessionPath,
-    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of the long session.")] = 60.0,
-    json_file: JsonFile = None,
-) -> None:
-    """How long the report of a long session takes, and its memory: SESSION repeated until it is so long."""
-    from liex_lab.pipelines.evaluate_report import evaluate_report as measure
-
-    with progress_bar() as progress:
-        result = measure(session, minutes, progress=progress)
-    _tell_numbers(result, json_file)
-
-
-@evaluate.command("nyu")
-def evaluate_nyu(
-    reference: Annotated[
-        Path, typer.Option("--reference", metavar="DIR", help="Labels, published answers and frames of the NYU data.")
-    ],
-    model: Annotated[str | None, typer.Option("--model", help="A hand model of your own, .npz.")] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and ours."""
-    from liex_lab.pipelines.nyu import evaluate_nyu as measure
-    from liex_lab.pipelines.nyu import in_short
-
-    with progress_bar() as progress:
-        result = measure(reference, model=model, progress=progress)
-    _tell_numbers(in_short(result), None)
-    if json_file is not None:
-        _keep_numbers(result, json_file)
-
-
-@evaluate.command("reference")
-def evaluate_reference(
-    session: SessionPath,
-    reference: Annotated[
-        Path, typer.Option("--reference", metavar="CSV", help="The reference's table, one row a frame.")
-    ],
-    json_file: JsonFile = None,
-) -> None:
-    """Compare a session with what another program measured in the same recording."""
-    from liex_lab.pipelines.evaluate import evaluate_reference as measure
-
-    _tell_numbers(measure(session, reference), json_file)
 
 
 @app.command()
@@ -454,7 +246,7 @@ def live(
 
     with progress_bar() as progress:
         result = follow_live(source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress)
-    _tell_numbers(result, json_file)
+    tell_numbers(result, json_file)
 
 
 @app.command()
@@ -501,7 +293,7 @@ def info(
     models = bundled_models()
     facts["models"] = ", ".join(models) or "none"
     facts |= {f"model {name}: {key}": value for name, card in models.items() for key, value in card.items()}
-    _tell_numbers(facts, None)
+    tell_numbers(facts, None)
 
 
 def main() -> None:
@@ -535,25 +327,3 @@ def _tell_session(session: Path) -> None:
     if report.is_file():
         typer.echo(f"report:  {report}")
     typer.echo(f"replay:  liex show {session}")
-
-
-def _tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
-    """The numbers as a table on the screen, and as JSON where a file was named."""
-    if json_file is not None:
-        _keep_numbers(result, json_file)
-    table = Table(show_header=False)
-    for name, value in result.items():
-        shown = f"{value:.4g}" if isinstance(value, float) else _json(value) if isinstance(value, dict) else str(value)
-        table.add_row(name, Text(shown))
-    Console().print(table)
-
-
-def _keep_numbers(result: dict[str, Any], json_file: Path) -> None:
-    json_file.parent.mkdir(parents=True, exist_ok=True)
-    json_file.write_text(_json(result) + "\n", encoding="utf-8")
-
-
-def _json(result: Any) -> str:
-    from liex_lab.evaluation import plain
-
-    return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -94,24 +93,6 @@ def verify(
         typer.echo(f"{finding.state:6}{finding.sentence}")
     if any(finding.state == "wrong" for finding in findings):
         raise typer.Exit(1)
-
-
-def scale(
-    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 3000,
-    minutes: Annotated[
-        list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
-    ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers here.")] = None,
-) -> None:
-    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
-    from liex_lab.api import run_scale
-
-    with progress_bar() as progress:
-        numbers = run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)
-    text = json.dumps(numbers, indent=2)
-    if json_file is not None:
-        json_file.write_text(text + "\n", encoding="utf-8")
-    typer.echo(text)
 
 
 def _tell_study(standings: list[Standing], all_of_them: bool) -> int:

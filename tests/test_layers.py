@@ -64,7 +64,7 @@ def test_jobs_and_views_do_not_know_each_other(folder: str, forbidden: tuple[str
 
 def test_only_the_command_line_and_the_front_door_know_the_jobs() -> None:
     for path in files_of("liex_lab"):
-        doors = {"cli.py", "cli_correct.py", "cli_results.py", "cli_study.py", "api.py"}
+        doors = {"cli.py", "cli_correct.py", "cli_evaluate.py", "cli_results.py", "cli_study.py", "api.py"}
         if path.relative_to(REPOSITORY / "liex_lab").as_posix() not in doors:
             upwards = [name for name in imported_modules(path) if name.startswith(("liex_lab.pipe", "liex_lab.dash"))]
             assert not upwards, f"{path} imports {upwards}"
