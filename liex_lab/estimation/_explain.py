@@ -45,20 +45,22 @@ def place_balls(rotations, positions, scale, body, out):
             out[b, i] = first + share * (second - first)
 
 
-@njit(cache=True)
-def nearest_ball(x, y, z, balls, radius, guess):
+@njit(cache=True, fastmath={"nnan", "nsz"})
+def nearest_ball(x, y, z, balls, radius, gaps):
     """Signed distance mm of a point from the surface of the nearest of the balls (B, 3), and which that is.
 
-    guess: one that may be it; roots are only drawn where a ball may be nearer than the nearest so far.
+    gaps (B,) is scratch: the distances of all, then their least, then which it is, for each of these three runs in
+    vector registers, while one loop that keeps the least waits for a root with every ball.
     """
-    which = guess
-    off2 = (x - balls[which, 0]) ** 2 + (y - balls[which, 1]) ** 2 + (z - balls[which, 2]) ** 2
-    best = np.sqrt(off2) - radius[which]
     for b in range(len(balls)):
-        reach = best + radius[b]
         off2 = (x - balls[b, 0]) ** 2 + (y - balls[b, 1]) ** 2 + (z - balls[b, 2]) ** 2
-        if reach > 0.0 and off2 < reach * reach:
-            best, which = np.sqrt(off2) - radius[b], b
+        gaps[b] = np.sqrt(off2) - radius[b]
+    best = gaps[0]
+    for b in range(len(balls)):
+        best = gaps[b] if gaps[b] < best else best
+    which, last = 0, len(balls) - 1
+    while which < last and gaps[which] != best:
+        which += 1
     return best, which
 
 
@@ -93,7 +95,7 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
     out[0] = SHARE_UNIT * beside / n
     out[1], out[2] = MM_UNIT * off / seen, MM_UNIT * out_of / seen
     out[3] = SHARE_UNIT * hidden / n
-    n_read, far, apart, within, which = 0, 0.0, 0.0, 0.0, 0
+    n_read, far, apart, within, gaps = 0, 0.0, 0.0, 0.0, np.empty(len(balls))
     for r in range(_STRIDE // 2, last + 1, _STRIDE):
         for c in range(_STRIDE // 2, last + 1, _STRIDE):
             if heights[r, c] == 0:
@@ -104,7 +106,7 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
             z = (heights[r, c] / 16.0 - look[13]) / (look[10] * dx + look[11] * dy + look[12])
             px, py = z * (look[4] * dx + look[5] * dy + look[6]), z * (look[7] * dx + look[8] * dy + look[9])
             pz = heights[r, c] / 16.0
-            nearest, which = nearest_ball(px, py, pz, balls, radius, which)
+            nearest, which = nearest_ball(px, py, pz, balls, radius, gaps)
             if which >= n_own:
                 continue
             nearest *= per_mm

@@ -223,9 +223,9 @@ def _pull(points, balls, radius, slopes, robust, gradient, curvature):
     """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B, 3) passes through
     it. slopes (n, 3, P) of the first n balls, which are the body's own.
     """
-    row, which = np.empty(gradient.size), 0
+    row, gaps = np.empty(gradient.size), np.empty(len(balls))
     for i in range(len(points)):
-        best, which = nearest_ball(points[i, 0], points[i, 1], points[i, 2], balls, radius, which)
+        best, which = nearest_ball(points[i, 0], points[i, 1], points[i, 2], balls, radius, gaps)
         if which >= len(slopes):
             continue
         length = max(best + radius[which], 1e-6)
