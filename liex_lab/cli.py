@@ -252,7 +252,7 @@ def live(
 @app.command()
 def show(
     session: SessionPath,
-    web: Annotated[bool, typer.Option("--web", help="Show it in the browser instead of a window.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")] = False,
     at_s: Annotated[float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")] = None,
 ) -> None:
     """Open a session's replay in Rerun."""
@@ -269,7 +269,9 @@ def show(
         raise LiexError(
             f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
         )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser does not heed it
+    if web:
+        typer.echo("Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the window does not")
     shown = [str(file) for file in replays_with(replay)]
     command = [sys.executable, "-m", "rerun", *shown, "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
