@@ -42,12 +42,15 @@ class Network:
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
 
     def logits(self, features: NDArray[np.float32]) -> Array:
-        """(m, K) of features (m, F)."""
+        """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's threads are not."""
+        from threadpoolctl import threadpool_limits
+
         x = np.clip((features - self.centre) / self.scale, -_LIMIT, _LIMIT)
-        for k, (weights, bias) in enumerate(self.layers):
-            x = x @ weights + bias
-            if k + 1 < len(self.layers):
-                x = np.maximum(x, 0.0)
+        with threadpool_limits(1, user_api="blas"):
+            for k, (weights, bias) in enumerate(self.layers):
+                x = x @ weights + bias
+                if k + 1 < len(self.layers):
+                    x = np.maximum(x, 0.0)
         return x.astype(np.float64)
 
 

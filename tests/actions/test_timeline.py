@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from threadpoolctl import threadpool_limits
 
 from liex_lab.actions.labelled import LabelledTrack, some_rows
 from liex_lab.actions.labels import read_labels, words_of
@@ -16,7 +17,7 @@ from liex_lab.actions.learning import learn, leave_one_animal_out
 from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.storage import load_action_model, save_action_model
 from liex_lab.actions.suggestions import doubtful_stretches
-from liex_lab.actions.timeline import TimelineModel
+from liex_lab.actions.timeline import Network, TimelineModel
 from liex_lab.errors import LiexError, ModelError
 from tests.actions.toy import GO, STAY, going_and_staying
 
@@ -53,6 +54,21 @@ def test_no_bout_crosses_a_gap_and_every_frame_with_a_pose_has_probabilities(mod
 def test_what_a_frame_rate_cannot_resolve_is_told(model: TimelineModel) -> None:
     assert model.unresolved(np.arange(9) * 10**9 // 120) == {}
     assert set(model.unresolved(np.arange(9) * 10**9)) == {GO, STAY}
+
+
+def test_a_network_says_the_same_bits_on_any_number_of_cores() -> None:
+    rng = np.random.default_rng(0)
+
+    def layer(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+        return rng.normal(0, 1, (n, m)).astype(np.float32), rng.normal(0, 1, m).astype(np.float32)
+
+    network = Network(np.zeros(140, np.float32), np.ones(140, np.float32), (layer(140, 64), layer(64, 9)))
+    features = rng.normal(0, 1, (4000, 140)).astype(np.float32)
+    said = []
+    for n_threads in (1, 2):
+        with threadpool_limits(n_threads, user_api="blas"):
+            said.append(network.logits(features))
+    np.testing.assert_array_equal(said[0], said[1])
 
 
 def test_a_cut_out_sequence_gets_one_word(model: TimelineModel) -> None:

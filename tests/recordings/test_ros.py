@@ -242,7 +242,7 @@ def test_a_cut_db3_gives_frames_or_a_sentence(tmp_path: Path) -> None:
         ("r.bag", b"hello", "something else"),
         ("r.bag", b"#ROSBAG V1.2\n" + bytes(99), "old ROS"),
         ("r.bag", b"#ROSBAG V2.0\n", "holds no depth pictures"),
-        ("r.db3", b"", "something else"),
+        ("r.db3", b"", "is empty"),
         ("r.db3", b"SQLite format 3\0" + bytes(5000), "holds no depth pictures"),
     ],
 )
