@@ -205,6 +205,7 @@ class PoseEstimator:
         return self._ways(self._sighted(crops, looks, size, parallel), size, parallel)
 
     def _sighted(self, crops: Crops, looks: Array, size: float, parallel: bool) -> _Sight:
+        """What was cut out of each frame, with its candidates."""
         rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
         return _Sight(crops, looks, rotations, positions, scores)
 
@@ -216,11 +217,14 @@ class PoseEstimator:
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
     ) -> tuple[_Sight, _Sight]:
         """What was taken for the animal, with its candidates, and the next best thing; see `estimate`."""
-        first = self._sight(depths, scene, size, parallel, 0)
+        camera_view = self.model.method.camera_view
+        crops, others = scene.extract_both(depths, size, parallel, camera_view)
+        first = self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
         second = first.nothing()
-        unsure = np.flatnonzero(first.crops.n_blobs > 1)
+        unsure = np.flatnonzero(crops.n_blobs > 1)
         if len(unsure):
-            other = self._sight(depths[unsure], scene, size, parallel, 1)
+            others = others[unsure]
+            other = self._sighted(others, scene.looks(others, camera_view), size, parallel)
             better = self._is_animal(depths[unsure], scene, size, first[unsure], other)
             second.put(unsure, other)
             rows = unsure[better]
@@ -228,12 +232,6 @@ class PoseEstimator:
             first.put(rows, other[better])
             second.put(rows, kept)
         return first, second
-
-    def _sight(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool, rank: int) -> _Sight:
-        """The thing of that rank in each frame, and its candidates."""
-        camera_view = self.model.method.camera_view
-        crops = scene.extract(depths, size, parallel, camera_view, rank=rank)
-        return self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
 
     def _estimates(self, sight: _Sight, size: float, parallel: bool) -> Estimates:
         """The chosen poses of what was seen, in the camera frame."""
@@ -274,9 +272,9 @@ class PoseEstimator:
         Told by area and volume and, where the metric has learned what is no animal, by its scores.
         """
         weight = _MM_PER_MISFIT * self.skeleton.relative_size
-        crops = [first.crops, second.crops]
+        crops = first.crops, second.crops
         if self.model.method.camera_view:  # likeness is told by what the scene's own view shows
-            crops = [scene.extract(depths, size, rank=rank) for rank in (0, 1)]
+            crops = scene.extract_both(depths, size)
         likeness = [weight * scene.misfit(crop) for crop in crops]
         if not self.model.method.metric_on_own:
             return likeness[1] < likeness[0]
