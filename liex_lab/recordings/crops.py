@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -41,7 +42,12 @@ class Crops:
     distance: Array
     n_blobs: NDArray[np.int64]
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Crops:
+    @staticmethod
+    def join(parts: Sequence[Crops]) -> Crops:
+        """Several batches as one."""
+        return Crops(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Crops)))
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Crops:
         """Some crops out of a batch."""
         return Crops(*(getattr(self, field.name)[index] for field in fields(self)))
 
