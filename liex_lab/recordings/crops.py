@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -48,6 +49,11 @@ class Crops:
             np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
             np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.full(n, distance_mm), np.zeros(n, np.int64),
         )  # fmt: skip
+
+    @staticmethod
+    def join(parts: Sequence[Crops]) -> Crops:
+        """Several batches as one."""
+        return Crops(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Crops)))
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Crops:
         """Some crops out of a batch."""
