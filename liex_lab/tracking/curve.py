@@ -21,7 +21,9 @@ from liex_lab.tracking.tuning import Tuning
 Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
-_ADMIT = 2.0  # predicted errors: nearer to the curve, a hypothesis that was passed by is a measurement after all
+# nearer to the curve than so many predicted errors, a hypothesis that was passed by is a measurement after all, unless
+# its score costs more than this share of what a score can: then it is of something else, or of half the animal
+_ADMIT, _ADMIT_COST = 2.0, 2 / 3
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -59,7 +61,7 @@ def track_whole(
             _turn_round(subject.skeleton, seen, path, pose, span)
             doubt[span.start : span.stop] = 0.0
     curve = _smoothed(subject, seen, pose, error, motion)
-    admitted = _admitted(subject.skeleton, seen, path, curve)
+    admitted = _admitted(subject.skeleton, seen, path, curve, chain.likely(seen, _ADMIT_COST))
     if (admitted >= 0).any():
         taken = admitted >= 0
         path = np.where(taken, admitted, path)
@@ -100,11 +102,15 @@ def _smoothed(subject: Subject, seen: Observations, pose: Pose, error: Array, mo
     return Curve.join(parts)
 
 
-def _admitted(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the hypothesis that lies on the curve all the same; NONE elsewhere."""
+def _admitted(
+    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, likely: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """(n,) of frames that were passed by, the `likely` (n, H) hypothesis that lies on the curve all the same; NONE
+    elsewhere.
+    """
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
     for h in range(seen.score.shape[1]):
-        rows = np.flatnonzero((path == NONE) & seen.known[:, h] & np.isfinite(curve.error_mm))
+        rows = np.flatnonzero((path == NONE) & likely[:, h] & np.isfinite(curve.error_mm))
         if not len(rows):
             continue
         joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
