@@ -102,14 +102,16 @@ def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
     from liex_lab.tracking.observations import Observations
 
     whole = writer.seen(Observations)
-    writer.take(tracker.track(whole), whole, tracker.subject)
+    writer.take(tracker.track(whole, room=writer.room), whole, tracker.subject)
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
     give_back()  # hours of recording leave much behind
-    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin)
+    rows = writer.rows
+    behaviour, notes = measure_behaviour(rows, plan, writer.origin)
     writer.note(**notes)
+    rows.track.rest()
     give_back()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
@@ -120,6 +122,8 @@ def measure_behaviour(rows: Rows, plan: Plan, origin: Provenance) -> tuple[Behav
 
     recogniser = build_recogniser(plan, origin.skeleton)
     named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows)
+    rows.track.rest()
+    give_back()
     return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
 
 
