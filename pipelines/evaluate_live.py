@@ -18,10 +18,12 @@ LIVE_PROTOCOL = (
     "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at the camera's pace, "
     "forwards and backwards in turn. latency: from when a whole frame had come to when its skeleton was told, without "
     "a viewer; counted from the first frame on that came when all before it had been told, so that learning the "
-    "background and compiling are not in it, and from then on every frame."
+    "background is not in it, and from then on every frame. Some frames are followed beforehand, so that all is "
+    "compiled."
 )
 _SEED = 78_001
 _KEPT = 150  # frames rendered
+_WARM, _WARM_SPEED = 60, 1000.0  # frames followed beforehand, and how many times as fast
 
 
 def evaluate_live(
@@ -38,7 +40,9 @@ def evaluate_live(
         name=f"live-{animal}", format="synthetic", camera=filmed.camera,
         times_ns=step_ns * np.arange(n_frames, dtype=np.int64), read=lambda index: kept[_to_and_fro(index, len(kept))],
     )  # fmt: skip
-    numbers, _ = follow_live(replayed(again), plan_of(animal), learn_frames=learn_frames, progress=progress)
+    plan = plan_of(animal)
+    follow_live(replayed(again[: learn_frames + _WARM], _WARM_SPEED), plan, learn_frames=learn_frames)
+    numbers, _ = follow_live(replayed(again), plan, learn_frames=learn_frames, progress=progress)
     return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers, "protocol": LIVE_PROTOCOL}
 
 

@@ -202,7 +202,7 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
     shown = size if method.session_size else np.ones(len(size))
     if skeleton.view.foreground == FOREGROUNDS[1]:
         held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
-        cuts = [held.extract(shown, method.camera_view, rank) for rank in (0, 1)]
+        crops, looks = held.extract(shown, method.camera_view, n_things=2)
     else:
         depth, background = (
             picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
@@ -212,8 +212,11 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
         area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
         # a scene learned from a recording knows how much its readings spread
         least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-        cuts = [cut.extract(shown, area, least, method.camera_view, rank) for rank in (0, 1)]
-    return TrainingSet.join([with_truth(skeleton, method, windows, crops, looks) for crops, looks in cuts])
+        crops, looks = cut.extract(shown, area, least, method.camera_view, n_things=2)
+    n = len(size)
+    return TrainingSet.join(
+        [with_truth(skeleton, method, windows, crops[thing], looks[thing]) for thing in (slice(n), slice(n, None))]
+    )
 
 
 def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:

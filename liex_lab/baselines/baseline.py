@@ -46,13 +46,12 @@ def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple
     Heights along the optical axis, no size known. Where two things have about the animal's area, the one that is more
     like it in area and volume is taken, as for the paper's own variant of the method.
     """
-    crops = scene.extract(depths, 1.0, parallel, camera_view=True)
+    crops, second = scene.extract_both(depths, 1.0, parallel, camera_view=True)
     unsure = np.flatnonzero(crops.n_blobs > 1)
     if len(unsure):
-        second = scene.extract(depths[unsure], 1.0, parallel, camera_view=True, rank=1)
-        misfits = [scene.misfit(scene.extract(depths[unsure], 1.0, parallel, rank=rank)) for rank in (0, 1)]
-        better = misfits[1] < misfits[0]
-        crops.put(unsure[better], second[better])
+        misfits = [scene.misfit(above_floor) for above_floor in scene.extract_both(depths[unsure], 1.0, parallel)]
+        better = unsure[misfits[1] < misfits[0]]
+        crops.put(better, second[better])
     return crops, scene.looks(crops, camera_view=True)
 
 

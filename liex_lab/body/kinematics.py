@@ -35,18 +35,25 @@ def aim(direction_from: Array, direction_to: Array) -> Array:
 
     Opposite directions have no smallest rotation; they turn by pi about some perpendicular axis.
     """
-    a = direction_from / np.linalg.norm(direction_from, axis=-1, keepdims=True)
-    b = direction_to / np.linalg.norm(direction_to, axis=-1, keepdims=True)
-    a, b = np.broadcast_arrays(a, b)
-    cross = np.cross(a, b)
-    sine = np.linalg.norm(cross, axis=-1, keepdims=True)
+    a, b = _unit(direction_from), _unit(direction_to)
+    cross = so3.cross(a, b)
+    sine = _length(cross)
     angle = np.arctan2(sine, np.sum(a * b, axis=-1, keepdims=True))
+    if np.all(sine > 1e-12):
+        return cross / sine * angle
     # any axis perpendicular to a will do when the cross product vanishes
     helper = np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    perpendicular = np.cross(a, helper)
-    perpendicular = perpendicular / np.linalg.norm(perpendicular, axis=-1, keepdims=True)
-    axis = np.where(sine > 1e-12, cross / np.where(sine > 1e-12, sine, 1.0), perpendicular)
+    axis = np.where(sine > 1e-12, cross / np.where(sine > 1e-12, sine, 1.0), _unit(so3.cross(a, helper)))
     return axis * angle
+
+
+def _length(v: Array) -> Array:
+    """(..., 1) of vectors (..., 3)."""
+    return np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+
+
+def _unit(v: Array) -> Array:
+    return v / _length(v)
 
 
 def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3, Array, Array]:
@@ -61,14 +68,13 @@ def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3
     scale = length.sum(-1) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
     bone = skeleton.offsets[children[0]]
     forward = along[..., 0, :] * np.sign(bone[0])
-    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    forward = _unit(forward)
     # a base that points straight up or down has no yaw of its own: lean on the next axis
     up = np.broadcast_to(up, forward.shape)
-    level = np.linalg.norm(up, axis=-1, keepdims=True)
+    level = _length(up)
     vertical = np.abs(np.sum(forward * up, axis=-1, keepdims=True)) > 0.999 * level
-    side = np.cross(np.where(vertical, np.roll(up, 1, axis=-1), up), forward)
-    side = side / np.linalg.norm(side, axis=-1, keepdims=True)
-    rotation = np.stack([forward, side, np.cross(forward, side)], axis=-1)
+    side = _unit(so3.cross(np.where(vertical, np.roll(up, 1, axis=-1), up), forward))
+    rotation = np.stack([forward, side, so3.cross(forward, side)], axis=-1)
     root = SE3(rotation, joints[..., 0, :])
     angles = np.zeros(joints.shape)
     for j in range(1, skeleton.n_joints):

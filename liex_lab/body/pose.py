@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +33,7 @@ class Pose:
         """The straight pose at the origin, pointing along x, or a batch of it."""
         return Pose(SE3.identity(*batch), np.zeros((*batch, skeleton.n_joints, 3)), np.ones(batch))
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int) -> Pose:
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]) -> Pose:
         """Some poses out of a batch."""
         return Pose(SE3(self.root.rotation[index], self.root.translation[index]), self.angles[index], self.scale[index])
 

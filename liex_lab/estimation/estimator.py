@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -45,6 +46,9 @@ class Estimates:
     found: NDArray[np.bool_]
     crops: Crops
 
+    def __getitem__(self, rows: slice) -> Estimates:
+        return Estimates(self.chosen[rows], self.found[rows], self.crops[rows])
+
 
 @dataclass(frozen=True)
 class _Sight:
@@ -62,10 +66,21 @@ class _Sight:
         return _Sight(self.crops[index], self.looks[index], self.rotations[index], self.positions[index],
                       self.scores[index])  # fmt: skip
 
+    @staticmethod
+    def join(parts: Sequence[_Sight]) -> _Sight:
+        """Those of several batches, one after the other."""
+        rest = (np.concatenate([getattr(p, name) for p in parts]) for name in _OF_SIGHT)
+        return _Sight(Crops.join([p.crops for p in parts]), *rest)
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(n,) where there is something, and a candidate for it."""
+        return self.crops.found & np.isfinite(self.scores).any(axis=1)
+
     def put(self, rows: NDArray[np.int64], other: _Sight) -> None:
         """Take these rows (m,) from another one of m frames."""
         self.crops.put(rows, other.crops)
-        for name in ("looks", "rotations", "positions", "scores"):
+        for name in _OF_SIGHT:
             getattr(self, name)[rows] = getattr(other, name)
 
     def nothing(self) -> _Sight:
@@ -90,6 +105,9 @@ class _Sight:
             self.crops, self.looks, self.rotations[rows[:, None], taken], self.positions[rows[:, None], taken],
             np.where(some[:, None], np.take_along_axis(scores, taken, axis=1), np.inf),
         )  # fmt: skip
+
+
+_OF_SIGHT = ("looks", "rotations", "positions", "scores")
 
 
 @dataclass(frozen=True)
@@ -191,8 +209,7 @@ class PoseEstimator:
         are not found.
         """
         size = size if self.model.method.session_size else 1.0
-        first, second = (self._ways(s, size, parallel) for s in self._look(depths, scene, size, parallel))
-        return (*first, *second)
+        return self._ways(self._look(depths, scene, size, parallel), size, parallel)
 
     def best_of(self, crops: Crops, looks: Array, size: float, parallel: bool = True) -> Estimates:
         """The pose of each height map (n), camera frame; see `estimate`."""
@@ -202,25 +219,36 @@ class PoseEstimator:
     def both_ways(self, crops: Crops, looks: Array, size: float, parallel: bool = True) -> tuple[Estimates, Estimates]:
         """The same, and the best pose that points the other way; see `hypotheses`."""
         size = size if self.model.method.session_size else 1.0
-        return self._ways(self._sighted(crops, looks, size, parallel), size, parallel)
+        best, turned = self._ways((self._sighted(crops, looks, size, parallel),), size, parallel)
+        return best, turned
 
     def _sighted(self, crops: Crops, looks: Array, size: float, parallel: bool) -> _Sight:
+        """What was cut out of each frame, with its candidates."""
         rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
         return _Sight(crops, looks, rotations, positions, scores)
 
-    def _ways(self, sight: _Sight, size: float, parallel: bool) -> tuple[Estimates, Estimates]:
-        best = self._estimates(sight, size, parallel)
-        return best, self._estimates(sight.opposite(best.found, self.skeleton.tip), size, parallel)
+    def _ways(self, sights: Sequence[_Sight], size: float, parallel: bool) -> tuple[Estimates, ...]:
+        """The chosen poses of each sight and those that point the other way, in turn.
+
+        All are chosen in one go: a live frame's poses are few, and what a step costs is its call.
+        """
+        both = [way for s in sights for way in (s, s.opposite(s.usable, self.skeleton.tip))]
+        whole = self._estimates(_Sight.join(both), size, parallel)
+        n = len(both[0].looks)
+        return tuple(whole[k * n : (k + 1) * n] for k in range(len(both)))
 
     def _look(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
     ) -> tuple[_Sight, _Sight]:
         """What was taken for the animal, with its candidates, and the next best thing; see `estimate`."""
-        first = self._sight(depths, scene, size, parallel, 0)
+        camera_view = self.model.method.camera_view
+        crops, others = scene.extract_both(depths, size, parallel, camera_view)
+        first = self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
         second = first.nothing()
-        unsure = np.flatnonzero(first.crops.n_blobs > 1)
+        unsure = np.flatnonzero(crops.n_blobs > 1)
         if len(unsure):
-            other = self._sight(depths[unsure], scene, size, parallel, 1)
+            others = others[unsure]
+            other = self._sighted(others, scene.looks(others, camera_view), size, parallel)
             better = self._is_animal(depths[unsure], scene, size, first[unsure], other)
             second.put(unsure, other)
             rows = unsure[better]
@@ -229,16 +257,9 @@ class PoseEstimator:
             second.put(rows, kept)
         return first, second
 
-    def _sight(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool, rank: int) -> _Sight:
-        """The thing of that rank in each frame, and its candidates."""
-        camera_view = self.model.method.camera_view
-        crops = scene.extract(depths, size, parallel, camera_view, rank=rank)
-        return self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
-
     def _estimates(self, sight: _Sight, size: float, parallel: bool) -> Estimates:
         """The chosen poses of what was seen, in the camera frame."""
-        crops = sight.crops
-        usable = crops.found & np.isfinite(sight.scores).any(axis=1)
+        crops, usable = sight.crops, sight.usable
         seen = sight[np.flatnonzero(usable)]
         images = ImageSet(seen.crops.heights, seen.looks, seen.crops.moments)
         picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
@@ -274,9 +295,9 @@ class PoseEstimator:
         Told by area and volume and, where the metric has learned what is no animal, by its scores.
         """
         weight = _MM_PER_MISFIT * self.skeleton.relative_size
-        crops = [first.crops, second.crops]
+        crops = first.crops, second.crops
         if self.model.method.camera_view:  # likeness is told by what the scene's own view shows
-            crops = [scene.extract(depths, size, rank=rank) for rank in (0, 1)]
+            crops = scene.extract_both(depths, size)
         likeness = [weight * scene.misfit(crop) for crop in crops]
         if not self.model.method.metric_on_own:
             return likeness[1] < likeness[0]

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _ROBUST_MM = 10.0  # in tenths of the balls' usual radius: a reading this far off counts a quarter
 _BESIDE = 0.3  # what a ball beside the animal weighs against a reading
+_FIRST_STEPS, _GO_ON = 1, 2  # that all poses take, and how many of them take the others: those that then lie best
 _BESIDE_MM = 4.0  # in that unit: what it weighs in the choice, if all balls were beside it
 # what it costs to leave the pose that the regressors found, in squares of that unit: a radian of the base, a unit of
 # place, of log scale, and a radian of a joint
@@ -70,11 +71,20 @@ class Refiner:
         return out.reshape(n, k, -1).astype(float)
 
     def best(self, poses: Pose, images: ImageSet, size: float, n_steps: int) -> tuple[Pose, Array]:
-        """The one of poses (n, K) that lies best in the picture once it was taken there (n), and its fit (n, N_FIT)."""
-        moved = self.refine(poses, images.heights, images.looks, size, n_steps)
-        fit = self.fit(moved, images.heights, images.looks, images.moments, size)
-        left = (fit[..., explaining.OUT_OF] + fit[..., explaining.APART]) / explaining.MM_UNIT
-        left += _BESIDE_MM * fit[..., explaining.BESIDE] / explaining.SHARE_UNIT
-        rows = np.arange(len(fit)), left.argmin(axis=1)
-        root = SE3(moved.root.rotation[rows], moved.root.translation[rows])
-        return Pose(root, moved.angles[rows], moved.scale[rows]), fit[rows]
+        """The one of poses (n, K) that lies best in the picture once it was taken there (n), and its fit (n, N_FIT).
+
+        A first step tells which are worth the others.
+        """
+        kept, rows = poses, np.arange(len(poses.scale))[:, None]
+        for n_more in (min(_FIRST_STEPS, n_steps), max(n_steps - _FIRST_STEPS, 0)):
+            moved = self.refine(kept, images.heights, images.looks, size, n_more)
+            fit = self.fit(moved, images.heights, images.looks, images.moments, size)
+            order = rows, np.argsort(_apart(fit), axis=1, kind="stable")[:, :_GO_ON]
+            kept, fit = moved[order], fit[order]
+        return kept[:, 0], fit[:, 0]
+
+
+def _apart(fit: Array) -> Array:
+    """How far (n, K) mm poses are from what the picture shows, of their fit (n, K, N_FIT)."""
+    off = (fit[..., explaining.OUT_OF] + fit[..., explaining.APART]) / explaining.MM_UNIT
+    return np.asarray(off + _BESIDE_MM * fit[..., explaining.BESIDE] / explaining.SHARE_UNIT)

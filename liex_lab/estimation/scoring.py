@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,10 @@ class Chosen:
     fit: Array
     told_scale: Array
     told_trust: Array
+
+    def __getitem__(self, rows: slice) -> Chosen:
+        """Some consecutive frames."""
+        return Chosen(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def choose(
@@ -176,11 +180,11 @@ def _spread_of_coordinates(
     twist = (root.inverse() @ SE3(turned[:, :, 0], joints[:, :, 0])).log()
     sd_root = np.sqrt(np.einsum("nk,nkd->nd", weight, twist**2))
     mean = pose.frames(skeleton).rotation
+    moving = np.array(skeleton.solved[1:])
+    parents = skeleton.parents[moving]
+    local = np.swapaxes(turned[:, :, parents], -1, -2) @ turned[:, :, moving]
+    mean_local = np.swapaxes(mean[:, parents], -1, -2) @ mean[:, moving]
+    turn = so3.log(np.swapaxes(mean_local, -1, -2)[:, None] @ local)
     sd_angles = np.zeros((*mean.shape[:2], 3))
-    for j in skeleton.solved[1:]:
-        p = skeleton.parents[j]
-        local = np.swapaxes(turned[:, :, p], -1, -2) @ turned[:, :, j]
-        mean_local = np.swapaxes(mean[:, p], -1, -2) @ mean[:, j]
-        turn = so3.log(np.swapaxes(mean_local, -1, -2)[:, None] @ local)
-        sd_angles[:, j] = np.sqrt(np.einsum("nk,nkd->nd", weight, turn**2)) * skeleton.axes[j]
+    sd_angles[:, moving] = np.sqrt(np.einsum("nk,nkjd->njd", weight, turn**2)) * skeleton.axes[moving]
     return sd_root, sd_angles

@@ -21,6 +21,14 @@ def hat(omega: ArrayLike) -> Array:
     return matrix
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross products (..., 3) of vectors (..., 3) that broadcast; np.cross, three times as fast for few."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for k, i, j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
+    return out
+
+
 def vee(matrix: ArrayLike) -> Array:
     """Vectors (..., 3) of skew matrices (..., 3, 3): the inverse of `hat`."""
     m = np.asarray(matrix, float)
@@ -49,17 +57,15 @@ def quaternion(rotation: ArrayLike) -> Array:
     r = np.asarray(rotation, float)
     d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
-    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], wx, wy, wz], axis=-1),
-            np.stack([wx, squares[..., 1], xy, xz], axis=-1),
-            np.stack([wy, xy, squares[..., 2], yz], axis=-1),
-            np.stack([wz, xz, yz, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
+    # row k: the quaternion times four times its component k
+    rows = np.empty((*squares.shape, 4))
+    for k in range(4):
+        rows[..., k, k] = squares[..., k]
+    for i, k, value in (
+        (0, 1, r[..., 2, 1] - r[..., 1, 2]), (0, 2, r[..., 0, 2] - r[..., 2, 0]), (0, 3, r[..., 1, 0] - r[..., 0, 1]),
+        (1, 2, r[..., 0, 1] + r[..., 1, 0]), (1, 3, r[..., 0, 2] + r[..., 2, 0]), (2, 3, r[..., 1, 2] + r[..., 2, 1]),
+    ):  # fmt: skip
+        rows[..., i, k] = rows[..., k, i] = value
     pivot = np.argmax(squares, axis=-1)
     q = np.take_along_axis(rows, pivot[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)

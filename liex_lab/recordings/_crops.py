@@ -30,8 +30,8 @@ def blob_area(blob, mm2_per_px):
 
 
 @njit(cache=True)
-def choose_blob(blobs, n_blobs, area, mm2_per_px, rank):
-    """The blob whose area comes next near (`rank`) to the animal's, -1 for none, and how many have about its area.
+def order_blobs(blobs, n_blobs, area, mm2_per_px):
+    """The blobs in the order in which their areas come near to the animal's, and how many have about its area.
 
     While `area` is 0 the largest comes first.
     """
@@ -46,17 +46,16 @@ def choose_blob(blobs, n_blobs, area, mm2_per_px, rank):
             distances[slot] = np.inf
         else:
             n_near += 1
-    if rank >= n_near:
-        return -1, n_near
-    return np.argsort(distances)[rank], n_near
+    return np.argsort(distances), n_near
 
 
 @njit(cache=True)
 def extract_one(
-    depth, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
-    n_px, moments, distance, n_blobs, k,
+    depth, limit, on_floor, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs, k,
 ):  # fmt: skip
-    """Find the animal in one frame and fill row k of the batch; distance[k] comes in as the floor's.
+    """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's. Where n_things is 2,
+    the batch has twice as many rows as there are frames, and the second half gets what comes next near.
 
     behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth.
     """
@@ -65,14 +64,16 @@ def extract_one(
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
     bridge = BRIDGE if behind_mm > 0.0 else 0
     n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
-    slot, n_blobs[k] = choose_blob(blobs, n_found, area, mm2_per_px, rank)
-    if slot < 0:
-        return
-    blob = blobs[slot]
-    mean_depth = blob[5] / blob[0]
-    cut_crop(depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, rotation, behind_mm, heights,
-             origin, n_steps, moments, distance, k)  # fmt: skip
-    n_px[k] = int(blob[0])
+    order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
+    for rank in range(n_things):
+        row = k + rank * (len(n_px) // n_things)
+        n_blobs[row] = n_near
+        if rank < n_near:
+            slot = order[rank]
+            blob = blobs[slot]
+            cut_crop(depth, limit, labels, slot, blob, blob[5] / blob[0], smooth_mm, intrinsics, plane, rotation,
+                     behind_mm, heights, origin, n_steps, moments, distance, row)  # fmt: skip
+            n_px[row] = int(blob[0])
 
 
 @njit(cache=True)
@@ -111,17 +112,17 @@ def cut_crop(
 
 @njit(cache=True, parallel=True, nogil=True)
 def extract_all(
-    depths, limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin, n_steps,
-    n_px, moments, distance, n_blobs,
+    depths, limit, on_floor, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs,
 ):  # fmt: skip
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], limit, on_floor, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm,
+        extract_one(depths[k], limit, on_floor, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm,
                     heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
 
 
 @njit(cache=True, parallel=True, nogil=True)
 def extract_windows(
-    depths, background, margin, area, rank, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    depths, background, margin, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
     n_steps, n_px, moments, distance, n_blobs,
 ):  # fmt: skip
     for k in prange(depths.shape[0]):
@@ -133,5 +134,5 @@ def extract_windows(
                     inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
                     behind = 1.0 / inverse if inverse > 1e-6 else 0.0
                 limit[v, u] = max(behind - margin[k], 0.0)
-        extract_one(depths[k], limit, everywhere, area[k], rank, smooth_mm[k], intrinsics[k], plane[k], rotation[k],
+        extract_one(depths[k], limit, everywhere, area[k], n_things, smooth_mm[k], intrinsics[k], plane[k], rotation[k],
                     behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip

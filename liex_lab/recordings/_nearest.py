@@ -236,27 +236,42 @@ def _reach(blocks, labels, row, column):
 
 @njit(cache=True)
 def extract_one(
-    depth, near, far, rank, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
+    depth, near, far, n_things, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
     distance, n_blobs, k,
 ):  # fmt: skip
-    """Find the hand in one frame (H, W) mm and fill row k of the batch; see `NearestScene.extract`."""
+    """Find the hand in frame k (H, W) mm and fill row k of the batch; see `NearestScene.extract`. Where n_things is 2,
+    the batch has twice as many rows as there are frames, and the second half gets what may be a hand as well.
+    """
     blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
     labels = np.empty(blocks.shape, np.int32)
     areas, ends = np.empty(MAX_SURFACES), np.empty((_MOST_ENDS, 4))
     focal2 = intrinsics[0] * intrinsics[1]
     block_depths(depth, near, far, blocks)
     n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
-    found, box = np.empty(FIELDS), np.empty(4, np.int64)
     n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, ends)
     unlike = np.empty(n_ends)
     compare_ends(blocks, labels, ends, size, intrinsics, unlike)
     ranked = np.argsort(unlike)
-    n_blobs[k] = min(n_ends, 2)
+    n_alike = min(n_ends, 2)
     if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
-        n_blobs[k] = 1
-    if rank >= n_blobs[k]:
-        return
-    locate(blocks, labels, ends[ranked[rank]], size, intrinsics, found)
+        n_alike = 1
+    for rank in range(n_things):
+        row = k + rank * (len(n_px) // n_things)
+        n_blobs[row] = n_alike
+        if rank < n_alike:
+            cut_end(depth, near, far, blocks, labels, ends[ranked[rank]], size, behind, smooth, intrinsics, along_axis,
+                    heights, origin, n_steps, n_px, moments, distance, row)  # fmt: skip
+
+
+@njit(cache=True)
+def cut_end(
+    depth, near, far, blocks, labels, end, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps,
+    n_px, moments, distance, k,
+):  # fmt: skip
+    """The height map of the hand at an end of a surface, and its moments, into row k; labels stay as they are."""
+    found, box = np.empty(FIELDS), np.empty(4, np.int64)
+    slot = labels[int(end[1]), int(end[2])]
+    locate(blocks, labels, end, size, intrinsics, found)
     box_of(labels, MAX_SURFACES, box)
     if box[1] < 0:
         return
@@ -273,8 +288,12 @@ def extract_one(
     plane = view_plane(rotation, distance[k], intrinsics)
     raw = np.empty((crop, crop), np.float32)
     cut_heights(depth, blocks, labels, found, plane, distance[k], intrinsics, origin[k], step, near, far, raw)
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
+            if labels[i, j] == MAX_SURFACES:
+                labels[i, j] = slot
     segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
-    mm_per_px = step * found[2] / np.sqrt(focal2)
+    mm_per_px = step * found[2] / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])
     segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k])
@@ -306,12 +325,12 @@ def view_plane(rotation, distance, intrinsics):
 
 @njit(cache=True, parallel=True)
 def extract_all(
-    depths, near, far, rank, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
+    depths, near, far, n_things, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
     distance, n_blobs,
 ):  # fmt: skip
     """`extract_one` for a batch; size, behind, smooth (n,) and intrinsics (n, 4) differ."""
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], near, far, rank, size[k], behind[k], smooth[k], intrinsics[k], along_axis, heights,
+        extract_one(depths[k], near, far, n_things, size[k], behind[k], smooth[k], intrinsics[k], along_axis, heights,
                     origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class Floor:
         a, b = n[0] / camera.fx / distance_mm, n[1] / camera.fy / distance_mm
         return Floor(n, float(distance_mm), np.array([a, b, n[2] / distance_mm - a * camera.cx - b * camera.cy]))
 
-    @property
+    @cached_property
     def T_arena_camera(self) -> SE3:
         """Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along the camera's."""
         up = -self.normal

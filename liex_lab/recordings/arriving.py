@@ -160,7 +160,7 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
             height, width = frame.depth.shape
             try:
                 link.sendall(_FRAME.pack(frame.index, frame.time_ns, height, width))
-                link.sendall(np.ascontiguousarray(frame.depth, np.float32).tobytes())
+                link.sendall(np.ascontiguousarray(frame.depth, np.float32).data.cast("B"))
             except OSError:  # nobody listens any more
                 return
 
@@ -169,23 +169,27 @@ def _frames(link: socket.socket) -> Iterator[Arrival]:
     with link:
         while head := _exactly(link, _FRAME.size):
             index, time_ns, height, width = _FRAME.unpack(head)
-            data = _exactly(link, 4 * height * width)
-            if not data:
+            depth = np.empty((height, width), np.float32)
+            if not _fill(link, depth.data.cast("B")):
                 return
-            depth = np.frombuffer(data, np.float32).reshape(height, width)
             yield Arrival(DepthFrame(index, time_ns, depth), time.perf_counter())
 
 
 def _exactly(link: socket.socket, n: int) -> bytes:
     """The next n bytes, none where the sender has gone."""
-    parts, left = [], n
-    while left:
+    data = bytearray(n)
+    return bytes(data) if _fill(link, memoryview(data)) else b""
+
+
+def _fill(link: socket.socket, place: memoryview) -> bool:
+    """Whether the next bytes came, as many as there is room for; they go where they stay, a frame is millions."""
+    filled = 0
+    while filled < len(place):
         try:
-            part = link.recv(min(left, 1 << 20))
+            n = link.recv_into(place[filled:])
         except OSError:
-            return b""
-        if not part:
-            return b""
-        parts.append(part)
-        left -= len(part)
-    return b"".join(parts)
+            return False
+        if not n:
+            return False
+        filled += n
+    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -41,7 +42,20 @@ class Crops:
     distance: Array
     n_blobs: NDArray[np.int64]
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Crops:
+    @staticmethod
+    def blank(n: int, distance_mm: Array | float) -> Crops:
+        """A batch in which nothing is found yet."""
+        return Crops(
+            np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
+            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.full(n, distance_mm), np.zeros(n, np.int64),
+        )  # fmt: skip
+
+    @staticmethod
+    def join(parts: Sequence[Crops]) -> Crops:
+        """Several batches as one."""
+        return Crops(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Crops)))
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Crops:
         """Some crops out of a batch."""
         return Crops(*(getattr(self, field.name)[index] for field in fields(self)))
 
@@ -78,9 +92,14 @@ class Foreground(Protocol):
         """The animal's usual area seen by the camera."""
 
     def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
     ) -> Crops:
-        """The animal of each frame (n, H, W) mm, or (rank 1) what may be it as well."""
+        """The animal of each frame (n, H, W) mm."""
+
+    def extract_both(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+    ) -> tuple[Crops, Crops]:
+        """The animal of each frame (n, H, W) mm, and what else may be it, found where n_blobs is more than one."""
 
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17)."""
@@ -132,16 +151,14 @@ class Windows:
         area_mm2: Array,
         min_height_mm: Array | float = 7.0,
         camera_view: bool = False,
-        rank: int = 0,
+        n_things: int = 1,
     ) -> tuple[Crops, Array]:
-        """The blobs of each window whose areas are nearest to area_mm2 (n,), by rank, and their looks (n, 17); see
-        `Scene.extract` and `Scene.looks`. size (n,) of the animals over home; min_height_mm: one, or (n,).
+        """The blob of each window whose area is nearest to area_mm2 (n,), and its looks (n, 17); see `Scene.extract`
+        and `Scene.looks`. size (n,) of the animals over home; min_height_mm: one, or (n,); n_things: 2 gives as many
+        rows again, of what is next near.
         """
         n = len(self.depth)
-        crops = Crops(
-            np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.empty(n), np.zeros(n, np.int64),
-        )  # fmt: skip
+        distance = np.empty(n)
         # a window is the picture of a camera whose centre is shifted
         intrinsics, plane = self.intrinsics.copy(), self.inverse_depth.copy()
         intrinsics[:, 2:] -= self.origin
@@ -151,14 +168,14 @@ class Windows:
         for k in range(n):
             if not k or (of_whom[k] != of_whom[k - 1]).any():  # many in a row are often before one camera
                 floor = self.floor(k)
-            crops.distance[k] = floor.distance_mm
+            distance[k] = floor.distance_mm
             rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
+        crops = Crops.blank(n_things * n, np.tile(distance, n_things))
         kernels.extract_windows(
-            self.depth, self.background, margin, area_mm2, rank, self.view.smooth_mm * size,
+            self.depth, self.background, margin, area_mm2, n_things, self.view.smooth_mm * size,
             intrinsics, plane, rotation, np.full(n, self.view.behind_mm if camera_view else 0.0), crops.heights,
             crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
         )  # fmt: skip
-        looks = np.concatenate(
-            [intrinsics, rotation.reshape(n, 9), crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1
-        )
+        cut = np.tile(np.concatenate([intrinsics, rotation.reshape(n, 9)], axis=1), (n_things, 1))
+        looks = np.concatenate([cut, crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1)
         return crops, looks

@@ -12,7 +12,7 @@ from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
 from liex_lab.recordings import _crops as kernels
-from liex_lab.recordings._segment import MAX_BLOBS, N_MOMENTS
+from liex_lab.recordings._segment import MAX_BLOBS
 from liex_lab.recordings.arena import Floor, find_floor
 from liex_lab.recordings.background import floor_region, learn_background, sample_frames, stride_for
 from liex_lab.recordings.crops import CROP, Crops, Windows
@@ -223,26 +223,34 @@ class Scene:
         return looks
 
     def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
     ) -> Crops:
         """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home length.
 
-        depths: whole pictures, or a sample of them with the scene's own stride. rank: 0 takes the blob whose area is
-        nearest to the animal's, 1 the next one, which may be the animal after all. camera_view: heights are measured
-        along the optical axis from the view's behind_mm behind the animal's mean depth, as the paper's features see
-        them; otherwise above the floor.
+        depths: whole pictures, or a sample of them with the scene's own stride; the animal is the blob whose area is
+        nearest to its own. camera_view: heights are measured along the optical axis from the view's behind_mm behind
+        the animal's mean depth, as the paper's features see them; otherwise above the floor.
         """
-        n = len(depths)
+        return self._extract(depths, size, parallel, camera_view, 1)
+
+    def extract_both(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+    ) -> tuple[Crops, Crops]:
+        """`extract`, and the blob whose area is next near, which may be the animal after all."""
+        crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
+        return crops[:n], crops[n:]
+
+    def _extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+    ) -> Crops:
+        """The rows of what is nearest, and then of what is next near, if that is asked for."""
         if depths.shape[1:] != self.limit.shape:
             depths = depths[:, :: self.stride, :: self.stride]
-        crops = Crops(
-            np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.full(n, self.floor.distance_mm), np.zeros(n, np.int64),
-        )  # fmt: skip
+        crops = Crops.blank(n_things * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):
             kernels.extract_all(
-                depths, self.limit, self.on_floor, self.area_mm2, rank, self.view.smooth_mm * size,
+                depths, self.limit, self.on_floor, self.area_mm2, n_things, self.view.smooth_mm * size,
                 np.array([grid.fx, grid.fy, grid.cx, grid.cy]), self._grid_floor.inverse_depth,
                 self.view_rotation(camera_view), self.view.behind_mm if camera_view else 0.0,
                 crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,

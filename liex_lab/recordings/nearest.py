@@ -11,7 +11,6 @@ from liex_lab.body.skeleton import View
 from liex_lab.camera import Camera
 from liex_lab.errors import EstimationError
 from liex_lab.recordings import _nearest as kernels
-from liex_lab.recordings._segment import N_MOMENTS
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.background import sample_frames
 from liex_lab.recordings.crops import CROP, Crops, view_of
@@ -83,19 +82,29 @@ class NearestScene:
         return self.floor.T_arena_camera @ middle
 
     def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False, rank: int = 0
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
     ) -> Crops:
         """The hand of each frame (n, H, W) mm; `size` is its length over the skeleton's home length.
 
         Heights are measured along the line of sight through the middle of the crop, from behind_mm (at home size)
-        behind the hand's middle; camera_view: along the optical axis. rank: 0 takes the nearest thing of a hand's
-        size, 1 the next one.
+        behind the hand's middle; camera_view: along the optical axis.
         """
+        return self._extract(depths, size, parallel, camera_view, 1)
+
+    def extract_both(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+    ) -> tuple[Crops, Crops]:
+        """`extract`, and the next thing that is about as like a hand."""
+        crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
+        return crops[:n], crops[n:]
+
+    def _extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+    ) -> Crops:
         n = len(depths)
-        sizes = np.full(n, size)
         with threads(parallel):
-            return cut_nearest(depths, self._intrinsics(n), sizes, self.view, (self.near_mm, self.far_mm), camera_view,
-                               rank)  # fmt: skip
+            return cut_nearest(depths, self._intrinsics(n), np.full(n, size), self.view, (self.near_mm, self.far_mm),
+                               camera_view, n_things)  # fmt: skip
 
     def every(self, step: int) -> NearestScene:
         """The same with every `step`-th pixel along rows and columns."""
@@ -120,29 +129,28 @@ class NearestWindows:
     origin: Array
     view: View
 
-    def extract(self, size: Array, camera_view: bool = False, rank: int = 0) -> tuple[Crops, Array]:
-        """The hands and their looks (n, 17) in pixels of the windows; see `NearestScene`."""
+    def extract(self, size: Array, camera_view: bool = False, n_things: int = 1) -> tuple[Crops, Array]:
+        """The hands and their looks (n, 17) in pixels of the windows; see `NearestScene`. n_things: 2 gives as many
+        rows again, of what may be a hand as well.
+        """
         intrinsics = self.intrinsics.copy()
         intrinsics[:, 2:] -= self.origin  # a window is the picture of a camera whose centre is shifted
-        crops = cut_nearest(self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, rank)
-        return crops, looks_of(crops, intrinsics, camera_view)
+        crops = cut_nearest(self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, n_things)
+        return crops, looks_of(crops, np.tile(intrinsics, (n_things, 1)), camera_view)
 
 
 def cut_nearest(
     depths: NDArray[np.float32] | NDArray[np.uint16], intrinsics: Array, size: Array, view: View,
-    range_mm: tuple[float, float], camera_view: bool, rank: int,
+    range_mm: tuple[float, float], camera_view: bool, n_things: int,
 ) -> Crops:  # fmt: skip
-    """Height maps of the hands in pictures (n, H, W) mm; intrinsics (n, 4), size (n,).
+    """Height maps of the hands in pictures (n, H, W) mm; intrinsics (n, 4), size (n,). n_things: 2 gives as many rows
+    again, of what may be a hand as well.
 
     The long axis among the moments points away from the arm, where one is seen.
     """
-    n = len(depths)
-    crops = Crops(
-        np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32), np.zeros(n, np.int64),
-        np.zeros((n, N_MOMENTS)), np.full(n, 1000.0), np.zeros(n, np.int64),
-    )  # fmt: skip
+    crops = Crops.blank(n_things * len(depths), 1000.0)
     kernels.extract_all(
-        depths, *range_mm, rank, size, size * view.behind_mm, size * view.smooth_mm, intrinsics, camera_view,
+        depths, *range_mm, n_things, size, size * view.behind_mm, size * view.smooth_mm, intrinsics, camera_view,
         crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
     )  # fmt: skip
     return crops

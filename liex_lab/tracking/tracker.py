@@ -15,6 +15,7 @@ from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.memory import Room
 from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.threads import threads
 from liex_lab.tracking.curve import Subject, single_frames, track_whole
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.residual import BodyResidual
@@ -84,8 +85,9 @@ class FrameTracker:
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
         seen.has_depth[:] = (depths > 0).any(axis=(1, 2))
-        for h, estimates in enumerate(self.estimator.hypotheses(depths, self.scene, self.size)):
-            self._put(seen, h, estimates)
+        with threads(len(frames) > 1):  # kernels share frames out: of one, the other cores would only wait
+            for h, estimates in enumerate(self.estimator.hypotheses(depths, self.scene, self.size)):
+                self._put(seen, h, estimates)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:

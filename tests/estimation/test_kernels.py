@@ -116,12 +116,12 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
 def test_the_numbers_about_the_whole_animal_do_not_change_when_it_turns_or_grows(turned, grown):
     rng = np.random.default_rng(5)
     rotation, position = drawn_joint(rng)
-    moments = np.array([900.0, 1300.0, 21000.0, 12.0, -7.0, 0.4, 16.0, 7.0])
+    moments = np.array([900.0, 1300.0, 21000.0, 12.0, -7.0, 0.4, 16.0, 7.0, 0.2])
     before, after = np.empty((2, kernels.N_SCALARS))
     kernels.fill_scalars(rotation, position, 0.95, moments, 1.0, before)
     turn = so3.exp(np.array([0.0, 0.0, turned]))
     centre = grown * turn[:2, :2] @ moments[3:5]
-    moved = moments * [1, grown**2, grown**3, 0, 0, 1, grown, grown] + [0, 0, 0, *centre, turned, 0, 0]
+    moved = moments * [1, grown**2, grown**3, 0, 0, 1, grown, grown, 1] + [0, 0, 0, *centre, turned, 0, 0, 0]
     kernels.fill_scalars(turn @ rotation, grown * turn @ position, 0.95 * grown, moved, grown, after)
     np.testing.assert_allclose(after, before, atol=1e-8)
 

@@ -119,7 +119,7 @@ def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> No
         np.concatenate([p.angles for p in poses], axis=1), np.concatenate([p.scale for p in poses], axis=1),
     )  # fmt: skip
     best, fit = REFINER.best(both, ImageSet(crops.heights, looks, crops.moments), 1.0, 2)
-    near = refined(true, crops.heights, looks, 1.0, 2)
+    near = refined(refined(true, crops.heights, looks, 1.0, 1), crops.heights, looks, 1.0, 1)
     taken = off(best, near) < 1e-9
     assert taken.mean() > 0.9
     np.testing.assert_allclose(fit[taken], fit_of(near, crops.heights, looks, crops.moments, 1.0)[taken])

@@ -56,6 +56,12 @@ def test_hat_is_the_cross_product_and_vee_undoes_it(omega: Array, x: Array) -> N
     np.testing.assert_array_equal(so3.vee(so3.hat(omega)), omega)
 
 
+@given(a=rotation_vectors(), b=rotation_vectors())
+def test_cross_is_numpys(a: Array, b: Array) -> None:
+    np.testing.assert_array_equal(so3.cross(a, b), np.cross(a, b))
+    np.testing.assert_array_equal(so3.cross(a, np.stack([b, a])), np.cross(a, np.stack([b, a])))
+
+
 @given(omega=rotation_vectors())
 def test_the_inverse_of_the_left_jacobian_is_its_inverse(omega: Array) -> None:
     np.testing.assert_allclose(so3.left_jacobian(omega) @ so3.left_jacobian_inverse(omega), np.eye(3), atol=1e-12)

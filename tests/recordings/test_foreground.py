@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -132,6 +134,20 @@ def test_serial_and_parallel_extraction_agree():
     one, two = scene.extract(stack, 1.0, parallel=False), scene.extract(stack, 1.0, parallel=True)
     np.testing.assert_array_equal(one.heights, two.heights)
     np.testing.assert_array_equal(one.moments, two.moments)
+
+
+def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
+    floor = tilted(3.0)
+    alone = with_box(floor, (50, 60))
+    beside = np.where(alone < with_box(floor, (110, 60), (10, 6)), alone, with_box(floor, (110, 60), (10, 6)))
+    scene = replace(Scene.from_floor(CAMERA, floor), area_mm2=24 * 12 * (575.0 / 300.0) ** 2)
+    first, second = scene.extract_both(np.stack([alone, beside]), 1.0)
+    np.testing.assert_array_equal(first.heights, scene.extract(np.stack([alone, beside]), 1.0).heights)
+    assert first.n_blobs.tolist() == second.n_blobs.tolist() == [1, 2]
+    assert second.found.tolist() == [False, True]
+    only_other = scene.extract(with_box(floor, (110, 60), (10, 6))[None], 1.0)
+    np.testing.assert_array_equal(second.heights[1], only_other.heights[0])
+    np.testing.assert_allclose(second.moments[1], only_other.moments[0])
 
 
 def test_the_long_axis_and_area_of_a_box_are_its_own():

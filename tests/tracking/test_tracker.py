@@ -111,6 +111,20 @@ def test_rows_do_not_depend_on_how_the_frames_are_dealt_out(tracker, frames, tra
                 np.testing.assert_array_equal(getattr(joined, field.name), getattr(track, field.name))
 
 
+def test_the_first_hypothesis_is_the_frames_own_answer_and_the_second_points_the_other_way(tracker, frames):
+    seen = tracker.observe(frames)
+    alone = tracker.estimator.estimate(np.stack([f.depth for f in frames]), tracker.scene, tracker.size)
+    np.testing.assert_array_equal(seen.known[:, 0], alone.found)
+    np.testing.assert_array_equal(seen.error_mm[:, 0], alone.chosen.error_mm.astype(np.float32))
+    pose = alone.chosen.pose.moved(tracker.scene.floor.T_arena_camera)
+    np.testing.assert_array_equal(seen.place[:, 0], pose.root.translation.astype(np.float32))
+    both = seen.known[:, 0] & seen.known[:, 1]
+    ends = seen.joints([0, tracker.estimator.skeleton.tip])[both]
+    along = ends[:, :, 1] - ends[:, :, 0]
+    assert both.sum() > 5
+    assert (np.einsum("nd,nd->n", along[:, 0], along[:, 1]) < 0).all()
+
+
 def test_the_size_is_measured_or_taken_from_the_plan(tracker, toy, scene):
     assert tracker.size_origin == "recording"
     assert tracker.spine_mm == pytest.approx(toy.skeleton.length, rel=0.05)
