@@ -1,4 +1,4 @@
-"""Arrays on disk: they hold what arrays hold, take no memory once let go of, and a full disk is told before they are."""
+"""Arrays on disk: they hold what arrays hold, take no memory once let go of, and a full disk is told beforehand."""
 
 from __future__ import annotations
 
