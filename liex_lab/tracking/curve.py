@@ -22,7 +22,9 @@ from liex_lab.tracking.tuning import Tuning
 Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
-_ADMIT = 2.0  # predicted errors: nearer to the curve, a hypothesis that was passed by is a measurement after all
+# nearer to the curve than so many predicted errors, a hypothesis that was passed by is a measurement after all, unless
+# its score costs more than this share of what a score can: then it is of something else, or of half the animal
+_ADMIT, _ADMIT_COST = 2.0, 2 / 3
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -74,7 +76,8 @@ def track_whole(
         return curve
 
     for rows in _blocks(len(seen)):
-        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows))
+        likely = chain.likely(seen[rows], _ADMIT_COST)
+        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), likely)
         _rest(track, seen)
     taken = admitted >= 0
     path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
@@ -129,11 +132,15 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
         pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
 
 
-def _admitted(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the hypothesis that lies on the curve all the same; NONE elsewhere."""
+def _admitted(
+    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, likely: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """(n,) of frames that were passed by, the `likely` (n, H) hypothesis that lies on the curve all the same; NONE
+    elsewhere.
+    """
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
     for h in range(seen.score.shape[1]):
-        rows = np.flatnonzero((path == NONE) & seen.known[:, h] & np.isfinite(curve.error_mm))
+        rows = np.flatnonzero((path == NONE) & likely[:, h] & np.isfinite(curve.error_mm))
         if not len(rows):
             continue
         joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
