@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -57,6 +59,8 @@ def on_disk(folder: Path) -> Room:
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if not size:
             return np.empty(shape, dtype)
+        if size > shutil.disk_usage(folder).free:  # asking for the room would take all there is before it fails
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
         with tempfile.TemporaryFile(dir=folder) as file:
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)
