@@ -20,6 +20,7 @@ from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.windows import window_features
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.memory import Room, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -76,29 +77,33 @@ class TimelineModel:
         """(m, K) of each word at each tick by itself."""
         margin = round(_MARGIN_S * self.clock_hz)
         out = np.empty((len(stretch.times_s), len(self.words)))
+        speed = steady_speed(stretch, names)[:, None]
         for start in range(0, len(out), _PIECE):
             stop = min(start + _PIECE, len(out))
             low, high = max(0, start - margin), min(len(out), stop + margin)
             features = window_features(Stretch(stretch.times_s[low:high], stretch.values[low:high]), names)
             features = features[start - low : stop - low]
+            let_go(stretch.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
-            out[start:stop] = np.log(np.maximum(p, 1e-6))
-        speed = steady_speed(stretch, names)[:, None]
-        beyond = (speed < self.speeds[:, 0] / _SLACK) | (speed > self.speeds[:, 1] * _SLACK + _STILL)
-        return out - _UNSEEN * beyond
+            now = speed[start:stop]
+            beyond = (now < self.speeds[:, 0] / _SLACK) | (now > self.speeds[:, 1] * _SLACK + _STILL)
+            out[start:stop] = np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
+        return out
 
     def scores(self, log_probabilities: Array) -> Array:
         """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is."""
         return self.sharpness * (log_probabilities - np.log(np.maximum(self.share, 1e-3)))
 
-    def recognise(self, track: Track, wall_mm: Array | None = None) -> Recognised:
-        """The ethogram of a track, and the probability of each word in each of its frames."""
+    def recognise(self, track: Track, wall_mm: Array | None = None, room: Room = np.empty) -> Recognised:
+        """The ethogram of a track, and the probability of each word in each of its frames. room: for what takes much
+        of it on the way.
+        """
         n, words = track.n_frames, np.array(self.words)
         probability = np.full((n, len(words)), np.nan)
         label, part = np.full(n, UNLABELLED, dtype=words.dtype), np.full(n, -1)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
-        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm)):
+        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, room)):
             scores = self.scores(self.log_probabilities(stretch, names))
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz)
             certain = self.chain.probabilities(scores, 1.0 / self.clock_hz)
