@@ -26,6 +26,9 @@ _CURVES = (  # column of the kinematics, title, what it is, unit, colour, whethe
 )
 _WALKING, _SWIMMING = ("speed_mm_s", "nose_height_mm"), ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
 _AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz")
+# columns that are drawn
+FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
+KINEMATICS = ("time_s", "x_mm", "y_mm", *(curve[0] for curve in _CURVES))
 _CERTAIN = 0.05  # of p, corrected
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from liex_lab.dashboards import figures
-from liex_lab.dashboards.charts import around_actions, charts, curves, pictures
+from liex_lab.dashboards.charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
 from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 
 from liex_lab.sessions import Session
@@ -26,7 +26,7 @@ _TABLES = {
 def write_report(folder: str | Path) -> Path:
     """Make report.html in a session's folder from what lies in it, and return its path."""
     path = Path(folder) / "report.html"
-    write_whole(path, render(Session.open(folder)))
+    write_whole(path, render(Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS)))
     return path
 
 

@@ -1,9 +1,22 @@
-"""How much memory this process has held."""
+"""How much memory this process has held, and arrays that lie on disk so that hours of recording take no more of it."""
 
 from __future__ import annotations
 
+import errno
+import mmap
+import os
+import shutil
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_ZEROS = 1 << 20  # bytes written at once
+Room = Callable[[tuple[int, ...], Any], NDArray[Any]]  # shape and dtype -> an array to be filled, as np.empty
 
 
 def peak_memory_mb() -> float | None:
@@ -24,11 +37,50 @@ def peak_memory_mb() -> float | None:
 def give_back() -> None:
     """Hand memory that is not used any more back to the system, where it would be kept for later.
 
-    glibc keeps what lies between arrays still in use, which after hours of recording is much.
+    glibc keeps what lies between arrays still in use, and Arrow what tables took; after hours of recording it is much.
     """
+    if "pyarrow" in sys.modules:
+        sys.modules["pyarrow"].default_memory_pool().release_unused()
     if sys.platform == "linux":
         import ctypes
 
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+def on_disk(folder: Path) -> Room:
+    """Where arrays are made that lie in nameless files of that folder and go with the last who looks at them.
+
+    Making one raises OSError where the disk is full, so that filling it cannot fail.
+    """
+
+    def room(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        if not size:
+            return np.empty(shape, dtype)
+        if size > shutil.disk_usage(folder).free:  # asking for the room would take all there is before it fails
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+        with tempfile.TemporaryFile(dir=folder) as file:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+            else:
+                for start in range(0, size, _ZEROS):
+                    file.write(bytes(min(_ZEROS, size - start)))
+                file.flush()
+            return np.memmap(file, dtype, "r+", shape=shape).view(np.ndarray)
+
+    return room
+
+
+def let_go(*arrays: NDArray[Any]) -> None:
+    """Let go of the memory of those of these arrays that are mapped from files; it is read again when it is wanted.
+
+    Only for what is shared with its file (`on_disk`) or never written to: changes of a private copy would be lost.
+    """
+    for array in arrays:
+        base: Any = array
+        while base is not None and not isinstance(base, mmap.mmap):
+            base = getattr(base, "base", None)
+        if base is not None and sys.platform == "linux":
+            base.madvise(mmap.MADV_DONTNEED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
@@ -21,6 +21,19 @@ def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
                 return
             coming = maker.submit(next, left, end)
             yield item  # type: ignore[misc]
+
+
+@contextmanager
+def meanwhile(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
+    """What `make` makes on a thread of its own while the block runs; what is yielded waits for it, and raises what went
+    wrong. A block that ends before is not held up.
+    """
+    maker = ThreadPoolExecutor(1)
+    coming = maker.submit(make)
+    try:
+        yield coming.result
+    finally:
+        maker.shutdown(wait=False)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,30 +109,40 @@ def plan_of(animal: str) -> Plan:
 
 
 def build_estimator(plan: Plan) -> PoseEstimator:
-    """The estimator of the plan's animal."""
+    """The estimator of the plan's animal; the last one is kept, for a study's next session mostly wants the same."""
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.catalog import find_model
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.model import Model
+    from liex_lab.catalog import find_model, sha256
 
-    model = Model.load(find_model(plan.estimation.model))
+    path = find_model(plan.estimation.model)
+    estimator = _estimator(path, sha256(path), plan.estimation.n_candidates or 0)
     wanted = plan.animal.skeleton
     if wanted.endswith(".toml"):  # a file of the user's own: what matters is the animal in it
         wanted = Skeleton.load(wanted).name
-    if model.skeleton.name != wanted:
+    if estimator.skeleton.name != wanted:
         raise PlanError(
-            f"the model '{plan.estimation.model}' was made for the skeleton {model.skeleton.name}, but the plan says "
-            f"{plan.animal.skeleton}; set estimation.model to a model of the {wanted}"
+            f"the model '{plan.estimation.model}' was made for the skeleton {estimator.skeleton.name}, but the plan "
+            f"says {plan.animal.skeleton}; set estimation.model to a model of the {wanted}"
         )
-    return PoseEstimator(model, plan.estimation.n_candidates or 0)
+    return estimator
 
 
-def build_tracker(recording: Recording, plan: Plan) -> FrameTracker:
-    """The tracker of a recording: its scene learned, the animal's size and girth found."""
+@lru_cache(maxsize=1)
+def _estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
+    """digest: another content is another model."""
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.estimation.model import Model
+
+    return PoseEstimator(Model.load(path), n_candidates)
+
+
+def build_tracker(recording: Recording, plan: Plan, estimator: PoseEstimator | None = None) -> FrameTracker:
+    """The tracker of a recording: its scene learned, the animal's size and girth found. estimator: the plan's, where it
+    is at hand.
+    """
     from liex_lab.tracking.tracker import FrameTracker
 
     build_zones(plan)  # a slip in their file is told before any work is done
-    estimator = build_estimator(plan)
+    estimator = estimator or build_estimator(plan)
     scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
     limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
     return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)

@@ -67,7 +67,7 @@ def write_long(
             writer.add(frames, seen=part)
         told("written")
         whole = writer.seen(Observations)
-        writer.take(track_whole(short.subject, whole), whole, short.subject)
+        writer.take(track_whole(short.subject, whole, room=writer.room), whole, short.subject)
         del whole
         told("tracked")
         conclude(writer, plan, {"prepare": 0.0, "track": 0.0})

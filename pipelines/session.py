@@ -5,16 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.pipelines.build import (
+    build_estimator,
     build_provenance,
     build_recogniser,
     build_recording,
     build_rules,
     build_surroundings,
     build_tracker,
+    build_zones,
 )
 from liex_lab.pipelines.crew import Crew
 from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
@@ -22,7 +25,7 @@ from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look
 from liex_lab.memory import give_back
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
-from liex_lab.threads import ahead
+from liex_lab.threads import ahead, meanwhile
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
@@ -59,12 +62,13 @@ def measure_session(
     from liex_lab.sessions.place import check_place, part_folder
 
     started = time.perf_counter()
-    with build_recording(recording, plan, progress) as opened:
+    with meanwhile(partial(build_estimator, plan)) as estimator, build_recording(recording, plan, progress) as opened:
         folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
         check_place(folder, overwrite)
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
-        tracker = build_tracker(opened, plan)
+        build_zones(plan)  # a slip in their file is told before any work is done
+        tracker = build_tracker(opened, plan, estimator())
         build_recogniser(plan, tracker.estimator.skeleton)  # a slip in its name is told before any work is done
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
@@ -102,14 +106,16 @@ def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
     from liex_lab.tracking.observations import Observations
 
     whole = writer.seen(Observations)
-    writer.take(tracker.track(whole), whole, tracker.subject)
+    writer.take(tracker.track(whole, room=writer.room), whole, tracker.subject)
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
     give_back()  # hours of recording leave much behind
-    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin)
+    rows = writer.rows
+    behaviour, notes = measure_behaviour(rows, plan, writer.origin)
     writer.note(**notes)
+    rows.track.rest()
     give_back()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
@@ -120,6 +126,8 @@ def measure_behaviour(rows: Rows, plan: Plan, origin: Provenance) -> tuple[Behav
 
     recogniser = build_recogniser(plan, origin.skeleton)
     named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows)
+    rows.track.rest()
+    give_back()
     return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
 
 

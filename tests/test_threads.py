@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from liex_lab.threads import ahead
+from liex_lab.threads import ahead, meanwhile
 
 
 def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
@@ -43,3 +43,24 @@ def test_what_goes_wrong_is_raised_after_the_items_before_it() -> None:
     assert next(coming) == 1
     with pytest.raises(OSError, match="drive"):
         next(coming)
+
+
+def test_something_is_made_while_a_block_runs_and_what_goes_wrong_is_raised_where_it_is_wanted() -> None:
+    asked, begun = threading.Event(), threading.Event()
+
+    def make() -> int:
+        begun.set()
+        assert asked.wait(10)
+        return 7
+
+    def fail() -> int:
+        raise OSError("the drive is gone")
+
+    with meanwhile(make) as made:
+        assert begun.wait(10)  # before anybody asks for it
+        asked.set()
+        assert made() == made() == 7
+    with meanwhile(fail) as failed, pytest.raises(OSError, match="gone"):
+        failed()
+    with meanwhile(fail):  # nobody wants it
+        pass

@@ -7,6 +7,7 @@ part the track into stretches.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ _FLIP_S = 0.15  # to either side: a body that points the other way for a moment 
 _WALL_BL = 0.6  # a wall this many lengths away hardly matters
 _AXIS = {1: 0.75, -1: 0.4}  # of the chain is the trunk, for bases at the rear and at the front
 _GROUPS = 3  # parts of the chain whose bends are added up
+_PIECE = 4096  # ticks whose channels are made at once
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,8 @@ def stretches_of(track: Track, rate_hz: float, wall_mm: Array | None = None) -> 
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
-    return [
-        Stretch(clock, _channels(track.skeleton, length_mm, clock, *_on_clock(track, rows, time_s, wall, clock)))
-        for rows in np.split(good, cuts)
-        for clock in [_clock(time_s[rows], rate_hz)]
-    ]
+    return [_stretch(track, rows, time_s, wall, length_mm, _clock(time_s[rows], rate_hz))
+            for rows in np.split(good, cuts)]  # fmt: skip
 
 
 def _usual_step(time_s: Array) -> float:
@@ -90,50 +89,98 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
     return np.asarray(np.sum(axis * around, axis=1) < -0.5 * (high - low - 1).clip(1))
 
 
-def _on_clock(
-    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm and predicted error (m,) mm."""
-    n = len(rows)
-    distance, error = np.nan_to_num(wall[rows], nan=1e6), np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)
-    columns = np.concatenate(
-        [track.joints_mm[rows].reshape(n, -1), track.angles_rad[rows].reshape(n, -1), distance[:, None],
-         error[:, None]], axis=1,
-    )  # fmt: skip
-    times, step = time_s[rows], clock[1] - clock[0]
-    if n > 2 and np.median(np.diff(times)) < 0.7 * step:  # a faster camera: the mean of what falls to each tick
-        tick = np.clip(np.round((times - clock[0]) / step).astype(int), 0, len(clock) - 1)
-        starts = np.flatnonzero(np.append(True, np.diff(tick) > 0))
-        count = np.diff(np.append(starts, n))[:, None]
-        columns, times = np.add.reduceat(columns, starts) / count, np.add.reduceat(times, starts) / count[:, 0]
-    out = _interpolated(clock, times, columns)
-    j = track.skeleton.n_joints
-    return out[:, : 3 * j].reshape(-1, j, 3), out[:, 3 * j : 6 * j].reshape(-1, j, 3), out[:, -2], out[:, -1]
+class _OnClock:
+    """What the channels are made of, at any of a clock's times (m,) s, from frames `rows` of a track.
+
+    A faster camera is averaged over what falls to each tick, a slower one interpolated, linearly; ends are held.
+    """
+
+    def __init__(self, track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array) -> None:
+        self._track, self._rows, self._wall = track, rows, wall
+        times, step, n = time_s[rows], clock[1] - clock[0], len(rows)
+        self._starts: NDArray[np.int64] | None = None  # of the rows that fall to one tick
+        if n > 2 and np.median(np.diff(times)) < 0.7 * step:
+            tick = np.clip(np.round((times - clock[0]) / step).astype(int), 0, len(clock) - 1)
+            starts = np.flatnonzero(np.append(True, np.diff(tick) > 0))
+            self._starts = np.append(starts, n)
+            times = np.add.reduceat(times, starts) / np.diff(self._starts)
+        self._n = len(times)
+        if self._n > 1:
+            self._low = np.clip(np.searchsorted(times, clock, side="right") - 1, 0, self._n - 2)
+            passed = (clock - times[self._low]) / (times[self._low + 1] - times[self._low])
+            self._share = np.clip(passed, 0.0, 1.0)[:, None]
+
+    def at(self, ticks: slice) -> tuple[Array, Array, Array, Array]:
+        """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, predicted error (m,) mm."""
+        if self._n == 1:
+            out = np.repeat(self._measured(0, 1), ticks.stop - ticks.start, axis=0)
+        else:
+            low, share = self._low[ticks], self._share[ticks]
+            first = int(low[0])
+            seen = self._measured(first, int(low[-1]) + 2)
+            out = seen[low - first] * (1.0 - share) + seen[low - first + 1] * share
+        j = self._track.skeleton.n_joints
+        return out[:, : 3 * j].reshape(-1, j, 3), out[:, 3 * j : 6 * j].reshape(-1, j, 3), out[:, -2], out[:, -1]
+
+    def _measured(self, first: int, stop: int) -> Array:
+        """Columns (k, 6 J + 2) of measurements first to stop, each of a frame or of those of a tick."""
+        starts = None if self._starts is None else self._starts[first : stop + 1]
+        track, rows = self._track, self._rows[first:stop] if starts is None else self._rows[starts[0] : starts[-1]]
+        n = len(rows)
+        distance = np.nan_to_num(self._wall[rows], nan=1e6)
+        error = np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)
+        columns = np.concatenate(
+            [track.joints_mm[rows].reshape(n, -1), track.angles_rad[rows].reshape(n, -1), distance[:, None],
+             error[:, None]], axis=1,
+        )  # fmt: skip
+        if starts is None:
+            return columns
+        return np.asarray(np.add.reduceat(columns, starts[:-1] - starts[0]) / np.diff(starts)[:, None])
 
 
-def _interpolated(clock: Array, times: Array, rows: Array) -> Array:
-    """Rows (m, k) at the clock's times from rows (n, k) at other times, linear, ends held."""
-    if len(times) == 1:
-        return np.repeat(rows, len(clock), axis=0)
-    low = np.clip(np.searchsorted(times, clock, side="right") - 1, 0, len(times) - 2)
-    share = np.clip((clock - times[low]) / (times[low + 1] - times[low]), 0.0, 1.0)[:, None]
-    return rows[low] * (1.0 - share) + rows[low + 1] * share
+def _stretch(
+    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, length_mm: float, clock: Array
+) -> Stretch:
+    """The channels of an unbroken stretch, a piece after the other."""
+    found, m = _OnClock(track, rows, time_s, wall, clock), len(clock)
+    heading, steep = np.empty(m), np.empty(m, np.bool_)
+    for piece in _pieces(m):
+        heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
+    heading = np.unwrap(heading)
+    # a body that stands upright has no heading: it keeps the last one
+    heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
+    values, step = np.empty((m, len(channel_names(track.skeleton)))), clock[1] - clock[0]
+    for piece in _pieces(m):
+        # a channel looks two ticks to either side
+        around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
+        channels = _channels(track.skeleton, length_mm, step, heading[around], *found.at(around))
+        values[piece] = channels[piece.start - around.start : piece.stop - around.start]
+        track.rest()
+    return Stretch(clock, values)
+
+
+def _pieces(m: int) -> Iterator[slice]:
+    return (slice(start, min(start + _PIECE, m)) for start in range(0, m, _PIECE))
+
+
+def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where the trunk of a body with these joints (m, J, 3) points on the floor (m,) rad, and whether it is upright."""
+    rear, front = _forward(skeleton)
+    axis = joints[:, front] - joints[:, rear]
+    upright = np.hypot(axis[:, 0], axis[:, 1]) < 0.25 * np.linalg.norm(axis, axis=1)
+    return np.arctan2(axis[:, 1], axis[:, 0]), upright
 
 
 def _channels(
-    skeleton: Skeleton, length_mm: float, clock: Array, joints: Array, angles: Array, wall: Array, error: Array
-) -> Array:
-    """Channels (m, C) of joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and predicted errors (m,) mm."""
-    step = clock[1] - clock[0]
+    skeleton: Skeleton, length_mm: float, step: float, heading: Array, joints: Array, angles: Array, wall: Array,
+    error: Array,
+) -> Array:  # fmt: skip
+    """Channels (m, C) of headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and predicted
+    errors (m,) mm on a clock whose ticks are `step` s apart.
+    """
     rear, front = _forward(skeleton)
     axis = joints[:, front] - joints[:, rear]
-    level = np.hypot(axis[:, 0], axis[:, 1])
-    climb = np.arctan2(axis[:, 2], level)
-    heading = np.unwrap(np.arctan2(axis[:, 1], axis[:, 0]))
-    # a body that stands upright has no heading: it keeps the last one
-    steep = level < 0.25 * np.linalg.norm(axis, axis=1)
-    keep = np.maximum.accumulate(np.where(steep, 0, np.arange(len(clock))))
-    heading = heading[keep]
+    climb = np.arctan2(axis[:, 2], np.hypot(axis[:, 0], axis[:, 1]))
     middle = joints.mean(axis=1) / length_mm
     velocity = _rate(_softened(middle), step)
     ahead, aside = np.cos(heading), np.sin(heading)

@@ -25,16 +25,27 @@ def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float3
     x = stretch.values
     step = stretch.times_s[1] - stretch.times_s[0]
     signed = np.array([name.endswith("~") for name in names])
-    sums, squares = (np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(v, axis=0)]) for v in (x, x * x))
-    out = [x, np.abs(x[:, signed])]
+    n, n_signed = x.shape[1], int(signed.sum())
+    n_features = n + n_signed + len(HALF_WINDOWS_S) * (2 * n + n_signed) + len(SIDE_WINDOWS_S) * 2 * n + n
+    found, filled = np.empty((len(x), n_features), np.float32), 0
+
+    def put(*parts: Array) -> None:  # one by one, for all of them in double precision are large
+        nonlocal filled
+        for part in parts:
+            found[:, filled : filled + part.shape[1]] = part
+            filled += part.shape[1]
+
+    sums, squares = (np.concatenate([np.zeros((1, n)), np.cumsum(v, axis=0)]) for v in (x, x * x))
+    put(x, np.abs(x[:, signed]))
     for half in HALF_WINDOWS_S:
         mean, square = (_window_mean(total, -half, half, step) for total in (sums, squares))
-        out += [mean, np.abs(mean[:, signed]), np.sqrt(np.maximum(square - mean * mean, 0.0))]
+        put(mean, np.abs(mean[:, signed]), np.sqrt(np.maximum(square - mean * mean, 0.0)))
     for start, stop in SIDE_WINDOWS_S:
         mean, square = (_window_mean(total, start, stop, step) for total in (sums, squares))
-        out += [np.where(signed, np.abs(mean), mean), np.sqrt(np.maximum(square, 0.0))]
-    out += [_extreme(np.abs(x), RANGE_S, step)]
-    return np.concatenate(out, axis=1).astype(np.float32)
+        put(np.where(signed, np.abs(mean), mean), np.sqrt(np.maximum(square, 0.0)))
+    put(_extreme(np.abs(x), RANGE_S, step))
+    assert filled == n_features
+    return found
 
 
 def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:

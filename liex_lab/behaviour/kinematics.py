@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import Body
 from liex_lab.behaviour.columns import kinematics_columns
-from liex_lab.behaviour.posture import Posture
+from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
 from liex_lab.sessions.rows import gap_follows, median_step, stop_times
 from liex_lab.sessions.tables import to_pandas
@@ -27,6 +27,7 @@ Rows = NDArray[np.int64]
 HALF_WINDOW_S = 0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 ERROR_LASTS_S = 0.3  # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
+_BLOCK = 16_384  # frames whose postures are in memory at a time
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
@@ -72,36 +73,42 @@ def kinematics(
 
     surface_z_mm: height of the water's surface above the floor, for an animal that swims.
     """
-    joints, xyz, sd = joint_positions(frames, poses)
-    body = Body.of(joints)
-    posture = Posture.of(body, xyz, sd)
+    joints = _Joints.of(poses, len(frames))
+    body = Body.of(joints.names)
+    shape, heights = _frame_by_frame(body, joints)
     time_s = frames["time_s"].to_numpy(float)
-    observed = np.isfinite(posture.centre[:, 0])
+    observed = np.isfinite(shape.centre[:, 0])
     spans = Spans.of(time_s, observed, half_window_s)
     block: dict[str, Any] = {name: frames[name].to_numpy() for name in ("frame_index", "time_s", "dt_s")}
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
-    block |= _moving(posture, spans, stop_times(time_s) - time_s, impossible_above_mm_s)
-    block |= {
-        "length_mm": posture.length_mm, "straightness": posture.straightness, "bend_rad": posture.bend_rad,
-    }  # fmt: skip
+    block |= _moving(shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s)
+    block |= {"length_mm": shape.length_mm, "straightness": shape.straightness, "bend_rad": shape.bend_rad, **heights}
     if body.swims:
-        block |= _swimming(posture, time_s, segments(time_s, observed), surface_z_mm)
-    else:
-        block |= _walking(body, xyz, sd)
+        block |= _swimming(shape, time_s, segments(time_s, observed), surface_z_mm)
     return to_pandas(kinematics_columns(body.swims), block)
 
 
-def _moving(posture: Posture, spans: Spans, hold_s: Array, impossible_above_mm_s: float) -> dict[str, Array]:
+def _frame_by_frame(body: Body, joints: _Joints) -> tuple[Shape, dict[str, Array]]:
+    """What each frame tells by itself, and of an animal that stands its heights; a block of frames is in memory."""
+    shapes, heights = [], []
+    for start in range(0, max(joints.n_frames, 1), _BLOCK):
+        xyz, sd = joints.at(slice(start, start + _BLOCK))
+        shapes.append(Shape.of(Posture.of(body, xyz, sd)))
+        heights.append({} if body.swims else _walking(body, xyz, sd))
+    return Shape.join(shapes), {name: np.concatenate([part[name] for part in heights]) for name in heights[0]}
+
+
+def _moving(shape: Shape, swims: bool, spans: Spans, hold_s: Array, impossible_above_mm_s: float) -> dict[str, Array]:
     """Place, speed and turning of the body as a whole; hold_s (n,): how long each frame counts."""
-    centre, sd = posture.centre, posture.centre_sd
+    centre, sd = shape.centre, shape.centre_sd
     velocity = spans.rate(centre)
-    over = velocity if posture.body.swims else velocity[:, :2]
+    over = velocity if swims else velocity[:, :2]
     speed = np.linalg.norm(over, axis=1)
     speed = np.where(speed > impossible_above_mm_s, np.nan, speed)
     speed_sd = spans.sd(sd)
-    flat = np.abs(posture.pitch_rad) < STEEP_RAD
-    heading = np.where(flat, posture.heading_rad, np.nan)
-    heading_sd = np.where(flat, posture.heading_sd_rad, np.nan)
+    flat = np.abs(shape.pitch_rad) < STEEP_RAD
+    heading = np.where(flat, shape.heading_rad, np.nan)
+    heading_sd = np.where(flat, shape.heading_sd_rad, np.nan)
     return {
         "x_mm": centre[:, 0], "y_mm": centre[:, 1], "z_mm": centre[:, 2], "position_sd_mm": sd,
         "speed_mm_s": speed, "speed_sd_mm_s": speed_sd, "vertical_speed_mm_s": velocity[:, 2],
@@ -109,7 +116,7 @@ def _moving(posture: Posture, spans: Spans, hold_s: Array, impossible_above_mm_s
         "step_mm": speed * hold_s,
         "heading_rad": heading, "heading_sd_rad": heading_sd,
         "yaw_rate_rad_s": spans.turning(heading), "yaw_rate_sd_rad_s": spans.sd(heading_sd),
-        "body_pitch_rad": posture.pitch_rad, "body_pitch_sd_rad": posture.pitch_sd_rad,
+        "body_pitch_rad": shape.pitch_rad, "body_pitch_sd_rad": shape.pitch_sd_rad,
     }  # fmt: skip
 
 
@@ -124,28 +131,46 @@ def _walking(body: Body, xyz: Array, sd: Array) -> dict[str, Array]:
     }  # fmt: skip
 
 
-def _swimming(posture: Posture, time_s: Array, number: Rows, surface_z_mm: float | None) -> dict[str, Array]:
+def _swimming(shape: Shape, time_s: Array, number: Rows, surface_z_mm: float | None) -> dict[str, Array]:
     """Curvature along the body, the tail's beat, and the depth below the surface."""
-    beat = tail_beat(posture, time_s, number, median_step(time_s))
+    beat = tail_beat(shape, time_s, number, median_step(time_s))
     surface = np.nan if surface_z_mm is None else surface_z_mm
-    front, middle, rear = posture.thirds_rad()
+    front, middle, rear = shape.thirds_rad.T
     return {
         "bend_front_rad": front, "bend_middle_rad": middle, "bend_rear_rad": rear,
-        "tail_angle_rad": posture.tail_angle_rad, "tail_mm": posture.tail_mm,
+        "tail_angle_rad": shape.tail_angle_rad, "tail_mm": shape.tail_mm,
         "tail_extreme_rad": beat.extreme_rad, "tail_beat_hz": beat.frequency_hz,
-        "tail_beat_mm": beat.amplitude_mm, "below_surface_mm": surface - posture.centre[:, 2],
+        "tail_beat_mm": beat.amplitude_mm, "below_surface_mm": surface - shape.centre[:, 2],
     }  # fmt: skip
 
 
-def joint_positions(frames: pd.DataFrame, poses: pd.DataFrame) -> tuple[list[str], Array, Array]:
-    """Joint names, positions (n, J, 3) mm in the arena and their sd (n, J) mm along an axis; NaN where unknown."""
-    column = poses["joint"]
-    names = column.cat.categories if isinstance(column.dtype, pd.CategoricalDtype) else pd.unique(column)
-    joints = [str(name) for name in names]
-    shape = (len(frames), len(joints))
-    xyz = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(*shape, 3)
-    sd = poses["sd_mm"].to_numpy(float).reshape(shape) if "sd_mm" in poses else np.full(shape, np.nan)
-    return joints, xyz, sd
+@dataclass(frozen=True)
+class _Joints:
+    """The joints of n frames: their names; x, y, z mm in the arena and sd mm along an axis, (n, J) each, NaN where they
+    are not known.
+    """
+
+    names: list[str]
+    columns: tuple[Array, Array, Array, Array]
+
+    @staticmethod
+    def of(poses: pd.DataFrame, n: int) -> _Joints:
+        """Those of the table `poses` of n frames."""
+        column = poses["joint"]
+        names = column.cat.categories if isinstance(column.dtype, pd.CategoricalDtype) else pd.unique(column)
+        shape = (n, len(names))
+        x, y, z = (poses[name].to_numpy(float).reshape(shape) for name in ("x_mm", "y_mm", "z_mm"))
+        sd = poses["sd_mm"].to_numpy(float).reshape(shape) if "sd_mm" in poses else np.full(shape, np.nan)
+        return _Joints([str(name) for name in names], (x, y, z, sd))
+
+    @property
+    def n_frames(self) -> int:
+        return len(self.columns[0])
+
+    def at(self, rows: slice) -> tuple[Array, Array]:
+        """Positions (m, J, 3) and sd (m, J) of some frames."""
+        *xyz, sd = (column[rows] for column in self.columns)
+        return np.moveaxis(np.stack(xyz), 0, -1), sd
 
 
 def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:

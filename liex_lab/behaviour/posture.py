@@ -7,7 +7,8 @@ factor of two and more; here it is the whole turn from the direction of the fron
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -125,6 +126,43 @@ class Posture:
         """(n, 3) the animal's back, upright in the vertical plane through its axis."""
         ahead = self.axis / _positive(np.linalg.norm(self.axis, axis=1))[:, None]
         return np.asarray(np.cross(ahead, self._left))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What is told of a body's posture in each of n frames; see `Posture`. thirds_rad (n, 3); rear_sd_mm (n,): of the
+    chain's rear end. Of a body that does not swim the last four are empty.
+    """
+
+    centre: Array
+    centre_sd: Array
+    pitch_rad: Array
+    pitch_sd_rad: Array
+    heading_rad: Array
+    heading_sd_rad: Array
+    length_mm: Array
+    straightness: Array
+    bend_rad: Array
+    thirds_rad: Array
+    tail_mm: Array
+    tail_angle_rad: Array
+    rear_sd_mm: Array
+
+    @staticmethod
+    def of(posture: Posture) -> Shape:
+        """All of it."""
+        p, none = posture, np.empty(len(posture.spine))
+        swims = (
+            (np.stack(p.thirds_rad(), axis=1), p.tail_mm, p.tail_angle_rad, p.spine_sd[:, -1])
+            if p.body.swims else (none, none, none, none)
+        )  # fmt: skip
+        return Shape(p.centre, p.centre_sd, p.pitch_rad, p.pitch_sd_rad, p.heading_rad, p.heading_sd_rad, p.length_mm,
+                     p.straightness, p.bend_rad, *swims)  # fmt: skip
+
+    @staticmethod
+    def join(parts: Sequence[Shape]) -> Shape:
+        """That of consecutive frames."""
+        return Shape(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Shape)))
 
 
 def _positive(values: Array) -> Array:

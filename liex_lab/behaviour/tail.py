@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.posture import Posture
+from liex_lab.behaviour.posture import Shape
 from liex_lab.sessions.rows import stretches
 
 Array = NDArray[np.float64]
@@ -30,20 +30,20 @@ class TailBeat:
     amplitude_mm: Array
 
 
-def tail_beat(posture: Posture, time_s: Array, number: NDArray[np.int64], step_s: float) -> TailBeat:
+def tail_beat(shape: Shape, time_s: Array, number: NDArray[np.int64], step_s: float) -> TailBeat:
     """The beat within each unbroken stretch `number` (n,); step_s: the usual time from frame to frame.
 
     A swing lasts from one turning point to the next; frequency = 1 / (2 x its time). Slower than `SLOWEST_HZ` it is
     left empty, and so are one faster than a quarter of the frame rate and its neighbours, for bends may be missing.
     """
-    swing, angle = posture.tail_mm, posture.tail_angle_rad
+    swing, angle = shape.tail_mm, shape.tail_angle_rad
     out = TailBeat(*(np.full(len(swing), np.nan) for _ in range(3)))
     known = np.isfinite(swing)
     if step_s <= 0 or not known.any():
         return out
-    noise = np.hypot(posture.spine_sd[:, -1], posture.length_mm * posture.heading_sd_rad)[known]
+    noise = np.hypot(shape.rear_sd_mm, shape.length_mm * shape.heading_sd_rad)[known]
     typical = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
-    least = max(_LEAST_SHARE * float(np.median(posture.length_mm[known])), _LEAST_SD * typical)
+    least = max(_LEAST_SHARE * float(np.median(shape.length_mm[known])), _LEAST_SD * typical)
     slowest_s = 0.5 / SLOWEST_HZ
     for start, stop, key in stretches(np.where(known, number, -1)):
         if key < 0:

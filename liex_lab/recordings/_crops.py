@@ -9,6 +9,8 @@ from liex_lab.recordings import _segment as segment
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
 BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
+_MORE = 1.3  # times the area of the animal: there may be something with it
+_APART = 2.0  # roots of the animal's area: what lies farther before the animal is not a part of it
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
 
@@ -50,20 +52,42 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
 
 
 @njit(cache=True)
+def parted(depth, limit, labels, blobs, area, mm2_per_px):
+    """The picture without what hangs together with the animal in it alone, and whether there is such a thing.
+
+    Of two layers far from one another the animal is the one whose area is nearer to its own. What lies before it hides
+    parts of it, and is taken for unread; what lies behind it is background.
+    """
+    for slot in range(len(blobs)):
+        if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
+            cut, near, far = segment.layers(depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area))
+            if cut > 0.0 and abs(np.log(far * mm2_per_px / area)) < abs(np.log(near * mm2_per_px / area)):
+                return np.where(depth < cut, np.float32(0.0), depth), True
+            if cut > 0.0:
+                return np.where(depth > cut, np.float32(np.inf), depth), True
+    return depth, False
+
+
+@njit(cache=True)
 def extract_one(
-    depth, limit, on_floor, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    depth, limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
     n_steps, n_px, moments, distance, n_blobs, k,
 ):  # fmt: skip
     """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's. Where n_things is 2,
     the batch has twice as many rows as there are frames, and the second half gets what comes next near.
 
-    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth.
+    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth. parts:
+    what hangs together with the animal in the picture alone is told apart by its depth, see `parted`.
     """
     labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
     blobs = np.empty((segment.MAX_BLOBS, 7))
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
     bridge = BRIDGE if behind_mm > 0.0 else 0
     n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+    if parts and area > 0.0:
+        depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
+        if changed:
+            n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
     for rank in range(n_things):
         row = k + rank * (len(n_px) // n_things)
@@ -112,12 +136,12 @@ def cut_crop(
 
 @njit(cache=True, parallel=True, nogil=True)
 def extract_all(
-    depths, limit, on_floor, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    depths, limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
     n_steps, n_px, moments, distance, n_blobs,
 ):  # fmt: skip
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], limit, on_floor, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm,
-                    heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+        extract_one(depths[k], limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation,
+                    behind_mm, heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -134,5 +158,6 @@ def extract_windows(
                     inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
                     behind = 1.0 / inverse if inverse > 1e-6 else 0.0
                 limit[v, u] = max(behind - margin[k], 0.0)
-        extract_one(depths[k], limit, everywhere, area[k], n_things, smooth_mm[k], intrinsics[k], plane[k], rotation[k],
-                    behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+        extract_one(depths[k], limit, everywhere, area[k], n_things, False, smooth_mm[k], intrinsics[k], plane[k],
+                    rotation[k], behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs,
+                    k)  # fmt: skip

@@ -114,7 +114,7 @@ class MessageFile(ABC):
                 raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
             self.file.seek(chunk.offset)
             self._last_chunk = (-1, memoryview(b""))  # never two at once
-            self._last_chunk = (number, memoryview(_unpack(self.file.read(chunk.length), chunk)))
+            self._last_chunk = (number, memoryview(unpacked(self.file.read(chunk.length), chunk)))
         return self._last_chunk[1]
 
     def close(self) -> None:
@@ -123,7 +123,7 @@ class MessageFile(ABC):
         self._last_chunk = (-1, memoryview(b""))
 
 
-def _unpack(packed: bytes, chunk: Chunk) -> bytes:
+def unpacked(packed: bytes, chunk: Chunk) -> bytes:
     """A chunk's bytes. Of one that is cut, as many as there are: what lies before the cut is as it was written."""
     try:
         data = _inflate(packed, chunk.packing, chunk.size)

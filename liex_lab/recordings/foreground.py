@@ -250,7 +250,7 @@ class Scene:
         grid = self.grid
         with threads(parallel):
             kernels.extract_all(
-                depths, self.limit, self.on_floor, self.area_mm2, n_things, self.view.smooth_mm * size,
+                depths, self.limit, self.on_floor, self.area_mm2, n_things, camera_view, self.view.smooth_mm * size,
                 np.array([grid.fx, grid.fy, grid.cx, grid.cy]), self._grid_floor.inverse_depth,
                 self.view_rotation(camera_view), self.view.behind_mm if camera_view else 0.0,
                 crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 from typing import IO
@@ -20,7 +22,7 @@ from liex_lab.camera import Lens
 from liex_lab.errors import RecordingError
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings._depth_topics import open_topic
-from liex_lab.recordings._message_file import Channel, Chunk, DamagedChunk, Envelope, MessageFile, Place
+from liex_lab.recordings._message_file import Channel, Chunk, DamagedChunk, Envelope, MessageFile, Place, unpacked
 from liex_lab.recordings.recording import Recording
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -30,6 +32,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # its record: opcode, length, where the summary and its offsets begin, CRC
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, unpacked size, its CRC, length of the packing's name
 _BLOCK = 1 << 20
+_THREADS, _SMALL_CHUNK = 2, 1 << 23  # chunks of so many bytes at most are unpacked before it is their turn
 _FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _LARGEST_FACT = 1 << 24  # bytes of one of them
 _DAMAGE = (McapError, KeyError, ValueError, OverflowError, MemoryError, RuntimeError, struct.error, EOFError)
@@ -59,6 +62,7 @@ class McapFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
+        self._coming: dict[int, Future[bytes]] = {}  # chunks that are being unpacked, by where their content begins
         self._sure = (len(MAGIC), 0, True)  # behind the last whole record: where, chunks until there, `whole`
 
     def go_on(self) -> int | None:
@@ -74,6 +78,14 @@ class McapFile(MessageFile):
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
         """Every whole message of the wanted channels, in file order; a second walk begins where the first was sure."""
         self._learn_ending()
+        with ThreadPoolExecutor(_THREADS) as unpackers:
+            try:
+                yield from self._walk(wanted, progress, unpackers)
+            finally:
+                unpackers.shutdown(wait=False, cancel_futures=True)
+                self._coming.clear()
+
+    def _walk(self, wanted: Wanted, progress: Progress, unpackers: ThreadPoolExecutor) -> Iterator[Envelope]:
         at, footer = self._sure[0], False
         while at + _RECORD.size <= self.size and not footer:
             opcode, start, end = self._record(at)
@@ -81,6 +93,7 @@ class McapFile(MessageFile):
             if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
                 end = self.resume(at)  # a size that cannot be; and no record has the opcode 0: these are zeros
             elif opcode == Opcode.CHUNK:
+                self._look_ahead(at, unpackers)
                 yield from self._walk_chunk(start, end - start, wanted)
             elif opcode == Opcode.MESSAGE or (opcode in _FACTS and end - start <= _LARGEST_FACT):
                 data = memoryview(self.file.read(end - start))
@@ -90,6 +103,23 @@ class McapFile(MessageFile):
                 self._sure = (at, len(self.chunks), self.whole)
             progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
+
+    def _look_ahead(self, at: int, unpackers: ThreadPoolExecutor) -> None:
+        """Have the chunks after the one at `at` unpacked meanwhile, where the file's index says where they are."""
+        n = bisect_right(self.starts, at)
+        for later in self.starts[n : n + _THREADS]:
+            if later + _RECORD.size + _CHUNK.size > self.size:
+                return
+            opcode, start, end = self._record(later)
+            if opcode != Opcode.CHUNK or start in self._coming:
+                continue
+            try:
+                chunk = self._chunk(start, end - start)
+            except (DamagedChunk, struct.error, UnicodeDecodeError):
+                return  # the walk says so when it is there
+            if chunk.size <= _SMALL_CHUNK:
+                self.file.seek(chunk.offset)
+                self._coming[start] = unpackers.submit(unpacked, self.file.read(chunk.length), chunk)
 
     def _record(self, at: int) -> tuple[int, int, int]:
         """What kind of record begins at `at`, and where its content begins and ends."""
@@ -135,6 +165,8 @@ class McapFile(MessageFile):
         number = len(self.chunks)
         try:
             self.chunks.append(self._chunk(start, length))
+            if start in self._coming:
+                self._last_chunk = (number, memoryview(self._coming.pop(start).result()))
             data = self.unpack(number)
         except (DamagedChunk, struct.error, UnicodeDecodeError):
             self.whole = False

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from liex_lab.geometry import SE3, so3
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rows import Rows
+from liex_lab.tracking.track import Track
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SECOND = 10**9
+_BLOCK = 8192  # frames of a track that are in memory
 _ACTION_SCHEMA = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",
@@ -87,9 +89,19 @@ class McapWriter:
     def finish(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]) -> None:
         """Skeleton, transforms, actions and notes of the whole track; closes the file."""
         track = rows.track
-        quaternions = so3.quaternion(np.where(track.posed[:, None, None], track.root_rotation, np.eye(3)))
-        for i, time_ns in enumerate(track.times_ns.tolist()):
-            seen = bool(track.posed[i])
+        for start in range(0, track.n_frames, _BLOCK):
+            self._log_track(track[start : start + _BLOCK])
+            track.rest()
+        self._log_actions(rows, bouts, words)
+        if len(track.times_ns):
+            self._log_notes(int(track.times_ns[0]), problems)
+        self.abandon()
+
+    def _log_track(self, track: Track) -> None:
+        """Skeleton and transforms of some frames."""
+        posed = track.posed
+        quaternions = so3.quaternion(np.where(posed[:, None, None], track.root_rotation, np.eye(3)))
+        for i, (time_ns, seen) in enumerate(zip(track.times_ns.tolist(), posed.tolist(), strict=True)):
             joints_m = track.joints_mm[i] / 1000.0
             self._scene.log(self._scene_update(time_ns, joints_m, seen), log_time=time_ns)
             self._poses.log(_joint_poses(time_ns, joints_m, seen), log_time=time_ns)
@@ -97,10 +109,6 @@ class McapWriter:
             if seen:
                 root = _transform(time_ns, "arena", "root", track.root_mm[i], quaternions[i])
                 self._transforms.log(messages.FrameTransforms(transforms=[root]), log_time=time_ns)
-        self._log_actions(rows, bouts, words)
-        if len(track.times_ns):
-            self._log_notes(int(track.times_ns[0]), problems)
-        self.abandon()
 
     def flushed(self) -> int:
         """Hand everything to the system; returns the file's bytes. Raises what the system said against it."""

@@ -82,18 +82,16 @@ class Rows:
             }  # fmt: skip
 
     def measured(self) -> pd.DataFrame:
-        """What measures of behaviour need of the table `poses`: frame, joint and its place; one row per joint."""
+        """What measures of behaviour need of the table `poses`: a joint and its place; one row per frame and joint."""
         import pandas as pd
 
         track, n_joints = self.track, self.track.skeleton.n_joints
         codes = np.tile(np.arange(n_joints, dtype=np.int8), track.n_frames)
         # what was bridged was not measured
-        place = np.where(track.bridged[:, None, None], np.nan, track.joints_mm).reshape(-1, 3)
-        return pd.DataFrame({
-            "frame_index": np.repeat(self.frame_index, n_joints),
-            "joint": pd.Categorical.from_codes(codes, pd.Index(track.skeleton.names)),
-            "x_mm": place[:, 0], "y_mm": place[:, 1], "z_mm": place[:, 2], "sd_mm": track.sd_mm.ravel(),
-        })  # fmt: skip
+        place = (np.where(track.bridged[:, None], np.nan, track.joints_mm[:, :, k]).ravel() for k in range(3))
+        columns = dict(zip(("x_mm", "y_mm", "z_mm"), place, strict=True), sd_mm=track.sd_mm.ravel())
+        joint = pd.Categorical.from_codes(codes, pd.Index(track.skeleton.names))
+        return pd.DataFrame({"joint": joint, **columns}, copy=False)
 
     def rotations(self) -> Iterator[Block]:
         """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
@@ -185,6 +183,7 @@ class Rows:
         step = max(1, ROWS_PER_GROUP // rows_per_frame)
         for start in range(0, self.track.n_frames, step):
             yield slice(start, start + step)
+            self.track.rest()
 
 
 def _xyz(name: str, values: Array) -> dict[str, Array]:

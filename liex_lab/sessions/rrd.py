@@ -5,7 +5,7 @@ Depth streams in as it comes; everything small is written at the end from the sa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -119,7 +119,10 @@ class ReplayWriter:
                 scalars.append((f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float)))
         for entity, label, colour, values in scalars:
             self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True)
-            self._stream.send_columns(entity, _timeline(index, elapsed), [*rr.Scalars.columns(scalars=values)])
+            for part in _blocks(len(index)):
+                columns = rr.Scalars.columns(scalars=values[part])
+                self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
+            self._stream.flush()
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
         for problem in problems:
@@ -206,14 +209,15 @@ class ReplayWriter:
         self._stream.log(UNCERTAINTY, look, static=True)
         girth = float(self._origin.animal_size.get("girth", 1.0))
         carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
-        for start in range(0, track.n_frames, _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for part in _blocks(track.n_frames):
             when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
             send_body(self._stream, track, part, when, carriers)
             self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
             self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
+            self._stream.flush()  # or hours of it wait in memory
+            track.rest()
 
     def _send_points(
         self, entity: str, when: list[rr.TimeColumn], points: Array, seen: NDArray[np.bool_], dot: Any, line: Any
@@ -244,9 +248,13 @@ class ReplayWriter:
         if not seen.any():
             return
         self._stream.log(ROOT, rr.TransformAxes3D(0.02), static=True)
-        xyzw = np.roll(so3.quaternion(track.root_rotation[seen]), -1, axis=-1)
-        columns = rr.Transform3D.columns(translation=track.root_mm[seen] / 1000.0, quaternion=xyzw)
-        self._stream.send_columns(ROOT, _timeline(index[seen], elapsed[seen]), [*columns])
+        for part in _blocks(track.n_frames):
+            where = part.start + np.flatnonzero(seen[part])
+            if not len(where):
+                continue
+            xyzw = np.roll(so3.quaternion(track.root_rotation[where]), -1, axis=-1)
+            columns = rr.Transform3D.columns(translation=track.root_mm[where] / 1000.0, quaternion=xyzw)
+            self._stream.send_columns(ROOT, _timeline(index[where], elapsed[where]), [*columns])
 
     def _log_candidates(self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The bones of every pose that a frame thought possible, each rank in its colour."""
@@ -255,13 +263,13 @@ class ReplayWriter:
             entity = f"{CANDIDATES}/{h + 1}"
             look = rr.LineStrips3D.from_fields(radii=0.0008, colors=_rgba([colour]))
             self._stream.log(entity, look, static=True)
-            for start in range(0, len(seen), _BLOCK):
-                part = slice(start, start + _BLOCK)
+            for part in _blocks(len(seen)):
                 known = seen.known[part, h]
                 joints = seen[part].joints(range(seen.skeleton.n_joints))[known, h] / MM_PER_UNIT
                 strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
                 when = _timeline(index[part], elapsed[part])
                 self._stream.send_columns(entity, when, [*strips.partition(np.where(known, len(edges), 0))])
+                seen.rest()
 
     def _log_worst(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frames with the largest predicted error, as notes to jump to."""
@@ -349,6 +357,10 @@ def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[f
     near, far = np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
     near = max(float(near), floor_distance_mm - 60.0) - 80.0  # a floor tilted by 10 degrees, but not the walls
     return max(near, 1.0), max(float(far), near + 10.0) + 10.0
+
+
+def _blocks(n: int) -> Iterator[slice]:
+    return (slice(start, min(start + _BLOCK, n)) for start in range(0, n, _BLOCK))
 
 
 def _timeline(index: NDArray[np.int64], elapsed_ns: NDArray[np.int64]) -> list[rr.TimeColumn]:

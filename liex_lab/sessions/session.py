@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -187,6 +188,21 @@ class Session:
         """The plan as resolved, TOML text."""
         with reading_from(self.path / "plan.toml") as path:
             return path.read_text(encoding="utf-8")
+
+    def narrowed(self, **wanted: Sequence[str]) -> Session:
+        """The same session of whose named tables no more is read than these columns, as far as it has them: of hours of
+        recording all of them take much memory.
+        """
+        import pyarrow.parquet as pq
+
+        other = Session(self.path, self.metadata, self.log)
+        for name, columns in wanted.items():
+            path = self.file(f"{name}.parquet")
+            if path.is_file():
+                with reading_from(path):
+                    known = pq.read_schema(path).names
+                other.__dict__[name] = self.table(name, [column for column in columns if column in known])
+        return other
 
     def table(self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None) -> pd.DataFrame:
         """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.memory import give_back, peak_memory_mb
+from liex_lab.memory import Room, give_back, on_disk, peak_memory_mb
 from liex_lab.sessions import tables
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
@@ -177,6 +177,11 @@ class SessionWriter:
             self._checkpoint.save(len(self._index), self._checkpoint.seconds_before + self._elapsed, sizes)
 
     @property
+    def room(self) -> Room:
+        """Where a track of hours may lie until the session is whole: on the disk that it will be on."""
+        return on_disk(self._folder)
+
+    @property
     def track(self) -> Track:
         """The track so far."""
         return self._held.track
@@ -192,6 +197,7 @@ class SessionWriter:
         self.track, self._flips = tracked.track, tracked.flips
         self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
+        seen.rest()
 
     @property
     def rows(self) -> Rows:

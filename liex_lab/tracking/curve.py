@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,16 +12,19 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.geometry import SE3
+from liex_lab.memory import Room
 from liex_lab.tracking.chain import NONE, Chain
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
-from liex_lab.tracking.smoother import Curve, Motion, smooth
+from liex_lab.tracking.smoother import Curve, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
 from liex_lab.tracking.tuning import Tuning
 
 Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
-_ADMIT = 2.0  # predicted errors: nearer to the curve, a hypothesis that was passed by is a measurement after all
+# nearer to the curve than so many predicted errors, a hypothesis that was passed by is a measurement after all, unless
+# its score costs more than this share of what a score can: then it is of something else, or of half the animal
+_ADMIT, _ADMIT_COST = 2.0, 2 / 3
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -43,68 +46,101 @@ class Subject:
 
 
 def track_whole(
-    subject: Subject, seen: Observations, corrections: Sequence[Flip] = (), tuning: Tuning | None = None
-) -> Tracked:
+    subject: Subject, seen: Observations, corrections: Sequence[Flip] = (), tuning: Tuning | None = None,
+    room: Room = np.empty,
+) -> Tracked:  # fmt: skip
     """The track of a recording from what was seen in all of its frames; corrections: what a human says of flips.
 
-    tuning: None takes the animal's own.
+    tuning: None takes the animal's own. room: where the track is to lie; of everything else no more than a block of
+    frames is in memory.
     """
     tuning = tuning or Tuning.of(subject.skeleton.name)
-    chain, motion = Chain(subject.skeleton, subject.length_mm, tuning.chain), tuning.motion
+    chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
     path = chain.path(seen)
     doubt = chain.doubt(seen, path)
-    pose, error = seen.pose(path), seen.along(seen.error_mm, path)
-    for span in corrections:
-        if not span.undone_at:
-            _turn_round(subject.skeleton, seen, path, pose, span)
-            doubt[span.start : span.stop] = 0.0
-    curve = _smoothed(subject, seen, pose, error, motion)
-    admitted = _admitted(subject.skeleton, seen, path, curve)
-    if (admitted >= 0).any():
-        taken = admitted >= 0
-        path = np.where(taken, admitted, path)
-        _put(pose, taken, seen.pose(admitted)[taken])
-        error = np.where(taken, seen.along(seen.error_mm, admitted), error)
-        curve = _smoothed(subject, seen, pose, error, motion)
-    track = to_track(subject, seen, path, curve, doubt, tuning=tuning)
+    error = seen.along(seen.error_mm, path)
+    turned = _turn_round(seen, path, doubt, corrections)
+    track = Track.empty(subject.skeleton, seen.times_ns, room=room)
+    used, admitted = np.zeros(len(seen), np.bool_), np.full(len(seen), NONE)
+    seconds = seen.seconds
+
+    def draw(rows: slice) -> Curve:
+        first, last = max(0, rows.start - MARGIN), min(len(seen), rows.stop + MARGIN)
+        around = slice(first, last)
+        pose = seen[around].pose(path[around])
+        _reverse(subject.skeleton, pose, turned[around])
+        curve = smooth(subject.skeleton, seconds[around], pose, error[around], subject.length_mm, tuning.motion)
+        curve = curve[rows.start - first : rows.stop - first]
+        _write(subject, track[rows], curve, tuning)
+        used[rows] = curve.used
+        return curve
+
+    for rows in _blocks(len(seen)):
+        likely = chain.likely(seen[rows], _ADMIT_COST)
+        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), likely)
+        _rest(track, seen)
+    taken = admitted >= 0
+    path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
+    for rows in _blocks(len(seen)):
+        if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
+            draw(rows)
+            _rest(track, seen)
+    measured = used & (path >= 0)
+    bridged = short_gaps(seconds, measured, subject.bridge_s)
+    for rows in _blocks(len(seen)):
+        _settle(subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows])
+        _rest(track, seen)
     flips = _flips(seen, track)
     return Tracked(track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))))
 
 
-def _put(pose: Pose, rows: NDArray[np.bool_] | NDArray[np.int64], other: Pose) -> None:
-    pose.root.rotation[rows], pose.root.translation[rows] = other.root.rotation, other.root.translation
-    pose.angles[rows], pose.scale[rows] = other.angles, other.scale
+def _blocks(n: int) -> Iterator[slice]:
+    return (slice(start, min(start + _BLOCK, n)) for start in range(0, n, _BLOCK))
 
 
-def _turn_round(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], pose: Pose, span: Flip) -> None:
-    """Exchange head and tail of the poses in a span: by the other hypothesis of a frame where there is one."""
-    for t in range(span.start, span.stop):
-        if path[t] == NONE:
+def _rest(track: Track, seen: Observations) -> None:
+    track.rest()
+    seen.rest()
+
+
+def _turn_round(
+    seen: Observations, path: NDArray[np.int64], doubt: Array, corrections: Sequence[Flip]
+) -> NDArray[np.int64]:  # fmt: skip
+    """Exchange head and tail in the spans that a human says, of which there is no doubt then: in the path where a frame
+    has that hypothesis. Returns how often (n,) the pose itself is to be turned round elsewhere.
+    """
+    turned = np.zeros(len(seen), np.int64)
+    for span in corrections:
+        if span.undone_at:
             continue
-        if seen.known[t, path[t] ^ 1]:
-            path[t] ^= 1
-            _put(pose, np.array([t]), seen[t : t + 1].pose(path[t : t + 1]))
-        else:
-            _put(pose, np.array([t]), reversed_pose(skeleton, pose[np.array([t])]))
+        for t in range(span.start, min(span.stop, len(seen))):
+            if path[t] == NONE:
+                continue
+            if seen.known[t, path[t] ^ 1]:
+                path[t] ^= 1
+            else:
+                turned[t] += 1
+        doubt[span.start : span.stop] = 0.0
+    return turned
 
 
-def _smoothed(subject: Subject, seen: Observations, pose: Pose, error: Array, motion: Motion) -> Curve:
-    """`smooth` over a recording of any length, in blocks whose neighbours have a say."""
-    parts: list[Curve] = []
-    n = len(seen)
-    for start in range(0, n, _BLOCK):
-        first, last = max(0, start - MARGIN), min(n, start + _BLOCK + MARGIN)
-        rows = slice(first, last)
-        curve = smooth(subject.skeleton, seen.seconds[rows], pose[rows], error[rows], subject.length_mm, motion)
-        parts.append(curve[start - first : min(start + _BLOCK, n) - first])
-    return Curve.join(parts)
+def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
+    """Turn poses (n) round so many times (n,) each, in place."""
+    for t in np.repeat(np.arange(len(turned)), turned):
+        other = reversed_pose(skeleton, pose[t : t + 1])
+        pose.root.rotation[t], pose.root.translation[t] = other.root.rotation[0], other.root.translation[0]
+        pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
 
 
-def _admitted(skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the hypothesis that lies on the curve all the same; NONE elsewhere."""
+def _admitted(
+    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, likely: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """(n,) of frames that were passed by, the `likely` (n, H) hypothesis that lies on the curve all the same; NONE
+    elsewhere.
+    """
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
     for h in range(seen.score.shape[1]):
-        rows = np.flatnonzero((path == NONE) & seen.known[:, h] & np.isfinite(curve.error_mm))
+        rows = np.flatnonzero((path == NONE) & likely[:, h] & np.isfinite(curve.error_mm))
         if not len(rows):
             continue
         joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
@@ -122,31 +158,44 @@ def to_track(
 
     ahead: the curve also goes on for a short time after the last measurement; told: only these rows.
     """
-    skeleton = subject.skeleton
+    tuning = tuning or Tuning.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
-    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)[told]
-    measured, seen, path, curve, doubt = measured[told], seen[told], path[told], curve[told], doubt[told]
-    track = Track.empty(skeleton, seen.times_ns)
+    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
+    track = Track.empty(subject.skeleton, seen.times_ns[told])
+    _write(subject, track, curve[told], tuning)
+    _settle(subject, track, seen[told], path[told], doubt[told], measured[told], bridged[told])
+    return track
+
+
+def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None:
+    """A curve into the rows (n) of a track, whether anything was measured there or not."""
+    pose, motion = curve.pose, tuning.motion
+    track.joints_mm[:], track.predicted_error_mm[:] = curve.joints, curve.error_mm
+    track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
+    track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
+    track.sd_mm[:] = (curve.error_mm / _ERROR_PER_SD)[:, None] * np.array(subject.joint_share)
+    track.sd_root[:] = _spread_of_root(curve) * motion.honest_root
+    track.sd_angles_rad[:] = (curve.sd_bend * motion.honest_bend)[:, None] * subject.skeleton.axes
+    track.sd_angles_rad[:, 0] = 0.0
+
+
+def _settle(
+    subject: Subject, track: Track, seen: Observations, path: NDArray[np.int64], doubt: Array,
+    measured: NDArray[np.bool_], bridged: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Keep of the curve in the rows (n) of a track what was measured or is bridged, and add what was seen."""
     there = measured | bridged
-    pose, camera = curve.pose, subject.camera
-    in_camera = subject.T_arena_camera.inverse() @ curve.joints[there]
-    track.joints_mm[there], track.uv_px[there] = curve.joints[there], camera.project(in_camera)
-    track.root_rotation[there], track.root_mm[there] = pose.root.rotation[there], pose.root.translation[there]
-    track.angles_rad[there], track.scale[there] = pose.angles[there], pose.scale[there]
-    sd = curve.error_mm / _ERROR_PER_SD
-    track.sd_mm[there] = (sd[:, None] * np.array(subject.joint_share))[there]
-    motion = (tuning or Tuning.of(skeleton.name)).motion
-    track.sd_root[there] = (_spread_of_root(curve) * motion.honest_root)[there]
-    bend = curve.sd_bend * motion.honest_bend
-    track.sd_angles_rad[there] = (bend[:, None] * skeleton.axes)[there]
-    track.sd_angles_rad[:, 0] = np.where(there[:, None], 0.0, np.nan)
-    track.predicted_error_mm[there] = curve.error_mm[there]
+    for column in (
+        track.joints_mm, track.predicted_error_mm, track.root_rotation, track.root_mm, track.angles_rad, track.scale,
+        track.sd_mm, track.sd_root, track.sd_angles_rad,
+    ):  # fmt: skip
+        column[~there] = np.nan
+    track.uv_px[there] = subject.camera.project(subject.T_arena_camera.inverse() @ track.joints_mm[there])
     track.p_flip[there] = doubt[there]
     _add_sight(track, seen, path, measured)
     track.bridged[:] = bridged
-    track.flag[measured] = np.where(curve.error_mm > subject.doubtful_mm, "doubtful", "")[measured]
+    track.flag[measured] = np.where(track.predicted_error_mm > subject.doubtful_mm, "doubtful", "")[measured]
     track.flag[~measured & ~seen.has_depth] = "no_depth"
-    return track
 
 
 def _spread_of_root(curve: Curve) -> Array:
@@ -204,10 +253,12 @@ def short_gaps(
 
 def _flips(seen: Observations, track: Track) -> list[Flip]:
     """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
-    tip = track.skeleton.tip
-    ends = seen.joints([0, tip])[:, 0]
-    along = track.joints_mm[:, tip] - track.joints_mm[:, 0]
-    exchanged = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
+    tip, exchanged = track.skeleton.tip, np.zeros(len(seen), np.bool_)
+    for rows in _blocks(len(seen)):
+        ends = seen[rows].joints([0, tip])[:, 0]
+        along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]
+        exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
+        _rest(track, seen)
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)
     return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]

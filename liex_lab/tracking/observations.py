@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
+from liex_lab.memory import let_go
 from liex_lab.tracking._joints import place_joints
 
 Array = NDArray[np.float64]
@@ -74,6 +75,10 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.times_ns)
+
+    def rest(self) -> None:
+        """Let go of the memory of columns that lie on disk, until they are looked at again."""
+        let_go(*(getattr(self, name) for name in COLUMNS))
 
     @property
     def seconds(self) -> Array:

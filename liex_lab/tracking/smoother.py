@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,15 +90,6 @@ class Curve:
     def __getitem__(self, rows: slice) -> Curve:
         """Some consecutive frames."""
         return Curve(self.pose[rows], *(getattr(self, name)[rows] for name in _ROWS))
-
-    @staticmethod
-    def join(parts: Sequence[Curve]) -> Curve:
-        """Consecutive parts as one."""
-        poses = [part.pose for part in parts]
-        turns, places = [p.root.rotation for p in poses], [p.root.translation for p in poses]
-        root = SE3(np.concatenate(turns), np.concatenate(places))
-        pose = Pose(root, np.concatenate([p.angles for p in poses]), np.concatenate([p.scale for p in poses]))
-        return Curve(pose, *(np.concatenate([getattr(part, name) for part in parts]) for name in _ROWS))
 
     @staticmethod
     def unknown(n: int, n_joints: int) -> Curve:

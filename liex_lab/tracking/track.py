@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
+from liex_lab.memory import Room, let_go
 
 Array = NDArray[np.float64]
 
@@ -57,28 +59,38 @@ class Track:
     flag: NDArray[np.str_]
 
     @staticmethod
-    def empty(skeleton: Skeleton, times_ns: NDArray[np.int64], flag: str = "not_found") -> Track:
-        """A track of these times in which nothing has been measured yet."""
+    def empty(skeleton: Skeleton, times_ns: NDArray[np.int64], flag: str = "not_found", room: Room = np.empty) -> Track:
+        """A track of these times in which nothing has been measured yet; room: where its columns are to lie."""
         n, j = len(times_ns), skeleton.n_joints
-        nan = np.full
+
+        def column(value: object, dtype: object, *shape: int) -> NDArray[Any]:
+            made = room((n, *shape), dtype)
+            made[...] = value
+            let_go(made)
+            return made
+
+        def unknown(*shape: int) -> Array:
+            return column(np.nan, np.float64, *shape)
+
         return Track(
-            skeleton, np.asarray(times_ns, np.int64), nan((n, j, 3), np.nan), nan((n, j, 2), np.nan),
-            nan((n, j), np.nan), nan((n, 3, 3), np.nan), nan((n, 3), np.nan), nan((n, 6), np.nan),
-            nan((n, j, 3), np.nan), nan((n, j, 3), np.nan), nan(n, np.nan), nan(n, np.nan), nan(n, np.nan),
-            np.zeros(n, np.int64), nan((n, 3), np.nan), nan((n, 2), np.nan), nan(n, np.nan),
-            np.zeros(n, np.bool_), np.full(n, flag, dtype="<U12"),
+            skeleton, np.asarray(times_ns, np.int64), unknown(j, 3), unknown(j, 2), unknown(j), unknown(3, 3),
+            unknown(3), unknown(6), unknown(j, 3), unknown(j, 3), unknown(), unknown(), unknown(),
+            column(0, np.int64), unknown(3), unknown(2), unknown(), column(False, np.bool_), column(flag, "<U12"),
         )  # fmt: skip
 
     @staticmethod
     def join(parts: list[Track]) -> Track:
         """One track from consecutive parts of the same recording."""
-        columns = [f.name for f in fields(Track) if f.name != "skeleton"]
-        return Track(parts[0].skeleton, *(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in _columns())
+        return Track(parts[0].skeleton, *columns)
 
     def __getitem__(self, rows: slice) -> Track:
-        """Some consecutive frames."""
-        columns = [f.name for f in fields(Track) if f.name != "skeleton"]
-        return Track(self.skeleton, *(getattr(self, name)[rows] for name in columns))
+        """Some consecutive frames; what is written into them is written into the whole."""
+        return Track(self.skeleton, *(getattr(self, name)[rows] for name in _columns()))
+
+    def rest(self) -> None:
+        """Let go of the memory of columns that lie on disk, until they are looked at again."""
+        let_go(*(getattr(self, name) for name in _columns()))
 
     @property
     def n_frames(self) -> int:
@@ -104,6 +116,10 @@ class Track:
     def spine_mm(self) -> Array:
         """(n,) length of the fitted chain, all bones added up, mm."""
         return self.scale * self.skeleton.length
+
+
+def _columns() -> list[str]:
+    return [f.name for f in fields(Track) if f.name != "skeleton"]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.memory import Room
 from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.threads import threads
@@ -97,9 +98,9 @@ class FrameTracker:
         """The same from what was seen of them."""
         return single_frames(self.subject, seen)
 
-    def track(self, seen: Observations, corrections: Sequence[Flip] = ()) -> Tracked:
-        """The track of a whole recording."""
-        return track_whole(self.subject, seen, corrections)
+    def track(self, seen: Observations, corrections: Sequence[Flip] = (), room: Room = np.empty) -> Tracked:
+        """The track of a whole recording; room: where it is to lie."""
+        return track_whole(self.subject, seen, corrections, room=room)
 
     def _put(self, seen: Observations, h: int, estimates: Estimates) -> None:
         """What the estimator says as hypothesis h, and what is seen of the thing that it is of."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,36 @@ def test_what_hangs_together_with_the_animal_but_lies_far_behind_it_is_left_out(
     frame[85:95, 185:200] = FLOOR.distance_mm - 4.0  # something low on the floor, seen beside the animal
     crops = scene("camera").extract(frame[None], 1.0, camera_view=True)
     assert crops.distance[0] == pytest.approx(FLOOR.distance_mm - HIGH + BEHIND, abs=0.2)
+
+
+def under_a_beam(thing: float, columns: slice) -> tuple[np.ndarray, np.ndarray]:
+    """The bar with a beam of depth `thing` mm over some columns, and the same with the beam's readings missing."""
+    frame, unread = bar(), bar()
+    frame[:, columns], unread[:, columns] = thing, 0.0
+    return frame, unread
+
+
+@pytest.mark.parametrize("columns", [slice(40, 70), slice(150, 230)])
+def test_a_thing_far_before_the_animal_is_taken_for_unread_though_they_touch_in_the_picture(columns):
+    known = replace(scene("camera"), area_mm2=480.0)
+    frame, unread = under_a_beam(150.0, columns)
+    crops, alone = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
+    assert crops.n_px[0] > 0.5 * known.extract(bar()[None], 1.0, camera_view=True).n_px[0]
+    np.testing.assert_array_equal(crops.n_px, alone.n_px)
+    np.testing.assert_array_equal(crops.heights, alone.heights)
+    np.testing.assert_array_equal(crops.moments, alone.moments)
+
+
+def test_a_larger_thing_far_behind_the_animal_is_background_though_they_touch_in_the_picture():
+    known = replace(scene("camera"), area_mm2=480.0)
+    alone = bar()
+    alone[alone < FLOOR.distance_mm - 20.0] -= 20.0
+    frame = alone.copy()
+    beside = (slice(60, 130), slice(170, 230))
+    frame[beside] = np.minimum(alone[beside], FLOOR.distance_mm - 4.0)  # low on the floor
+    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, alone))
+    np.testing.assert_array_equal(crops.n_px, same.n_px)
+    np.testing.assert_array_equal(crops.heights, same.heights)
 
 
 def test_readings_missing_across_the_body_do_not_part_it():
