@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from liex_lab.recordings.times import Gap
     from liex_lab.recordings.zones import Zone
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 _PACKAGES = (
     "liex_lab", "numpy", "scipy", "numba", "scikit-learn", "pandas", "pyarrow", "opencv-python-headless", "rerun-sdk",
     "mcap", "foxglove-sdk",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from liex_lab.geometry import so3
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
-from liex_lab.sessions.tables import FRAMES, ROWS_PER_GROUP, Block, Words, to_pandas
+from liex_lab.sessions.tables import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
 from liex_lab.tracking.track import Flip, Track
 
 if TYPE_CHECKING:
@@ -91,11 +91,14 @@ class Rows:
             spread = np.concatenate([track.sd_root[part][:, None, :3], track.sd_angles_rad[part]], axis=1)
             shift, sd_shift = np.full(turn.shape, np.nan), np.full(turn.shape, np.nan)
             shift[:, 0], sd_shift[:, 0] = track.root_mm[part], track.sd_root[part][:, 3:]
+            together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
+            together[:, 0] = track.cov_root[part][:, *np.triu_indices(6, 1)]
             yield {
                 **self._who, **self._when(part, n_rows),
                 "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
                 **_xyz("w{}_rad", turn), **_xyz("sd_w{}_rad", spread),
                 **_xyz("t{}_mm", shift), **_xyz("sd_t{}_mm", sd_shift),
+                **{name: together[..., k].ravel() for k, name in enumerate(ROOT_COVARIANCES)},
             }  # fmt: skip
 
     def missing_before(self) -> NDArray[np.int64]:

@@ -117,6 +117,13 @@ POSES = columns(
 _TURN = "rotation vector relative to the parent joint; row 'root': the body's base relative to the arena"
 _SHIFT = "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
 _SPREAD = "posterior of the smoother"
+_OF_ROOT = ("wx_rad", "wy_rad", "wz_rad", "tx_mm", "ty_mm", "tz_mm")
+# of each pair of them, row by row of the upper triangle: name and unit
+ROOT_COVARIANCES = {
+    f"cov_{a[:2]}_{b[:2]}_{unit}": unit.replace("2", "²").replace("_", " ")
+    for k, a in enumerate(_OF_ROOT) for b in _OF_ROOT[k + 1 :]
+    for unit in [a[3:] + "2" if a[3:] == b[3:] else f"{a[3:]}_{b[3:]}"]
+}  # fmt: skip
 ROTATIONS = columns(
     "rotations", *_WHO, *_WHEN,
     ("joint", "string", "", "name of the joint; 'root' is the rigid transform of the body's base, T_arena_root"),
@@ -127,6 +134,8 @@ ROTATIONS = columns(
     *((f"t{axis}_mm", "float64", "mm", f"{axis}; {_SHIFT}", "", "fit") for axis in "xyz"),
     *((f"sd_t{axis}_mm", "float64", "mm", f"standard deviation of t{axis}_mm, in the root's own frame", "", _SPREAD)
       for axis in "xyz"),
+    *((name, "float64", unit, f"row 'root' only: covariance of the root's {name[4:6]} and {name[7:9]}, in its own "
+       "frame; the variances are the squares of their sd_", "", _SPREAD) for name, unit in ROOT_COVARIANCES.items()),
 )  # fmt: skip
 
 BOUTS = columns(

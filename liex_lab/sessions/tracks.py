@@ -11,6 +11,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.sessions.evidence import read_skeleton
+from liex_lab.sessions.tables import ROOT_COVARIANCES
 from liex_lab.tracking.track import Track
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     track.root_rotation[seen] = so3.exp(turns[seen, 0])
     track.root_mm[:] = _columns(rotations, [f"t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
     shift = _columns(rotations, [f"sd_t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
-    track.sd_root[:] = np.concatenate([spread[:, 0], shift], axis=1)
+    track.cov_root[:] = _covariance(rotations.iloc[:: j + 1], np.concatenate([spread[:, 0], shift], axis=1))
     for name in _SCALARS:
         if name in frames:
             getattr(track, name)[:] = frames[name].to_numpy()
@@ -58,6 +59,17 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     track.centroid_px[:] = _columns(frames, [f"centroid_{a}_px" for a in "uv"])
     track.flag[:] = frames["flag"].to_numpy().astype(track.flag.dtype)
     return track
+
+
+def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
+    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6); of an older session these
+    alone are known.
+    """
+    out = np.zeros((len(sd), 6, 6))
+    out[:, range(6), range(6)] = sd**2
+    rows, columns = np.triu_indices(6, 1)
+    out[:, rows, columns] = out[:, columns, rows] = _columns(roots, list(ROOT_COVARIANCES))
+    return out
 
 
 def wall_of(session: Session) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
-from liex_lab.geometry import SE3
+from liex_lab.geometry import SE3, so3
 from liex_lab.memory import Room
 from liex_lab.tracking.chain import NONE, Chain
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
@@ -176,7 +176,8 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None
     track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
     track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
     track.sd_mm[:] = (curve.error_mm / _ERROR_PER_SD)[:, None] * np.array(subject.joint_share)
-    track.sd_root[:] = _spread_of_root(curve) * motion.honest_root
+    honest = np.array(motion.honest_root)
+    track.cov_root[:] = covariance_of_root(curve) * (honest[:, None] * honest)
     track.sd_angles_rad[:] = (curve.sd_bend * motion.honest_bend)[:, None] * subject.skeleton.axes
     track.sd_angles_rad[:, 0] = 0.0
 
@@ -189,7 +190,7 @@ def _settle(
     there = measured | bridged
     for column in (
         track.joints_mm, track.predicted_error_mm, track.root_rotation, track.root_mm, track.angles_rad, track.scale,
-        track.sd_mm, track.sd_root, track.sd_angles_rad,
+        track.sd_mm, track.cov_root, track.sd_angles_rad,
     ):  # fmt: skip
         column[~there] = np.nan
     track.uv_px[there] = subject.camera.project(subject.T_arena_camera.inverse() @ track.joints_mm[there])
@@ -200,15 +201,19 @@ def _settle(
     track.flag[~measured & ~seen.has_depth] = "no_depth"
 
 
-def _spread_of_root(curve: Curve) -> Array:
-    """Standard deviations (n, 6) of the root in its own frame, rad and mm: what its middle may be off, and what a turn
-    about the middle moves the root.
+def covariance_of_root(curve: Curve) -> Array:
+    """Covariance (n, 6, 6) of the root's turn, rad, and shift, mm, about and along its own axes: what the joints'
+    middle may be off, and what a turn about the middle moves the root.
     """
-    root = curve.pose.root
+    root, out = curve.pose.root, np.zeros((len(curve.joints), 6, 6))
     lever = np.einsum("nij,ni->nj", root.rotation, curve.joints[:, 0] - curve.joints.mean(axis=1))
-    moved = np.cross(np.eye(3), lever[:, None]) * curve.sd_turn[:, :, None]  # (n, axis turned about, axis moved along)
-    place = np.einsum("nij,ni->nj", root.rotation**2, curve.sd_middle_mm**2) + (moved**2).sum(axis=1)
-    return np.concatenate([curve.sd_turn, np.sqrt(place)], axis=1)
+    moved = -so3.hat(lever)  # of a small turn: the shift is its cross product with the lever
+    turn = curve.sd_turn[:, :, None] ** 2 * np.eye(3)
+    out[:, :3, :3], out[:, 3:, :3] = turn, moved @ turn
+    out[:, :3, 3:] = np.swapaxes(out[:, 3:, :3], 1, 2)
+    middle = np.swapaxes(root.rotation, 1, 2) @ curve.cov_middle_mm2 @ root.rotation
+    out[:, 3:, 3:] = middle + moved @ turn @ np.swapaxes(moved, 1, 2)
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
 
 # a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
@@ -229,8 +234,8 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     pose, error = seen.pose(path), seen.along(seen.error_mm, path)
     moves = Tuning.of(subject.skeleton.name).motion.packed
     turn, bend = (group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend))
-    curve = Curve(pose, joints_of(subject.skeleton, pose), error, moves.place_error * error[:, None], turn, bend,
-                  path >= 0)  # fmt: skip
+    middle = (moves.place_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
+    curve = Curve(pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0)
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
 
 

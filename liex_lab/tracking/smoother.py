@@ -74,15 +74,15 @@ class Motion:
 class Curve:
     """A smoothed curve of n frames.
 
-    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error; sd_middle_mm (n, 3): of the
-    joints' middle along the arena's axes; sd_turn (n, 3) of the base's rotation about its own axes and sd_bend (n, 3)
-    of the other joints' about theirs, rad; used (n,): frames whose measurement it goes by.
+    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error; cov_middle_mm2 (n, 3, 3): of
+    the joints' middle along the arena's axes; sd_turn (n, 3) of the base's rotation about its own axes and sd_bend
+    (n, 3) of the other joints' about theirs, rad; used (n,): frames whose measurement it goes by.
     """
 
     pose: Pose
     joints: Array
     error_mm: Array
-    sd_middle_mm: Array
+    cov_middle_mm2: Array
     sd_turn: Array
     sd_bend: Array
     used: NDArray[np.bool_]
@@ -97,10 +97,10 @@ class Curve:
         nan = np.full((n, n_joints, 3, 3), np.nan)
         axes, none = nan[:, 0, 0], nan[:, 0, 0, 0]
         pose = Pose(SE3(nan[:, 0], axes), nan[..., 0], none)
-        return Curve(pose, nan[..., 0], none, axes, axes, axes, np.zeros(n, np.bool_))
+        return Curve(pose, nan[..., 0], none, nan[:, 0], axes, axes, np.zeros(n, np.bool_))
 
 
-_ROWS = ("joints", "error_mm", "sd_middle_mm", "sd_turn", "sd_bend", "used")
+_ROWS = ("joints", "error_mm", "cov_middle_mm2", "sd_turn", "sd_bend", "used")
 
 
 def smooth(
@@ -140,12 +140,12 @@ def _curve(
 ) -> Curve:  # fmt: skip
     """What the kernels made, and how far off it may be: what the filter leaves, and what lasts over many frames."""
     lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
-    middle = np.diagonal(spread.middle, axis1=1, axis2=2)
+    middle = np.trace(spread.middle, axis1=1, axis2=2)
     place, moves = np.array(motion.place_error), motion.packed
     # of a frame's predicted error, what the middle's errors and what the bends' are of it
-    relative = 0.5 * middle.sum(axis=1) / (place**2).sum()
+    relative = 0.5 * middle / (place**2).sum()
     relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2
-    sd_middle = np.sqrt(middle + (place**2).mean() * lasting[:, None] ** 2)
+    cov_middle = spread.middle + (place**2).mean() * np.eye(3) * lasting[:, None, None] ** 2
     turn, bend = (
         np.sqrt(left + (group[:, 0] * lasting[:, None] / length_mm) ** 2)
         for left, group in ((spread.turn, moves.turn), (spread.bend, moves.bend))
@@ -156,4 +156,5 @@ def _curve(
         np.log(error / length_mm), *np.array([(np.log(said), factor) for said, factor in motion.honest]).T
     )
     each = honest[:, None]
-    return Curve(pose, made.joints, honest * error, each * sd_middle, each * turn, each * bend, used)
+    cov_middle *= each[:, None] ** 2
+    return Curve(pose, made.joints, honest * error, cov_middle, each * turn, each * bend, used)

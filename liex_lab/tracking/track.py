@@ -29,13 +29,13 @@ class Track:
     """Poses over time: one row for EVERY frame of the recording, NaN where there is none.
 
     times_ns (n,) int64; joints_mm (n, J, 3) arena frame; uv_px (n, J, 2) pixels of the depth image; sd_mm (n, J);
-    root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; sd_root (n, 6) rad and mm, in the root's own frame;
-    angles_rad (n, J, 3) rotation vectors relative to the parent joint; sd_angles_rad (n, J, 3); scale (n,) of the
-    skeleton's bones; predicted_error_mm (n,) mean joint error expected by the learned metric; residual_mm (n,) median
-    distance between the rendered body and the observed depth; n_foreground_px (n,); centroid_mm (n, 3) centre of the
-    animal as seen from above and its mean height, arena frame; centroid_px (n, 2); p_flip (n,): probability that head
-    and tail are exchanged; bridged (n,): nothing was measured, but shortly before and after, and the pose is what lies
-    between; flag (n,) a word of `FLAGS`.
+    root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; cov_root (n, 6, 6): covariance of the root's turn, rad,
+    and shift, mm, about and along its own axes; angles_rad (n, J, 3) rotation vectors relative to the parent joint;
+    sd_angles_rad (n, J, 3); scale (n,) of the skeleton's bones; predicted_error_mm (n,) mean joint error expected by
+    the learned metric; residual_mm (n,) median distance between the rendered body and the observed depth;
+    n_foreground_px (n,); centroid_mm (n, 3) centre of the animal as seen from above and its mean height, arena frame;
+    centroid_px (n, 2); p_flip (n,): probability that head and tail are exchanged; bridged (n,): nothing was measured,
+    but shortly before and after, and the pose is what lies between; flag (n,) a word of `FLAGS`.
     """
 
     skeleton: Skeleton
@@ -45,7 +45,7 @@ class Track:
     sd_mm: Array
     root_rotation: Array
     root_mm: Array
-    sd_root: Array
+    cov_root: Array
     angles_rad: Array
     sd_angles_rad: Array
     scale: Array
@@ -74,7 +74,7 @@ class Track:
 
         return Track(
             skeleton, np.asarray(times_ns, np.int64), unknown(j, 3), unknown(j, 2), unknown(j), unknown(3, 3),
-            unknown(3), unknown(6), unknown(j, 3), unknown(j, 3), unknown(), unknown(), unknown(),
+            unknown(3), unknown(6, 6), unknown(j, 3), unknown(j, 3), unknown(), unknown(), unknown(),
             column(0, np.int64), unknown(3), unknown(2), unknown(), column(False, np.bool_), column(flag, "<U12"),
         )  # fmt: skip
 
@@ -111,6 +111,11 @@ class Track:
     def root(self) -> SE3:
         """T_arena_root, a batch (n,)."""
         return SE3(self.root_rotation, self.root_mm)
+
+    @property
+    def sd_root(self) -> Array:
+        """(n, 6) standard deviations of the root's turn, rad, and shift, mm."""
+        return np.asarray(np.sqrt(np.diagonal(self.cov_root, axis1=1, axis2=2)))
 
     @property
     def spine_mm(self) -> Array:

@@ -51,6 +51,7 @@ def test_a_session_gives_back_the_track_it_was_made_from(session: Session, mouse
     np.testing.assert_allclose(track.joints_mm, true.joints_mm, atol=1e-9)
     np.testing.assert_allclose(track.root_rotation, true.root_rotation, atol=1e-9)
     np.testing.assert_allclose(track.angles_rad, true.angles_rad, atol=1e-9)
+    np.testing.assert_allclose(track.cov_root, true.cov_root, rtol=1e-12)
     told = ("uv_px", "sd_mm", "sd_root", "sd_angles_rad", "centroid_mm", "residual_mm", "p_flip", "bridged", "flag")
     for name in told:
         np.testing.assert_array_equal(getattr(track, name), getattr(true, name), err_msg=name)

@@ -12,7 +12,7 @@ from liex_lab.geometry import so3
 from liex_lab.recordings.times import find_faults, find_gaps, median_step, settle
 from liex_lab.sessions.rows import Rows, nearness, stop_times, stretches
 from liex_lab.sessions.tables import GAPS, ROTATIONS, to_pandas
-from tests.sessions.walking_mouse import WalkingMouse, steady
+from tests.sessions.walking_mouse import SD_ROOT, WalkingMouse, steady
 
 
 def rows_of(mouse: WalkingMouse) -> Rows:
@@ -68,6 +68,11 @@ def test_rotations_bring_the_root_s_transform_back():
     np.testing.assert_allclose(back, mouse.track().root_rotation, atol=1e-9)
     np.testing.assert_allclose(root[["tx_mm", "ty_mm", "tz_mm"]], mouse.track().root_mm)
     np.testing.assert_allclose(root["sd_tz_mm"].iloc[0], 2.0)
+    np.testing.assert_allclose(root["cov_wx_wz_rad2"].iloc[0], 0.2 * SD_ROOT[0] * SD_ROOT[2])
+    np.testing.assert_allclose(root["cov_wy_tx_rad_mm"].iloc[0], 0.2 * SD_ROOT[1] * SD_ROOT[3])
+    np.testing.assert_allclose(root["cov_ty_tz_mm2"].iloc[0], 0.2 * SD_ROOT[4] * SD_ROOT[5])
+    assert root["cov_ty_tz_mm2"].isna().sum() == 1
+    assert table.loc[table["joint"] != "root", "cov_ty_tz_mm2"].isna().all()
     assert table.loc[table["joint"] != "root", "tx_mm"].isna().all()
     assert root["wx_rad"].isna().sum() == 1
 

@@ -36,6 +36,7 @@ def test_every_written_column_has_an_entry_in_columns_json(session):
 
 def test_a_unit_in_a_name_is_the_unit_of_the_entry():
     suffixes = {
+        "_rad_mm": "rad mm",
         "_mm_s": "mm/s",
         "_rad_s": "rad/s",
         "_mm": "mm",

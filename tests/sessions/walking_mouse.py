@@ -20,6 +20,7 @@ from liex_lab.tracking.track import Track
 FLOOR_MM = 700.0
 SPINE_MM = 90.0
 SMALL = Camera(95.8, 95.8, 53.0, 39.5, 107, 80, source="typical PrimeSense, a sixth of its size")
+SD_ROOT = np.array([0.02, 0.02, 0.05, 1.5, 1.5, 2.0])  # rad and mm; of two of them a fifth is common
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class WalkingMouse:
         track = Track(
             skeleton=skeleton, times_ns=self.times_ns, joints_mm=joints, uv_px=uv,
             sd_mm=np.full(joints.shape[:2], self.sd_mm), root_rotation=rotation, root_mm=pose.root.translation,
-            sd_root=np.tile([0.02, 0.02, 0.05, 1.5, 1.5, 2.0], (n, 1)), angles_rad=angles,
+            cov_root=np.tile(np.outer(SD_ROOT, SD_ROOT) * (0.8 * np.eye(6) + 0.2), (n, 1, 1)), angles_rad=angles,
             sd_angles_rad=np.full(angles.shape, 0.05), scale=scale,
             predicted_error_mm=2.0 + 0.5 * np.sin(self.times_s), residual_mm=np.full(n, 1.5),
             n_foreground_px=np.full(n, 900, np.int64), centroid_mm=joints.mean(axis=1), centroid_px=uv.mean(axis=1),

@@ -9,11 +9,12 @@ import pytest
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.geometry import SE3
+from liex_lab.geometry import SE3, so3
 from liex_lab.memory import on_disk
-from liex_lab.tracking.curve import short_gaps, single_frames, spans, track_whole
+from liex_lab.tracking.curve import covariance_of_root, short_gaps, single_frames, spans, track_whole
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.online import OnlineTracker
+from liex_lab.tracking.smoother import Curve
 from liex_lab.tracking.track import Flip, Track
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
 
@@ -40,6 +41,30 @@ def test_the_curve_is_nearer_to_the_truth_than_its_frames_and_says_how_near(trut
     assert np.median(track.predicted_error_mm) < np.median(single.predicted_error_mm)
     off = np.abs(track.joints_mm - truth.joints(MOUSE)) / track.sd_mm[..., None]
     assert np.mean(off < 1.645) > 0.85
+
+
+def test_the_roots_covariance_is_that_of_a_middle_that_is_off_and_a_turn_about_it(measured):
+    rng, n = np.random.default_rng(8), 40_000
+    pose = measured[:1]
+    joints = joints_of(MOUSE, pose)
+    middle, sd_turn = np.array([[4.0, 1.0, 0.5], [1.0, 2.0, -0.3], [0.5, -0.3, 1.0]]), np.array([[0.04, 0.02, 0.06]])
+    one = np.ones(1)
+    said = covariance_of_root(Curve(pose, joints, one, middle[None], sd_turn, sd_turn, one > 0))[0]
+    centre, turns = joints[0].mean(axis=0), sd_turn * rng.normal(size=(n, 3))
+    turned = pose.root.rotation[0] @ so3.exp(turns)
+    lever = pose.root.rotation[0].T @ (pose.root.translation[0] - centre)
+    place = centre + rng.multivariate_normal(np.zeros(3), middle, n) + turned @ lever
+    drawn = np.concatenate([turns, (place - pose.root.translation[0]) @ pose.root.rotation[0]], axis=1)
+    scale = np.sqrt(np.diagonal(said))
+    np.testing.assert_allclose(np.cov(drawn.T) / np.outer(scale, scale), said / np.outer(scale, scale), atol=0.03)
+    assert np.abs(said[:3, 3:] / np.outer(scale[:3], scale[3:])).max() > 0.3, "a turn and a shift go together"
+
+
+def test_a_rows_covariance_of_the_root_is_one(measured):
+    track = track_whole(SUBJECT, told(SECONDS, measured)).track
+    np.testing.assert_array_equal(track.cov_root, np.swapaxes(track.cov_root, 1, 2))
+    scale = track.sd_root[:, :, None] * track.sd_root[:, None]
+    assert (np.linalg.eigvalsh(track.cov_root / scale) > 0).all()
 
 
 def test_a_curve_without_noise_is_followed_through_missing_frames(truth):
