@@ -137,5 +137,5 @@ def test_measures_made_in_blocks_from_the_track_are_those_of_the_whole_table(mon
     mouse = WalkingMouse(steady(2.0), lost=(10, 11, 25))
     frames, poses = tables_of(mouse)
     whole = kinematics(frames, poses)
-    monkeypatch.setattr("liex_lab.behaviour.kinematics._BLOCK", 7)
+    monkeypatch.setitem(kinematics.__globals__, "_BLOCK", 7)  # the package names the function like its module
     pd.testing.assert_frame_equal(kinematics(frames, Joints.of_track(mouse.track())), whole, check_exact=True)
