@@ -217,13 +217,17 @@ def evaluate_reference(
 
 @evaluate.command("scale")
 def evaluate_scale(
-    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 3000,
+    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 2000,
     minutes: Annotated[
         list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes.
+
+    Takes about a quarter of an hour on two cores, and wants a machine without other work; with --minutes 10 alone, half
+    of that.
+    """
     from liex_lab.api import run_scale
 
     with progress_bar() as progress:

@@ -114,7 +114,7 @@ def build_estimator(plan: Plan) -> PoseEstimator:
     from liex_lab.catalog import find_model, sha256
 
     path = find_model(plan.estimation.model)
-    estimator = _estimator(path, sha256(path), plan.estimation.n_candidates or 0)
+    estimator = kept_estimator(path, sha256(path), plan.estimation.n_candidates or 0)
     wanted = plan.animal.skeleton
     if wanted.endswith(".toml"):  # a file of the user's own: what matters is the animal in it
         wanted = Skeleton.load(wanted).name
@@ -127,8 +127,8 @@ def build_estimator(plan: Plan) -> PoseEstimator:
 
 
 @lru_cache(maxsize=1)
-def _estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
-    """digest: another content is another model."""
+def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
+    """The estimator of a model file. digest: another content is another model."""
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
 

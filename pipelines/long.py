@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FPS = 30
 _SHORT = "synthetic:walk?seed=5&frames=300&sensor=primesense-qvga"
-_COARSER = 4  # the pictures that are written: they go straight to disk, so their size does not matter here
+_COARSER = 8  # the pictures that are written: they go straight to disk, so their size does not matter here
 _CHUNK = 256  # frames
 
 Stage = Callable[[str], None]

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from liex_lab.pipelines.build import (
     build_estimator,
     build_provenance,
@@ -22,7 +23,7 @@ from liex_lab.pipelines.build import (
 from liex_lab.pipelines.crew import Crew
 from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
 
-from liex_lab.memory import give_back
+from liex_lab.memory import Room, give_back
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.threads import ahead, meanwhile
@@ -111,27 +112,32 @@ def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour of a session whose track is known, and put the session in its place."""
-    give_back()  # hours of recording leave much behind
     rows = writer.rows
-    behaviour, notes = measure_behaviour(rows, plan, writer.origin)
+    behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.room)
     writer.note(**notes)
     rows.track.rest()
     give_back()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
-def measure_behaviour(rows: Rows, plan: Plan, origin: Provenance) -> tuple[Behaviour, dict[str, Any]]:
-    """The behaviour of a track as the plan names it, and what session.json is to hold of the recogniser."""
+def measure_behaviour(
+    rows: Rows, plan: Plan, origin: Provenance, room: Room = np.empty
+) -> tuple[Behaviour, dict[str, Any]]:
+    """The behaviour of a track as the plan names it, and what session.json is to hold of the recogniser. room: for what
+    takes much of it on the way.
+    """
     from liex_lab.behaviour.summary import measure_rows
 
     recogniser = build_recogniser(plan, origin.skeleton)
-    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows)
+    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, room)
     rows.track.rest()
     give_back()
     return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
 
 
-def name_actions(recogniser: TimelineModel, rows: Rows) -> tuple[dict[str, Any], dict[str, Any]]:
+def name_actions(
+    recogniser: TimelineModel, rows: Rows, room: Room = np.empty
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which recogniser it was,
     and what the frame rate cannot tell.
     """
@@ -139,7 +145,7 @@ def name_actions(recogniser: TimelineModel, rows: Rows) -> tuple[dict[str, Any],
     from liex_lab.sessions.tables import FRAMES, to_pandas
 
     frames = to_pandas(FRAMES, rows.frames())
-    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float))
+    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), room)
     notes = {
         "action_model": {"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
         "unresolved_actions": found.unresolved,

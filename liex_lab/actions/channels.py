@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import VIEWS, Skeleton
+from liex_lab.memory import Room, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -43,8 +44,12 @@ def channel_names(skeleton: Skeleton) -> list[str]:
             *(f"{p}_rate" for p in pitches), "twist", *floor, "wall", "doubt"]  # fmt: skip
 
 
-def stretches_of(track: Track, rate_hz: float, wall_mm: Array | None = None) -> list[Stretch]:
-    """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal from a wall."""
+def stretches_of(
+    track: Track, rate_hz: float, wall_mm: Array | None = None, room: Room = np.empty
+) -> list[Stretch]:  # fmt: skip
+    """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal from a wall; room:
+    where the channels are to lie.
+    """
     time_s = (track.times_ns - track.times_ns[:1]).astype(np.float64) * 1e-9
     good = np.flatnonzero(track.observed)
     if not len(good):
@@ -53,7 +58,7 @@ def stretches_of(track: Track, rate_hz: float, wall_mm: Array | None = None) -> 
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
-    return [_stretch(track, rows, time_s, wall, length_mm, _clock(time_s[rows], rate_hz))
+    return [_stretch(track, rows, time_s, wall, length_mm, _clock(time_s[rows], rate_hz), room)
             for rows in np.split(good, cuts)]  # fmt: skip
 
 
@@ -139,23 +144,25 @@ class _OnClock:
 
 
 def _stretch(
-    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, length_mm: float, clock: Array
+    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, length_mm: float, clock: Array, room: Room
 ) -> Stretch:
     """The channels of an unbroken stretch, a piece after the other."""
     found, m = _OnClock(track, rows, time_s, wall, clock), len(clock)
     heading, steep = np.empty(m), np.empty(m, np.bool_)
     for piece in _pieces(m):
         heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
+        track.rest()
     heading = np.unwrap(heading)
     # a body that stands upright has no heading: it keeps the last one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
-    values, step = np.empty((m, len(channel_names(track.skeleton)))), clock[1] - clock[0]
+    values, step = room((m, len(channel_names(track.skeleton))), np.float64), clock[1] - clock[0]
     for piece in _pieces(m):
         # a channel looks two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
         channels = _channels(track.skeleton, length_mm, step, heading[around], *found.at(around))
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
         track.rest()
+        let_go(values)
     return Stretch(clock, values)
 
 

@@ -13,7 +13,7 @@ from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.scores import timeline_scores
-from liex_lab.actions.timeline import Examples, Network, TimelineModel, clock_of, gather
+from liex_lab.actions.timeline import Examples, Network, TimelineModel, clock_of, gather, runs_of
 from liex_lab.errors import LiexError
 from liex_lab.progress import Progress, silent
 
@@ -24,7 +24,8 @@ _LEAST_STEPS, _MOST_EPOCHS = 1500, 200  # of few labels
 _WEIGHT_DECAY = 2e-3
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
-_USUAL = (0.005, 0.99)  # quantiles of the speeds of a word
+_USUAL, _LEAST_PEAK = (0.005, 0.99), 0.01  # quantiles of the speeds of a word, and of its bouts' highest ones
+_FAST = 1.0  # lengths a second, in the mean of a bout: an action that goes fast
 _NEVER = -30.0  # what a network says of a word that it has not seen
 
 
@@ -40,10 +41,11 @@ def learn(
     progress(1, 3, "learning what each action looks like")
     networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
-    speeds = speeds_of(examples, len(words))
+    speeds, peaks = speeds_of(examples, len(words)), peaks_of(examples, len(words))
     chain = ActionChain.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
-        tracks[0].track.skeleton.name, clock_hz, words, share, networks, chain, _SHARPNESS, speeds, definitions or {}
+        tracks[0].track.skeleton.name, clock_hz, words, share, networks, chain, _SHARPNESS, speeds, peaks,
+        definitions or {},
     )
 
 
@@ -65,6 +67,20 @@ def speeds_of(examples: Examples, n_words: int) -> Array:
         if len(speed):
             limits[k] = np.quantile(speed, _USUAL)
     return limits
+
+
+def peaks_of(examples: Examples, n_words: int) -> Array:
+    """(K,) lengths a second: the highest speed that nearly all bouts of each fast word reached; 0 of others, for
+    another animal may well be stiller than all that were seen, and not run just before or after.
+    """
+    least = np.zeros(n_words)
+    starts, stops, codes = runs_of(examples.code + n_words * examples.recording)
+    peak, mean = np.maximum.reduceat(examples.speed, starts), np.add.reduceat(examples.speed, starts) / (stops - starts)
+    for k in range(1, n_words):  # 0 is UNLABELLED
+        own = codes % n_words == k
+        if own.any() and np.median(mean[own]) > _FAST:
+            least[k] = np.quantile(peak[own], _LEAST_PEAK)
+    return least
 
 
 def train_network(examples: Examples, n_words: int, seed: int) -> Network:

@@ -15,7 +15,7 @@ from liex_lab.catalog import MODELS, sha256
 from liex_lab.errors import ModelError
 
 SUFFIX = ".skops"
-_FORMAT = 1
+_FORMAT, _WITHOUT_PEAKS = 2, 1
 
 
 def save_action_model(model: TimelineModel, path: str | Path) -> Path:
@@ -27,7 +27,7 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
     document: dict[str, Any] = {
         "format": _FORMAT, "skeleton": model.skeleton, "clock_hz": model.clock_hz, "words": list(model.words),
         "share": model.share, "sharpness": model.sharpness, "speeds": model.speeds,
-        "definitions": dict(model.definitions),
+        "peaks": model.peaks, "definitions": dict(model.definitions),
         "card": dict(model.card),
         "chain": {name: getattr(model.chain, name) for name in ActionChain.__dataclass_fields__},
         "networks": [
@@ -46,15 +46,19 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
     path = find_action_model(name, folder)
     try:
         document = read_plain(path)
-        if document["format"] != _FORMAT:
-            raise ModelError(f"the action model {path} has format {document['format']}, this liex_lab reads {_FORMAT}")
+        if document["format"] not in (_FORMAT, _WITHOUT_PEAKS):
+            raise ModelError(
+                f"the action model {path} has format {document['format']}, this liex_lab reads {_WITHOUT_PEAKS} and "
+                f"{_FORMAT}"
+            )
+        peaks = np.zeros(len(document["words"])) if document["format"] == _WITHOUT_PEAKS else document["peaks"]
         chain = ActionChain(*(np.asarray(document["chain"][name]) for name in ActionChain.__dataclass_fields__))
         networks = tuple(
             Network(n["centre"], n["scale"], tuple((w, b) for w, b in n["layers"])) for n in document["networks"]
         )
         return TimelineModel(
             document["skeleton"], float(document["clock_hz"]), tuple(document["words"]), document["share"], networks,
-            chain, float(document["sharpness"]), document["speeds"], document["definitions"],
+            chain, float(document["sharpness"]), document["speeds"], peaks, document["definitions"],
             {**document["card"], "sha256": sha256(path)},
         )  # fmt: skip
     except ModelError:

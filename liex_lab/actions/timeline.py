@@ -20,6 +20,7 @@ from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.windows import window_features
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.memory import Room, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -29,6 +30,7 @@ _CLOCK_HZ = 30.0
 _PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
 _LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
 _SPEED_S, _SLACK, _STILL, _UNSEEN = 0.2, 1.25, 0.1, 6.0  # half window; how far beyond is meant, and what it costs
+_MOST_DECODED, _REFUSED = 6, 10.0  # how often bouts that are too slow are refused, and what that costs a tick
 _FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
 _RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
 
@@ -58,7 +60,8 @@ class Network:
 class TimelineModel:
     """A trained recogniser. words (K): its vocabulary, UNLABELLED among them; share (K,): of the training time;
     sharpness: how much one tick counts in the chain, as ticks beside each other tell much the same; speeds (K, 2):
-    between which speeds, lengths a second, each word was seen, for a network says anything of what it has not seen.
+    between which speeds, lengths a second, each word was seen, for a network says anything of what it has not seen;
+    peaks (K,): the highest speed that bouts of a fast word reached at least, for what is never fast is no dart.
     """
 
     skeleton: str
@@ -69,6 +72,7 @@ class TimelineModel:
     chain: ActionChain
     sharpness: float
     speeds: Array
+    peaks: Array
     definitions: dict[str, str] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
@@ -76,31 +80,35 @@ class TimelineModel:
         """(m, K) of each word at each tick by itself."""
         margin = round(_MARGIN_S * self.clock_hz)
         out = np.empty((len(stretch.times_s), len(self.words)))
+        speed = steady_speed(stretch, names)[:, None]
         for start in range(0, len(out), _PIECE):
             stop = min(start + _PIECE, len(out))
             low, high = max(0, start - margin), min(len(out), stop + margin)
             features = window_features(Stretch(stretch.times_s[low:high], stretch.values[low:high]), names)
             features = features[start - low : stop - low]
+            let_go(stretch.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
-            out[start:stop] = np.log(np.maximum(p, 1e-6))
-        speed = steady_speed(stretch, names)[:, None]
-        beyond = (speed < self.speeds[:, 0] / _SLACK) | (speed > self.speeds[:, 1] * _SLACK + _STILL)
-        return out - _UNSEEN * beyond
+            now = speed[start:stop]
+            beyond = (now < self.speeds[:, 0] / _SLACK) | (now > self.speeds[:, 1] * _SLACK + _STILL)
+            out[start:stop] = np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
+        return out
 
     def scores(self, log_probabilities: Array) -> Array:
         """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is."""
         return self.sharpness * (log_probabilities - np.log(np.maximum(self.share, 1e-3)))
 
-    def recognise(self, track: Track, wall_mm: Array | None = None) -> Recognised:
-        """The ethogram of a track, and the probability of each word in each of its frames."""
+    def recognise(self, track: Track, wall_mm: Array | None = None, room: Room = np.empty) -> Recognised:
+        """The ethogram of a track, and the probability of each word in each of its frames. room: for what takes much
+        of it on the way.
+        """
         n, words = track.n_frames, np.array(self.words)
         probability = np.full((n, len(words)), np.nan)
         label, part = np.full(n, UNLABELLED, dtype=words.dtype), np.full(n, -1)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
-        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm)):
+        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, room)):
             scores = self.scores(self.log_probabilities(stretch, names))
-            decoded = self.chain.decode(scores, 1.0 / self.clock_hz)
+            decoded = self._decode(scores, steady_speed(stretch, names))
             certain = self.chain.probabilities(scores, 1.0 / self.clock_hz)
             begin, step = stretch.times_s[0], 1.0 / self.clock_hz
             rows = np.arange(*np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step]))
@@ -111,6 +119,20 @@ class TimelineModel:
         score = np.take_along_axis(probability, code[np.argsort(words)][chosen][:, None], axis=1)[:, 0]
         ethogram = Ethogram.of_words(label, track.times_ns, self.definitions, np.nan_to_num(score), part)
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
+
+    def _decode(self, scores: Array, speed: Array) -> NDArray[np.int64]:
+        """The most probable words (m,) of bouts that are all as fast at some time as their words ask for; scores (m, K)
+        of others are lowered in place.
+        """
+        for _ in range(_MOST_DECODED):
+            decoded = self.chain.decode(scores, 1.0 / self.clock_hz)
+            starts, stops, words = runs_of(decoded)
+            wrong = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
+            if not wrong.any():
+                break
+            for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
+                scores[start:stop, word] -= _REFUSED
+        return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
         """Per word, what this frame rate cannot tell: bouts that hold fewer than four frames, and parts of an action
@@ -171,6 +193,12 @@ class Examples:
     animal: NDArray[np.int64]
     recording: NDArray[np.int64]
     runs: list[list[tuple[int, float]]]
+
+
+def runs_of(values: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Where the runs of equal values (m,) start and stop, and their values."""
+    starts = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
+    return starts, np.append(starts[1:], len(values)), values[starts]
 
 
 def steady_speed(stretch: Stretch, names: Sequence[str]) -> Array:

@@ -7,6 +7,7 @@ whole), those of the two ends of a line as independent, and an error as lasting 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
 from liex_lab.sessions.rows import gap_follows, median_step, stop_times
 from liex_lab.sessions.tables import to_pandas
+from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -64,16 +66,16 @@ class Spans:
 
 def kinematics(
     frames: pd.DataFrame,
-    poses: pd.DataFrame,
+    poses: pd.DataFrame | Joints,
     half_window_s: float = HALF_WINDOW_S,
     impossible_above_mm_s: float = IMPOSSIBLE_MM_S,
     surface_z_mm: float | None = None,
 ) -> pd.DataFrame:
-    """The table `kinematics` from the tables `frames` and `poses` of one animal: one row per recorded frame.
+    """The table `kinematics` from the tables `frames` and `poses` (or its joints) of one animal: one row per frame.
 
     surface_z_mm: height of the water's surface above the floor, for an animal that swims.
     """
-    joints = _Joints.of(poses, len(frames))
+    joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = Body.of(joints.names)
     shape, heights = _frame_by_frame(body, joints)
     time_s = frames["time_s"].to_numpy(float)
@@ -88,14 +90,17 @@ def kinematics(
     return to_pandas(kinematics_columns(body.swims), block)
 
 
-def _frame_by_frame(body: Body, joints: _Joints) -> tuple[Shape, dict[str, Array]]:
+def _frame_by_frame(body: Body, joints: Joints) -> tuple[Shape, dict[str, Array]]:
     """What each frame tells by itself, and of an animal that stands its heights; a block of frames is in memory."""
-    shapes, heights = [], []
+    shape = Shape.empty(joints.n_frames)
+    heights: dict[str, Array] = {}
     for start in range(0, max(joints.n_frames, 1), _BLOCK):
-        xyz, sd = joints.at(slice(start, start + _BLOCK))
-        shapes.append(Shape.of(Posture.of(body, xyz, sd)))
-        heights.append({} if body.swims else _walking(body, xyz, sd))
-    return Shape.join(shapes), {name: np.concatenate([part[name] for part in heights]) for name in heights[0]}
+        rows = slice(start, start + _BLOCK)
+        xyz, sd = joints.at(rows)
+        shape.put(rows, Posture.of(body, xyz, sd))
+        for name, values in ({} if body.swims else _walking(body, xyz, sd)).items():
+            heights.setdefault(name, np.empty(joints.n_frames))[rows] = values
+    return shape, heights
 
 
 def _moving(shape: Shape, swims: bool, spans: Spans, hold_s: Array, impossible_above_mm_s: float) -> dict[str, Array]:
@@ -145,32 +150,42 @@ def _swimming(shape: Shape, time_s: Array, number: Rows, surface_z_mm: float | N
 
 
 @dataclass(frozen=True)
-class _Joints:
-    """The joints of n frames: their names; x, y, z mm in the arena and sd mm along an axis, (n, J) each, NaN where they
-    are not known.
+class Joints:
+    """The joints of n frames: their names; at: positions (m, J, 3) mm in the arena of some frames and the sd (m, J) mm
+    along an axis, NaN where they are not known.
     """
 
     names: list[str]
-    columns: tuple[Array, Array, Array, Array]
+    n_frames: int
+    at: Callable[[slice], tuple[Array, Array]]
 
     @staticmethod
-    def of(poses: pd.DataFrame, n: int) -> _Joints:
+    def of_table(poses: pd.DataFrame, n: int) -> Joints:
         """Those of the table `poses` of n frames."""
         column = poses["joint"]
         names = column.cat.categories if isinstance(column.dtype, pd.CategoricalDtype) else pd.unique(column)
         shape = (n, len(names))
-        x, y, z = (poses[name].to_numpy(float).reshape(shape) for name in ("x_mm", "y_mm", "z_mm"))
+        xyz = [poses[name].to_numpy(float).reshape(shape) for name in ("x_mm", "y_mm", "z_mm")]
         sd = poses["sd_mm"].to_numpy(float).reshape(shape) if "sd_mm" in poses else np.full(shape, np.nan)
-        return _Joints([str(name) for name in names], (x, y, z, sd))
+        return Joints([str(name) for name in names], n, lambda rows: (_apart([one[rows] for one in xyz]), sd[rows]))
 
-    @property
-    def n_frames(self) -> int:
-        return len(self.columns[0])
+    @staticmethod
+    def of_track(track: Track) -> Joints:
+        """Those of a track; what was bridged was not measured."""
 
-    def at(self, rows: slice) -> tuple[Array, Array]:
-        """Positions (m, J, 3) and sd (m, J) of some frames."""
-        *xyz, sd = (column[rows] for column in self.columns)
-        return np.moveaxis(np.stack(xyz), 0, -1), sd
+        def at(rows: slice) -> tuple[Array, Array]:
+            part = track[rows]
+            xyz = np.where(part.bridged[:, None, None], np.nan, part.joints_mm)
+            sd = part.sd_mm.copy()
+            track.rest()
+            return _apart(list(np.moveaxis(xyz, -1, 0))), sd
+
+        return Joints(list(track.skeleton.names), track.n_frames, at)
+
+
+def _apart(xyz: Sequence[Array]) -> Array:
+    """Three coordinates (m, J) as (m, J, 3), each by itself in memory: sums over joints then have the same bits."""
+    return np.moveaxis(np.stack(xyz), 0, -1)
 
 
 def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:

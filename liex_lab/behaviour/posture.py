@@ -7,7 +7,6 @@ factor of two and more; here it is the whole turn from the direction of the fron
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -88,6 +87,11 @@ class Posture:
         """(n,) the whole turn from the front bone to the rear one."""
         return np.asarray(self.turns_rad.sum(axis=1)) if self.spine.shape[1] > 2 else np.full(len(self.spine), np.nan)
 
+    @cached_property
+    def rear_sd_mm(self) -> Array:
+        """(n,) standard deviation of the chain's rear end."""
+        return self.spine_sd[:, -1]
+
     def thirds_rad(self) -> tuple[Array, Array, Array]:
         """(n,) each: by how much the front, middle and rear third of the chain turns; positive to the left."""
         inner = self.turns_rad.shape[1]
@@ -149,20 +153,19 @@ class Shape:
     rear_sd_mm: Array
 
     @staticmethod
-    def of(posture: Posture) -> Shape:
-        """All of it."""
-        p, none = posture, np.empty(len(posture.spine))
-        swims = (
-            (np.stack(p.thirds_rad(), axis=1), p.tail_mm, p.tail_angle_rad, p.spine_sd[:, -1])
-            if p.body.swims else (none, none, none, none)
-        )  # fmt: skip
-        return Shape(p.centre, p.centre_sd, p.pitch_rad, p.pitch_sd_rad, p.heading_rad, p.heading_sd_rad, p.length_mm,
-                     p.straightness, p.bend_rad, *swims)  # fmt: skip
+    def empty(n: int) -> Shape:
+        """Room for n frames."""
+        more = {"centre": (n, 3), "thirds_rad": (n, 3)}
+        return Shape(*(np.full(more.get(one.name, (n,)), np.nan) for one in fields(Shape)))
 
-    @staticmethod
-    def join(parts: Sequence[Shape]) -> Shape:
-        """That of consecutive frames."""
-        return Shape(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Shape)))
+    def put(self, rows: slice, posture: Posture) -> None:
+        """What a posture tells of some frames."""
+        told = [one.name for one in fields(Shape)]
+        for name in told[: None if posture.body.swims else -4]:
+            if name == "thirds_rad":
+                self.thirds_rad[rows] = np.stack(posture.thirds_rad(), axis=1)
+            else:
+                getattr(self, name)[rows] = getattr(posture, name)
 
 
 def _positive(values: Array) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.activity import activity
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
-from liex_lab.behaviour.kinematics import kinematics
+from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.places import (
     Surroundings,
@@ -68,7 +68,7 @@ class Behaviour:
 
 def measure(
     frames: pd.DataFrame,
-    poses: pd.DataFrame,
+    poses: pd.DataFrame | Joints,
     rules: MouseRules | None = None,
     around: Surroundings | None = None,
     gaps: pd.DataFrame | None = None,
@@ -76,7 +76,8 @@ def measure(
     bouts: pd.DataFrame | None = None,
     actions: Mapping[str, str] | None = None,
 ) -> Behaviour:
-    """The behaviour tables of one animal from its tables `frames` and `poses`, and `gaps` where there are any.
+    """The behaviour tables of one animal from its tables `frames` and `poses` (or its joints), and `gaps` where there
+    are any.
 
     bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`), with its vocabulary `actions`, word ->
     definition; None takes the rules'. around: arena, zones and water.
@@ -100,7 +101,7 @@ def measure_rows(
 ) -> Behaviour:  # fmt: skip
     """`measure` of a track that is not in a session yet."""
     frames, gaps = to_pandas(FRAMES, rows.frames()), to_pandas(GAPS, rows.gaps())
-    return measure(frames, rows.measured(), rules, around, gaps, **named)
+    return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **named)
 
 
 def stated_by(session: Session) -> tuple[MouseRules, Surroundings]:

@@ -1,9 +1,9 @@
-"""Numba kernels of the foreground: background statistics, blobs, and the height map of one animal."""
+"""Numba kernels of the foreground: blobs, and the height map of one animal."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 BLOCK = 4  # pixels a side; blobs are connected in blocks
 _ROW_STEP = 2  # every other row is looked at: reading a picture takes longer than anything that is done with it
@@ -12,57 +12,6 @@ MAX_BLOBS = 32
 _MIN_UNREAD = 9  # of 16 pixels
 N_MOMENTS = 9
 _SLOPE_PASSES, _LEVEL_PASSES = 5, 3
-
-
-@njit(cache=True)
-def far_mode(values, window):
-    """Depth and spread of the farthest cluster in sorted readings (n,) mm; (0, 0) without one.
-
-    An animal is always nearer than what it covers, so the background is the farthest depth that comes back, not the
-    most frequent: a pixel covered nine tenths of the time still shows it. A cluster needs a twentieth of the
-    readings (at least 3) within `window` mm, which lone outliers beyond the floor do not reach.
-    """
-    n = values.size
-    need = max(3, (n + 19) // 20)
-    if n < need:
-        return 0.0, 0.0
-    top = n - 1
-    while top - need + 1 >= 0:
-        if values[top] - values[top - need + 1] <= window:
-            low = top
-            while low > 0 and values[top] - values[low - 1] <= window:
-                low -= 1
-            middle = values[(low + top) // 2]
-            # re-centre on the cluster's own middle, so that a few far readings do not cut its near half off
-            low = top
-            while low > 0 and middle - values[low - 1] <= window:
-                low -= 1
-            count = top - low + 1
-            middle = values[low + count // 2]
-            spread = 0.5 * (values[low + int(0.84 * (count - 1))] - values[low + int(0.16 * (count - 1))])
-            return middle, spread
-        top -= 1
-    return 0.0, 0.0
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
-    """`far_mode` of every pixel of `stack` (n, H, W) mm, 0 = unread, into depth and spread (H, W).
-
-    near (H, W) gets the depth that only `near_share` of a pixel's readings are nearer than.
-    """
-    for row in prange(stack.shape[1]):
-        values = np.empty(stack.shape[0], np.float32)
-        for column in range(stack.shape[2]):
-            n = 0
-            for k in range(stack.shape[0]):
-                if stack[k, row, column] > 0:
-                    values[n] = stack[k, row, column]
-                    n += 1
-            ordered = np.sort(values[:n])
-            window = window_mm if n == 0 else max(window_mm, window_share * ordered[-1])
-            depth[row, column], spread[row, column] = far_mode(ordered, window)
-            near[row, column] = ordered[int(near_share * n)] if n > 0 else 0.0
 
 
 @njit(cache=True)

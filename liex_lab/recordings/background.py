@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.recordings import _segment as kernels
+from liex_lab.recordings import _background as kernels
 from liex_lab.recordings.recording import Recording
 
 _MODE_SHARE, _MODE_MM = 0.012, 6.0  # readings this near to one another, of the depth or in mm, are one surface

@@ -81,18 +81,6 @@ class Rows:
                 "sd_mm": sd.ravel(),
             }  # fmt: skip
 
-    def measured(self) -> pd.DataFrame:
-        """What measures of behaviour need of the table `poses`: a joint and its place; one row per frame and joint."""
-        import pandas as pd
-
-        track, n_joints = self.track, self.track.skeleton.n_joints
-        codes = np.tile(np.arange(n_joints, dtype=np.int8), track.n_frames)
-        # what was bridged was not measured
-        place = (np.where(track.bridged[:, None], np.nan, track.joints_mm[:, :, k]).ravel() for k in range(3))
-        columns = dict(zip(("x_mm", "y_mm", "z_mm"), place, strict=True), sd_mm=track.sd_mm.ravel())
-        joint = pd.Categorical.from_codes(codes, pd.Index(track.skeleton.names))
-        return pd.DataFrame({"joint": joint, **columns}, copy=False)
-
     def rotations(self) -> Iterator[Block]:
         """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
         track = self.track

@@ -303,8 +303,8 @@ def to_pandas(schema: Sequence[Column], block: Block) -> pd.DataFrame:
             value = np.array(value.words, dtype=object)[value.codes]
         elif not _is_array(value):
             value = [value] * n
-        data[column.name] = pd.Series(value, dtype=_pandas_dtype(column))
-    return pd.DataFrame(data)
+        data[column.name] = pd.Series(value, dtype=_pandas_dtype(column), copy=True)
+    return pd.DataFrame(data, copy=False)
 
 
 def empty_table(schema: Sequence[Column]) -> pd.DataFrame:

@@ -7,6 +7,7 @@ import os
 import platform
 import shutil
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -78,8 +79,9 @@ class SessionWriter:
         self._folder = part_folder(path)
         self._checkpoint = unfinished(path, origin)
         before = self._checkpoint.seen.read()
-        self._index: list[int] = before.get(INDEX, np.zeros(0, np.int64)).tolist()
-        self._times_ns: list[int] = before.get(TIMES, np.zeros(0, np.int64)).tolist()
+        self._index, self._times_ns = (
+            array("q", before.get(name, np.zeros(0, np.int64)).tobytes()) for name in (INDEX, TIMES)
+        )
         self._logging: deque[Future[None]] = deque()
         self._loggers = {log: ThreadPoolExecutor(1) for log in LOGS}  # each writes in order, and beside the other
         try:
@@ -147,8 +149,8 @@ class SessionWriter:
             self._logging.append(messages.submit(self._mcap.add, times[part], depth))
             for image in depth:
                 self._keepsakes.add(image)
-        self._index += index
-        self._times_ns += times
+        self._index.extend(index)
+        self._times_ns.extend(times)
         if seen is not None:
             self._checkpoint.seen.append(seen_rows(frames, seen))
         if self._checkpoint.due:
@@ -195,6 +197,7 @@ class SessionWriter:
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
         """The track of all frames so far, what was found out about its flips, and what it was made of."""
         self.track, self._flips = tracked.track, tracked.flips
+        give_back()  # hours of recording leave much behind
         self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
         seen.rest()
@@ -248,6 +251,7 @@ class SessionWriter:
         bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
+        rows.track.rest()
         of_track.write_measured(self._folder, results, columns)
         give_back()
         words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
@@ -263,6 +267,8 @@ class SessionWriter:
         self._document.update(self._account(of_track, dict(timings_s or {})))
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
+        rows.track.rest()
+        give_back()
         try:
             if self._report is not None:
                 self._report(self._folder)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.memory import Room, let_go
 from liex_lab.tracking import _chain as kernels
 from liex_lab.tracking.observations import Observations
 
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 
 _BEAM = 24  # chains under way
 _JOINTS = 8  # so many say how far an animal has moved
+_BLOCK = 16_384  # frames that are in memory at a time
 NONE = kernels.NONE
 
 
@@ -52,9 +54,9 @@ class Chain:
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
         self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend, tuning.tail])
 
-    def joints(self, seen: Observations) -> NDArray[np.float32]:
-        """Positions (n, H, some, 3) mm of the joints that chains are told by."""
-        return seen.joints(self._joints)
+    def joints(self, seen: Observations, room: Room = np.empty) -> NDArray[np.float32]:
+        """Positions (n, H, some, 3) mm of the joints that chains are told by; room: where they are to lie."""
+        return seen.joints(self._joints, room)
 
     def path(
         self, seen: Observations, told: NDArray[np.int64] | None = None, joints: NDArray[np.float32] | None = None
@@ -70,10 +72,13 @@ class Chain:
         idle = np.concatenate([[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))])
         cost, parent = np.full((n, h), np.inf), np.full((n, h, 2), NONE, np.int64)
         live = np.zeros((_BEAM, 2), np.int64)
-        n_live = kernels.extend_all(
-            0, n, live, 0, seen.seconds, self.joints(seen) if joints is None else joints, seen.error_mm, emission, idle,
-            self._levels, self._length, self._tuning.ceiling, cost, parent,
-        )  # fmt: skip
+        joints, seconds, n_live = self.joints(seen) if joints is None else joints, seen.seconds, 0
+        for start in range(0, n, _BLOCK):
+            n_live = kernels.extend_all(
+                start, min(start + _BLOCK, n), live, n_live, seconds, joints, seen.error_mm, emission, idle,
+                self._levels, self._length, self._tuning.ceiling, cost, parent,
+            )  # fmt: skip
+            let_go(joints)
         path = np.full(n, NONE, np.int64)
         if n_live:
             kernels.trace_back(live[0, 0], live[0, 1], parent, 0, path)
@@ -104,6 +109,7 @@ class Chain:
             return doubt
         joints = self.joints(seen) if joints is None else joints
         one, two = joints[used, path[used]], joints[used, path[used] ^ 1]
+        let_go(joints)
         two = np.where(np.isfinite(two), two, one[:, ::-1])
         error = seen.error_mm[used, path[used]].astype(float)
         at_used = np.empty(len(used))

@@ -57,8 +57,10 @@ def track_whole(
     """
     tuning = tuning or Tuning.of(subject.skeleton.name)
     chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
-    path = chain.path(seen)
-    doubt = chain.doubt(seen, path)
+    joints = chain.joints(seen, room)
+    path = chain.path(seen, joints=joints)
+    doubt = chain.doubt(seen, path, joints)
+    del joints
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
     track = Track.empty(subject.skeleton, seen.times_ns, room=room)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.memory import let_go
+from liex_lab.memory import Room, let_go
 from liex_lab.tracking._joints import place_joints
 
 Array = NDArray[np.float64]
@@ -103,16 +103,19 @@ class Observations:
         taken[path < 0] = np.nan
         return taken
 
-    def joints(self, joints: Sequence[int]) -> Small:
-        """Positions (n, H, len(joints), 3) mm of some joints in all hypotheses."""
-        out = np.full((*self.score.shape, len(joints), 3), np.nan, np.float32)
+    def joints(self, joints: Sequence[int], room: Room = np.empty) -> Small:
+        """Positions (n, H, len(joints), 3) mm of some joints in all hypotheses; room: where they are to lie."""
+        out = room((*self.score.shape, len(joints), 3), np.float32)
         for start in range(0, len(self), _BLOCK):
+            out[start : start + _BLOCK] = np.nan
             part = self[start : start + _BLOCK]
             for h in range(self.score.shape[1]):
                 rows = np.flatnonzero(part.known[:, h])
                 if len(rows):
                     pose = part.pose(np.full(len(part), h))[rows]
                     out[start + rows, h] = joints_of(self.skeleton, pose)[:, list(joints)]
+            let_go(out)
+            self.rest()
         return out
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from liex_lab.actions.labelled import some_rows
 from liex_lab.actions.windows import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
+from liex_lab.memory import on_disk
 from liex_lab.tracking.track import Track
 from tests.actions.toy import straight_track
 
@@ -76,3 +79,16 @@ def test_the_papers_descriptors_have_252_and_888_numbers_and_tangents_do_not_dep
     track.root_rotation[:], track.root_mm[:] = root.rotation, root.translation
     np.testing.assert_allclose(tangent_descriptor(track), tangent, atol=1e-9)
     assert np.abs(position_descriptor(track) - joints).max() > 5.0
+
+
+@pytest.mark.parametrize("rate_hz", [15.0, 100.0])
+def test_channels_made_piece_by_piece_are_those_made_at_once(
+    rate_hz: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rng, clock = np.random.default_rng(1), np.arange(0.0, 6.0, 1.0 / rate_hz)
+    track = straight_track("mouse", clock, 100.0 * clock, 0.5 * clock)
+    track.joints_mm[:] += rng.normal(size=track.joints_mm.shape)
+    (whole,) = stretches_of(track, 30.0)
+    monkeypatch.setattr("liex_lab.actions.channels._PIECE", 7)
+    (pieces,) = stretches_of(track, 30.0, room=on_disk(tmp_path))
+    assert pieces.values.tobytes() == whole.values.tobytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 from threadpoolctl import threadpool_limits
 
+from liex_lab.actions import storage
 from liex_lab.actions.labelled import LabelledTrack, some_rows
 from liex_lab.actions.labels import read_labels, words_of
 from liex_lab.actions.learning import learn, leave_one_animal_out
@@ -85,6 +87,27 @@ def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(model: Tim
     assert again.definitions == model.definitions
     with zipfile.ZipFile(path) as archive:
         assert not [name for name in archive.namelist() if name.endswith((".pkl", ".pickle"))]
+
+
+def test_a_bout_that_is_never_as_fast_as_its_word_asks_for_gets_another_word(model: TimelineModel) -> None:
+    least = dict(zip(model.words, model.peaks, strict=True))
+    assert 2.0 < least[GO] < 3.2  # lengths a second: it goes at 3
+    assert least[STAY] == least[""] == 0.0
+    one, go = going_and_staying(15), model.words.index(GO)
+    free = replace(model, peaks=np.zeros(len(model.words)))
+    assert model.recognise(one.track).ethogram == free.recognise(one.track).ethogram
+    asking = replace(model, peaks=np.where(np.arange(len(model.words)) == go, 6.0, 0.0))
+    assert GO in {bout.action for bout in free.recognise(one.track).ethogram}
+    assert GO not in {bout.action for bout in asking.recognise(one.track).ethogram}
+
+
+def test_a_model_file_of_the_first_format_asks_for_no_speed(
+    model: TimelineModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as earlier:
+        earlier.setattr(storage, "_FORMAT", 1)
+        path = save_action_model(model, tmp_path / "old.skops")
+    assert not load_action_model(path).peaks.any()
 
 
 @pytest.mark.parametrize("content", [b"", b"not a model", b"PK\x03\x04" + bytes(40)])

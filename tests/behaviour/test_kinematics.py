@@ -8,7 +8,7 @@ import pytest
 
 from liex_lab.behaviour.body import Body
 from liex_lab.behaviour.columns import kinematics_columns
-from liex_lab.behaviour.kinematics import kinematics, neighbours, segments, smallest_turn
+from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.sessions import tables
 from liex_lab.sessions.rows import Rows
@@ -131,3 +131,11 @@ def test_a_single_frame_has_a_row_and_no_speed():
     assert len(moved) == 1
     assert moved["speed_mm_s"].isna().all()
     assert moved["nose_height_mm"].iloc[0] == pytest.approx(18.0)
+
+
+def test_measures_made_in_blocks_from_the_track_are_those_of_the_whole_table(monkeypatch):
+    mouse = WalkingMouse(steady(2.0), lost=(10, 11, 25))
+    frames, poses = tables_of(mouse)
+    whole = kinematics(frames, poses)
+    monkeypatch.setitem(kinematics.__globals__, "_BLOCK", 7)  # the package names the function like its module
+    pd.testing.assert_frame_equal(kinematics(frames, Joints.of_track(mouse.track())), whole, check_exact=True)

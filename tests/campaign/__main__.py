@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 
 
 def main() -> None:
@@ -19,12 +20,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="of a recording: 900, of a session of a hundred: 30")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--folder", type=Path, help="of the hundred sessions: given again, it goes on there")
     asked = parser.parse_args()
     figures = {
         "kills": lambda: kills.kills(asked.n or 50, asked.frames or 900, asked.seed),
         "workers": lambda: studies.workers(asked.n or 20, asked.seed),
         "faults": lambda: faults.faults(asked.n or 3, asked.frames or 300, asked.seed),
-        "broken": lambda: studies.broken(asked.n or 100, asked.frames or 30, 2),
+        "broken": lambda: studies.broken(asked.n or 100, asked.frames or 30, 2, asked.folder),
         "fuzz": lambda: fuzz.fuzz(asked.minutes, asked.seed),
     }[asked.part]()
     print(json.dumps(figures, indent=2))

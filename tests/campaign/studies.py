@@ -78,29 +78,37 @@ BROKEN = {
 }
 
 
-def broken(n: int, n_frames: int, n_workers: int) -> dict[str, Any]:
-    """A study of n sessions, ten of them broken in different ways; who fails and why; mended, one command does them."""
+def broken(n: int, n_frames: int, n_workers: int, kept: Path | None = None) -> dict[str, Any]:
+    """A study of n sessions, ten of them broken in different ways; who fails and why; mended, one command does them.
+
+    kept: a folder for the study, where the campaign goes on if it was interrupted.
+    """
     from liex_lab.api import run_study
 
-    folder = Path(tempfile.mkdtemp(prefix="liex-broken-"))
-    raw = folder / "rawdata"
-    raw.mkdir()
-    _break(raw, SAMPLE.read_bytes())
-    names = [(f"b{k}", f"rawdata/{_file_of(name)}") for k, name in enumerate(BROKEN)]
-    names += [(f"g{k}", f"synthetic:walk?seed={k}&frames={n_frames}&sensor=primesense-qvga")
-              for k in range(n - len(BROKEN))]  # fmt: skip
-    study = _study(folder, names)
-    found = run_study(study, workers=n_workers)
-    told = {name: _said(one) for name, one in zip(BROKEN, found, strict=False)}
-    right = [name for name, said in told.items() if BROKEN[name] in str(said["reason"])]
+    folder = kept or Path(tempfile.mkdtemp(prefix="liex-broken-"))
+    raw, study, first = folder / "rawdata", folder / "study.toml", folder / "first.json"
+    if not study.is_file():
+        raw.mkdir(parents=True, exist_ok=True)
+        _break(raw, SAMPLE.read_bytes())
+        names = [(f"b{k}", f"rawdata/{_file_of(name)}") for k, name in enumerate(BROKEN)]
+        names += [(f"g{k}", f"synthetic:walk?seed={k}&frames={n_frames}&sensor=primesense-qvga")
+                  for k in range(n - len(BROKEN))]  # fmt: skip
+        _study(folder, names)
+    if not first.is_file():
+        began = time.monotonic()
+        found = run_study(study, workers=n_workers)
+        told = {name: _said(one) for name, one in zip(BROKEN, found, strict=False)}
+        right = [name for name, said in told.items() if BROKEN[name] in str(said["reason"])]
+        figures = {"done": _count(found, "done"), "failed": _count(found, "failed"),
+                   "with_the_right_reason": len(right), "reasons": told, "seconds": round(time.monotonic() - began)}
+        first.write_text(json.dumps(figures))
     for name in BROKEN:
         shutil.copy(SAMPLE, raw / _file_of(name).replace(".png", ".mcap"))
     study.write_text(study.read_text().replace(".png", ".mcap"))
     after = run_study(study, workers=n_workers, retry=True)
+    figures = json.loads(first.read_text())
     shutil.rmtree(folder)
-    return {"done": _count(found, "done"), "failed": _count(found, "failed"),
-            "with_the_right_reason": len(right), "reasons": told,
-            "done_after_they_were_mended_and_tried_again": _count(after, "done")}  # fmt: skip
+    return {**figures, "done_after_they_were_mended_and_tried_again": _count(after, "done")}
 
 
 def _count(found: list[Standing], state: str) -> int:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from liex_lab.pipelines.build import build_recording
+from liex_lab.pipelines.build import build_estimator, build_recording
 
 from liex_lab.camera import Distortion
+from liex_lab.catalog import MODELS
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
@@ -112,3 +113,13 @@ def test_the_water_of_the_plan_is_undone(tmp_path: Path) -> None:
         assert recording.optics["water"]["height_mm"] == 500.0
         # stored are 700 mm: 200 mm below the surface as it seems, and 500 mm above it
         assert recording.frame(0).depth[5, 30] == pytest.approx(1.333 * 700, abs=3)
+
+
+def test_a_model_is_kept_until_another_one_is_in_its_place(tmp_path):
+    own = tmp_path / "own.npz"
+    own.write_bytes((MODELS / "mouse.npz").read_bytes())
+    first = build_estimator(plan(f"estimation.model={own}"))
+    assert build_estimator(plan(f"estimation.model={own}", "animal.spine_mm=70")) is first
+    own.write_bytes((MODELS / "fish.npz").read_bytes())
+    with pytest.raises(LiexError, match="made for the skeleton fish"):
+        build_estimator(plan(f"estimation.model={own}"))

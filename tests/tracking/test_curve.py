@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,11 +10,12 @@ import pytest
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
+from liex_lab.memory import on_disk
 from liex_lab.tracking.curve import covariance_of_root, short_gaps, single_frames, spans, track_whole
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.smoother import Curve
-from liex_lab.tracking.track import Flip
+from liex_lab.tracking.track import Flip, Track
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
 
 SECONDS = np.delete(np.arange(150) / 30, [40, 41, 90])  # a camera that missed three frames
@@ -164,6 +165,19 @@ def test_a_long_recording_is_smoothed_in_blocks_that_nobody_sees(measured, monke
     monkeypatch.setattr("liex_lab.tracking.curve.MARGIN", 60)
     parts = track_whole(SUBJECT, seen).track
     np.testing.assert_allclose(parts.joints_mm, whole.joints_mm, atol=0.02)
+
+
+def test_a_track_on_disk_is_the_one_in_memory(measured, tmp_path, monkeypatch):
+    seen = told(SECONDS, measured)
+    lose(seen, slice(50, 58))
+    monkeypatch.setattr("liex_lab.tracking.curve._BLOCK", 40)
+    monkeypatch.setattr("liex_lab.tracking.chain._BLOCK", 30)
+    flip = Flip(20, 30, 1.0, True, "human")
+    here, there = track_whole(SUBJECT, seen, [flip]), track_whole(SUBJECT, seen, [flip], room=on_disk(tmp_path))
+    assert here.flips == there.flips
+    for column in fields(Track):
+        if column.name != "skeleton":
+            assert getattr(here.track, column.name).tobytes() == getattr(there.track, column.name).tobytes()
 
 
 def test_online_every_frame_gets_one_row_and_a_lag_makes_it_better(truth, measured):

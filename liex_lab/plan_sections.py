@@ -1,0 +1,225 @@
+"""The sections of a plan: what can be set in each, its unit, its limits and its default."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Table(BaseModel):
+    """A table of settings: no unknown key, no value of another type, never changed after it was made."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Animal(Table):
+    """[animal]: what is in front of the camera."""
+
+    name: str = Field("mouse", description="the animal's kind, as it is called in tables and reports")
+    skeleton: str = Field(
+        "mouse", description="the skeleton: fish, mouse, hand, or the path of a TOML file of your own"
+    )
+    spine_mm: Positive | None = Field(
+        None, description="length of this animal's skeleton from its first joint to its last; not set: it is measured"
+    )
+    spine_min_mm: Positive = Field(40.0, description="an animal is not shorter than this, where its size is measured")
+    spine_max_mm: Positive = Field(115.0, description="an animal is not longer than this, where its size is measured")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Animal:
+        if not self.spine_min_mm < self.spine_max_mm:
+            raise ValueError(f"spine_min_mm={self.spine_min_mm} should be below spine_max_mm={self.spine_max_mm}")
+        return self
+
+
+class CameraOverride(Table):
+    """[camera]: intrinsics that overrule what the recording states or what is typical of the camera."""
+
+    fx: Positive | None = Field(None, description="focal length along a row, pixels; not set: what the recording says")
+    fy: Positive | None = Field(None, description="focal length along a column, pixels")
+    cx: float | None = Field(
+        None, description="column of the optical axis, pixels; 0 is the centre of the first column"
+    )
+    cy: float | None = Field(None, description="row of the optical axis, pixels; 0 is the centre of the first row")
+    distortion: list[float] | None = Field(
+        None,
+        description="coefficients of the lens distortion, in OpenCV's order: [k1, k2, p1, p2, k3, k4, k5, k6], all but "
+        "the first may be left out; [] says that there is none; not set: what the recording says",
+    )
+    distortion_model: str | None = Field(
+        None, description="plumb_bob (not set), rational_polynomial, or equidistant for a fisheye lens [k1, k2, k3, k4]"
+    )
+    source: str | None = Field(None, description="where these numbers come from; it is written into session.json")
+
+
+class WaterSurface(Table):
+    """[water]: a flat water surface between the camera and the animal; not needed for a camera behind glass in air."""
+
+    height_mm: Positive | None = Field(
+        None, description="height of the lens above the water; set, it makes millimetres under water true"
+    )
+    refractive_index: float = Field(
+        1.333, ge=1, le=2, description="of the water: 1.333 fresh at 20 degrees C in visible light, 1.34 sea water"
+    )
+    tilt_x_rad: float = Field(
+        0.0, ge=-1, le=1, description="angle by which the surface recedes from the camera towards the picture's right"
+    )
+    tilt_y_rad: float = Field(
+        0.0, ge=-1, le=1, description="angle by which the surface recedes from the camera towards the picture's bottom"
+    )
+    ranging: Literal["light_field", "structured_light", "time_of_flight", "paraxial"] = Field(
+        "light_field",
+        description="how the camera measures: light_field (Raytrix), structured_light (PrimeSense, RealSense; stereo "
+        "along the picture's rows), time_of_flight (Kinect v2, Azure), or paraxial: depth / n at every angle",
+    )
+
+
+class ArenaFacts(Table):
+    """[arena]: where in the arena the animal is."""
+
+    zones: str | None = Field(
+        None, description="path of a TOML file with named zones, circles and polygons; see the README"
+    )
+
+
+class RecordingOptions(Table):
+    """[recording]: how the file is read."""
+
+    fps: Positive | None = Field(
+        None, description="frames per second, only for recordings that carry no time stamps of their own"
+    )
+    topic: str | None = Field(None, description="the MCAP topic that holds the depth, where there are several")
+    accept_truncated: bool = Field(
+        False, description="true: use the whole frames of a recording that ends in the middle of one"
+    )
+    mirrored: bool = Field(
+        False, description="true: exchange left and right, for pictures that come mirrored, or to measure a left hand"
+    )
+
+
+class Foreground(Table):
+    """[foreground]: what belongs to the animal and what to the scene."""
+
+    min_height_mm: Positive = Field(
+        7.0, description="a pixel of the animal stands out from the background by this much"
+    )
+    n_background_frames: int = Field(
+        96, ge=3, description="frames, spread over the recording, that show the background"
+    )
+    near_mm: Positive = Field(250.0, description="a hand is not nearer to the camera than this")
+    far_mm: Positive = Field(1600.0, description="a hand is not farther from the camera than this")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Foreground:
+        if not self.near_mm < self.far_mm:
+            raise ValueError(f"near_mm={self.near_mm} should be below far_mm={self.far_mm}")
+        return self
+
+
+class Estimation(Table):
+    """[estimation]: one pose per frame."""
+
+    model: str = Field("mouse", description="a bundled model, or the path of an .npz made by `liex train`")
+    n_candidates: int | None = Field(
+        None, ge=1, description="poses a frame starts from; not set: as many as the model was made for"
+    )
+    doubtful_above_mm: Positive | None = Field(
+        None, description="frames with a larger predicted error are flagged doubtful; not set: the model's own limit"
+    )
+
+
+class Tracking(Table):
+    """[tracking]: from the frames' poses to a curve."""
+
+    bridge_s: NotNegative = Field(
+        0.5,
+        description="a stretch without a measurement that is no longer than this is bridged and flagged so, and of a "
+        "longer one half as much at either end",
+    )
+
+
+class SessionFacts(Table):
+    """[session]: facts about the animal and the day, copied into every table."""
+
+    name: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+@-]{0,199}$",
+        description="the session's id in every table, and the name of its folder; not set: the recording's name",
+    )
+    individual: str = Field("animal", description="name of the animal within this session")
+    subject_id: str | None = Field(None, description="the animal's identity across the whole study")
+    group: str | None = Field(None, description="experimental group of the animal")
+    cage: str | None = Field(None, description="home cage or tank of the animal")
+    sex: str | None = Field(None, description="sex of the animal")
+    batch: str | None = Field(None, description="batch of the experiment")
+    session_start_time: str | None = Field(
+        None, description="ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording says"
+    )
+
+    @field_validator("session_start_time", mode="before")
+    @classmethod
+    def _zoned(cls, value: Any) -> Any:
+        if value is None:
+            return None
+        try:
+            moment = value if isinstance(value, datetime) else datetime.fromisoformat(value)
+        except (TypeError, ValueError):
+            moment = None
+        if moment is None or moment.tzinfo is None:
+            raise ValueError("should be ISO 8601 with a time zone, as 2026-08-21T10:00:00+02:00")
+        return moment.isoformat()
+
+
+class Behaviour(Table):
+    """[behaviour]: where one behaviour ends and the next begins. Starting values: check them on your own animals."""
+
+    speed_half_window_s: Positive = Field(
+        0.034, description="speed at time t is measured from t - this to t + this (one frame each side at 30 fps)"
+    )
+    pause_below_mm_s: Positive = Field(50.0, description="slower than this is a pause, faster is walking")
+    run_above_mm_s: Positive = Field(300.0, description="faster than this is running")
+    impossible_above_mm_s: Positive = Field(3000.0, description="faster than this is an error of measurement")
+    rear_height_mm: Positive = Field(
+        40.0, description="rearing begins when the nose is this much higher than the tail's base ..."
+    )
+    rear_height_bl: Positive = Field(
+        0.6, description="... or, for a smaller animal, by this many of its own body lengths"
+    )
+    rear_leave: Positive = Field(
+        2.0 / 3.0, le=1, description="rearing reaches to where the nose is below this share of that height"
+    )
+    speed_hysteresis: NotNegative = Field(
+        0.1, lt=1, description="a speed is crossed upwards this share above it, downwards this share below"
+    )
+    merge_pauses_s: NotNegative = Field(0.33, description="shorter interruptions of a bout are bridged")
+    min_bout_s: NotNegative = Field(0.23, description="shorter bouts are dropped, after bridging")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Behaviour:
+        if not self.pause_below_mm_s < self.run_above_mm_s:
+            raise ValueError(
+                f"pause_below_mm_s={self.pause_below_mm_s} should be below run_above_mm_s={self.run_above_mm_s}"
+            )
+        return self
+
+
+class Replay(Table):
+    """[replay]: what the Rerun replay, session.rrd, holds."""
+
+    depth: bool = Field(True, description="the depth pictures; without them it takes a hundredth of the room")
+    candidates: bool = Field(False, description="every pose that single frames thought possible, too")
+
+
+class Actions(Table):
+    """[actions]: who names what the animal does."""
+
+    model: str | None = Field(
+        None,
+        description="an action model by the animal's name, or the path of a .skops made by `liex train actions`; not "
+        "set: the animal's bundled one, where there is one; 'rules': the thresholds of [behaviour]",
+    )
