@@ -137,7 +137,9 @@ class Tracking(Table):
     """[tracking]: from the frames' poses to a curve."""
 
     bridge_s: NotNegative = Field(
-        0.5, description="a stretch without a measurement that is no longer than this is bridged and flagged so"
+        0.5,
+        description="a stretch without a measurement that is no longer than this is bridged and flagged so, and of a "
+        "longer one half as much at either end",
     )
 
 

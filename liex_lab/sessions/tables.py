@@ -91,8 +91,9 @@ FRAMES = columns(
     ("scale", "float64", "", "size of the animal relative to the skeleton's file", "", "fit"),
     ("p_flip", "float64", "", "probability that head and tail are exchanged in this pose", "two states over the whole "
      "recording: what each frame says of either, and how fast animals turn", "tracker"),
-    ("bridged", "bool", "", "nothing was measured; the pose is what lies between two measured ones that are no farther "
-     "apart than tracking.bridge_s of the plan; measures of behaviour leave it out", "", "tracker"),
+    ("bridged", "bool", "", "nothing was measured; the pose is what lies between two measured ones, of which the "
+     "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour leave it out", "",
+     "tracker"),
     ("flag", "string", "", "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
      "person placed joints of it; not_found or no_depth: nothing was measured, and there is no pose where it is not "
      "bridged", "", "tracker"),

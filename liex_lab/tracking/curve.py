@@ -33,7 +33,8 @@ class Subject:
     """Whom a track is of, and before which camera.
 
     length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long a
-    stretch without a measurement is bridged; joint_share (J,): each joint's error over the mean.
+    stretch without a measurement is bridged, and half as far into a longer one from both its ends; joint_share (J,):
+    each joint's error over the mean.
     """
 
     skeleton: Skeleton
@@ -242,8 +243,8 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
 def short_gaps(
     seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
 ) -> NDArray[np.bool_]:  # fmt: skip
-    """(n,) True in frames between two measured ones that are no farther apart than that; ahead: and so long after the
-    last one.
+    """(n,) True in frames between two measured ones of which the nearer is no farther than half of bridge_s, so that a
+    gap no longer than bridge_s is bridged whole; ahead: and so long after the last one.
     """
     rows = np.flatnonzero(measured)
     if not len(rows):
@@ -252,7 +253,8 @@ def short_gaps(
     after = np.searchsorted(rows, t)
     inside = (after > 0) & (after < len(rows))
     before, after = rows[np.maximum(after - 1, 0)], rows[np.minimum(after, len(rows) - 1)]
-    short = inside & (seconds[after] - seconds[before] <= bridge_s)
+    away = np.minimum(seconds - seconds[before], seconds[after] - seconds)
+    short = inside & (away <= 0.5 * bridge_s)
     if ahead:
         short[rows[-1] + 1 :] = seconds[rows[-1] + 1 :] - seconds[rows[-1]] <= bridge_s
     return short & ~measured

@@ -101,17 +101,20 @@ def test_outliers_do_not_pull_the_curve_and_are_not_measurements(truth, measured
     assert (track.n_foreground_px[track.bridged] == 0).all()
 
 
-def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_stays_empty(truth, measured):
+def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_only_at_its_ends(truth, measured):
     seen = told(SECONDS, measured)
     lose(seen, slice(50, 58))
     lose(seen, slice(100, 130))
     lose(seen, slice(145, None))
     seen.has_depth[100] = False
     track = track_whole(SUBJECT, seen).track
-    assert np.flatnonzero(track.bridged).tolist() == list(range(50, 58))
+    # half of bridge_s is seven and a half frames
+    assert np.flatnonzero(track.bridged).tolist() == [*range(50, 58), *range(100, 107), *range(123, 130)]
     assert joint_error(track.joints_mm, truth)[50:58].max() < 8.0
     assert track.sd_mm[53].mean() > 1.2 * track.sd_mm[30].mean()
-    assert np.isnan(track.joints_mm[100:130]).all()
+    assert np.isnan(track.joints_mm[107:123]).all()
+    assert np.isfinite(track.sd_mm[100:107]).all()
+    assert track.sd_mm[106].mean() > 1.2 * track.sd_mm[30].mean()
     assert np.isnan(track.joints_mm[145:]).all()
     assert set(track.flag[50:58]) == {"not_found"}
     assert track.flag[100] == "no_depth"
@@ -202,7 +205,10 @@ def test_gaps_are_measured_in_seconds_between_measurements():
     measured = np.array([False, True, False, False, True, False, True, False])
     seconds = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.5, 1.6])
     assert np.flatnonzero(short_gaps(seconds, measured, 0.31)).tolist() == [2, 3]
-    assert np.flatnonzero(short_gaps(seconds, measured, 0.2, ahead=True)).tolist() == [7]
+    assert np.flatnonzero(short_gaps(seconds, measured, 0.21)).tolist() == [2, 3]
+    assert short_gaps(seconds, measured, 0.19).sum() == 0
+    assert np.flatnonzero(short_gaps(seconds, measured, 1.01)).tolist() == [2, 3, 5]
+    assert np.flatnonzero(short_gaps(seconds, measured, 0.15, ahead=True)).tolist() == [7]
     assert not short_gaps(seconds, np.zeros(8, bool), 1.0).any()
 
 
