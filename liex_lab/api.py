@@ -186,7 +186,7 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
 
 
 def run_scale(
-    n_frames: int = 2000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
+    n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
     """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
     from liex_lab.pipelines.scale import evaluate_scale

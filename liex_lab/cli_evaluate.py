@@ -217,7 +217,7 @@ def evaluate_reference(
 
 @evaluate.command("scale")
 def evaluate_scale(
-    n_frames: Annotated[int, typer.Option("--frames", min=100, help="Of each virtual recording.")] = 2000,
+    n_frames: Annotated[int, typer.Option("--frames", min=2000, help="Of each virtual recording.")] = 3000,
     minutes: Annotated[
         list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
     ] = None,

@@ -10,12 +10,13 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 _ZEROS = 1 << 20  # bytes written at once
+_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 Room = Callable[[tuple[int, ...], Any], NDArray[Any]]  # shape and dtype -> an array to be filled, as np.empty
 
 
@@ -50,7 +51,8 @@ def give_back() -> None:
 
 
 def on_disk(folder: Path) -> Room:
-    """Where arrays are made that lie in nameless files of that folder and go with the last who looks at them.
+    """Where arrays are made that lie in nameless files of that folder and go with the last who looks at them; in memory
+    where files of that disk cannot be mapped, as on some shares.
 
     Making one raises OSError where the disk is full, so that filling it cannot fail.
     """
@@ -61,16 +63,26 @@ def on_disk(folder: Path) -> Room:
             return np.empty(shape, dtype)
         if size > shutil.disk_usage(folder).free:  # asking for the room would take all there is before it fails
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
-        with tempfile.TemporaryFile(dir=folder) as file:
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, size)
-            else:
-                for start in range(0, size, _ZEROS):
-                    file.write(bytes(min(_ZEROS, size - start)))
-                file.flush()
-            return np.memmap(file, dtype, "r+", shape=shape).view(np.ndarray)
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                _reserve(file, size)
+                return np.memmap(file, dtype, "r+", shape=shape).view(np.ndarray)
+        except OSError as error:
+            if error.errno in _FULL:
+                raise
+            return np.empty(shape, dtype)
 
     return room
+
+
+def _reserve(file: IO[bytes], size: int) -> None:
+    """Take so many bytes of the disk for a new file. Raises OSError where it has not as many."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+        return
+    for start in range(0, size, _ZEROS):
+        file.write(bytes(min(_ZEROS, size - start)))
+    file.flush()
 
 
 def let_go(*arrays: NDArray[Any]) -> None:

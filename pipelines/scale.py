@@ -35,13 +35,14 @@ ASSUMPTIONS = (
 
 
 def evaluate_scale(
-    run: RunSession, n_frames: int = 2000, minutes: tuple[float, ...] = (1.0, 10.0), progress: Progress = silent
+    run: RunSession, n_frames: int = 3000, minutes: tuple[float, ...] = (1.0, 10.0), progress: Progress = silent
 ) -> dict[str, Any]:
     """Measure one session's stages, two workers against one, memory by length, and simulate many workers.
 
     Workers of one recording share its stretches, those of a study its sessions.
 
-    n_frames: of each virtual recording, 640 x 480; minutes: lengths of recording whose memory is measured.
+    n_frames: of each virtual recording, 640 x 480, some stretches long; minutes: lengths of recording whose memory is
+    measured.
     """
     with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
         folder = Path(scratch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sys
@@ -50,3 +51,17 @@ def test_a_disk_without_room_is_told_before_any_of_it_is_taken(tmp_path, monkeyp
     monkeypatch.setattr("tempfile.TemporaryFile", lambda **how: pytest.fail("it was tried all the same"))
     with pytest.raises(OSError, match="No space left"):
         on_disk(tmp_path)((2 * free,), np.uint8)
+
+
+def test_where_files_cannot_be_mapped_arrays_are_in_memory_and_a_full_disk_is_told(tmp_path, monkeypatch):
+    def refuse(number):
+        def memmap(*what, **how):
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr("numpy.memmap", memmap)
+
+    refuse(errno.ENODEV)
+    assert on_disk(tmp_path)((5, 2), np.float64).shape == (5, 2)
+    refuse(errno.ENOSPC)
+    with pytest.raises(OSError, match="No space left"):
+        on_disk(tmp_path)((5, 2), np.float64)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _BEGINS_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
-ROWS_PER_GROUP = 250_000  # a block of the widest table then takes some 30 MB
+ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
 
