@@ -11,6 +11,7 @@ AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is
 BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
 _MORE = 1.3  # times the area of the animal: there may be something with it
 _APART = 2.0  # roots of the animal's area: what lies farther before the animal is not a part of it
+_FAR = 65_535  # mm: behind everything
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
 
@@ -61,10 +62,16 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
             cut, near, far = segment.layers(depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area))
-            if cut > 0.0 and abs(np.log(far * mm2_per_px / area)) < abs(np.log(near * mm2_per_px / area)):
-                return np.where(depth < cut, np.float32(0.0), depth), True
             if cut > 0.0:
-                return np.where(depth > cut, np.float32(np.inf), depth), True
+                behind = abs(np.log(far * mm2_per_px / area)) < abs(np.log(near * mm2_per_px / area))
+                out = depth.copy()
+                for v in range(depth.shape[0]):
+                    for u in range(depth.shape[1]):
+                        if behind and depth[v, u] < cut:
+                            out[v, u] = 0
+                        elif not behind and depth[v, u] > cut:
+                            out[v, u] = _FAR
+                return out, True
     return depth, False
 
 

@@ -74,6 +74,8 @@ def test_a_thing_far_before_the_animal_is_taken_for_unread_though_they_touch_in_
     np.testing.assert_array_equal(crops.n_px, alone.n_px)
     np.testing.assert_array_equal(crops.heights, alone.heights)
     np.testing.assert_array_equal(crops.moments, alone.moments)
+    whole = known.extract(np.rint(frame[None]).astype(np.uint16), 1.0, camera_view=True)
+    np.testing.assert_array_equal(whole.n_px, alone.n_px)
 
 
 def test_a_larger_thing_far_behind_the_animal_is_background_though_they_touch_in_the_picture():
