@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.tracker import FrameTracker
 
 LEARN_FRAMES = 90  # that are waited for: the background, the floor and the animal's size are learned from them
+_AT_ONCE, _LONG_S = 16, 0.2
 Viewer = Callable[["FrameTracker", "Arriving"], Any]
 
 
@@ -60,16 +61,18 @@ def follow_live(
     online = OnlineTracker(tracker.subject)
     view = viewer(tracker, arriving) if viewer else None
     seen, latency, worked_until, keeping_up = [], list[float](), time.perf_counter(), False
-    for arrival in _chained(held, frames):
-        keeping_up = keeping_up or arrival.at_s >= worked_until
-        seen.append(tracker.observe([arrival.frame]))
-        row: Track | None = online.add(seen[-1])
-        if view is not None and row is not None:
-            view.show(arrival.frame, row)
-        worked_until = time.perf_counter()
-        if keeping_up:
-            latency.append(worked_until - arrival.at_s)
-        progress(len(seen), None, "following")
+    for some in _together(_chained(held, frames)):
+        keeping_up = keeping_up or some[0].at_s >= worked_until
+        told = tracker.observe([arrival.frame for arrival in some])
+        for k, arrival in enumerate(some):
+            seen.append(told[k : k + 1])
+            row: Track | None = online.add(seen[-1])
+            if view is not None and row is not None:
+                view.show(arrival.frame, row)
+            worked_until = time.perf_counter()
+            if keeping_up:
+                latency.append(worked_until - arrival.at_s)
+            progress(len(seen), None, "following")
     if view is not None:
         view.close()
     tracked = tracker.track(Observations.join(seen))
@@ -90,6 +93,18 @@ def _first(frames: Iterator[Arrival], n: int) -> list[Arrival]:
 def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival]:
     yield from held
     yield from frames
+
+
+def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
+    """Frames that have waited for long some at a time, for together each costs half; the others one by one."""
+    some: list[Arrival] = []
+    for arrival in arrivals:
+        some.append(arrival)
+        if len(some) == _AT_ONCE or time.perf_counter() - arrival.at_s < _LONG_S:
+            yield some
+            some = []
+    if some:
+        yield some
 
 
 def _as_recording(arriving: Arriving, held: list[Arrival]) -> Recording:

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from liex_lab.pipelines.build import build_estimator, build_recording
 from liex_lab.pipelines.crew import Crew
 
 from liex_lab.plan import Plan
@@ -42,6 +43,14 @@ class Stretch:
     start: int
     stop: int
 
+    def __getstate__(self) -> dict[str, Any]:
+        """To a worker goes all but the model, which is large: it has the file, and keeps what it loaded."""
+        return {**vars(self), "tracker": replace(self.tracker, estimator=None)}  # type: ignore[arg-type]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        tracker = replace(state["tracker"], estimator=build_estimator(state["plan"]))
+        vars(self).update({**state, "tracker": tracker})
+
 
 def look_at(stretch: Stretch) -> Stretch:
     """Measure a stretch and write it; the task of a worker. Done twice it does the same."""
@@ -59,8 +68,6 @@ def look_at(stretch: Stretch) -> Stretch:
 @lru_cache(maxsize=1)
 def _opened(recording: str, plan_toml: str, input_sha256: str) -> Recording:
     """The recording, open for this process's next stretches too. input_sha256: another content is another recording."""
-    from liex_lab.pipelines.build import build_recording
-
     return build_recording(recording, Plan.from_toml(plan_toml))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 from liex_lab.pipelines import session as job
 from liex_lab.pipelines import stretches
+from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker
 from liex_lab.pipelines.crew import Processes
 from liex_lab.pipelines.verify import verify_session
 
@@ -110,3 +112,13 @@ def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:
     assert list(stretches._cuts(0, 20)) == [(0, 8), (8, 16), (16, 20)]
     assert list(stretches._cuts(11, 20)) == [(11, 16), (16, 20)]
     assert list(stretches._cuts(20, 20)) == []
+
+
+def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(mouse: Any, tmp_path: Path) -> None:  # noqa: F811
+    plan = Plan.load("mouse")
+    with build_recording(mouse, plan) as opened:
+        tracker = build_tracker(opened, plan)
+        origin = build_provenance(opened, plan, tracker)
+    sent = pickle.dumps(stretches.Stretch("recording", plan, tracker, origin, tmp_path, 0, 8))
+    assert len(sent) < 0.2 * len(pickle.dumps(tracker))
+    assert pickle.loads(sent).tracker.estimator is tracker.estimator  # of the same process
