@@ -88,10 +88,6 @@ class Chain:
         """What each hypothesis (n, H) costs by itself."""
         return np.minimum(seen.score.astype(float) / self._score_mm, self._tuning.score_most)
 
-    def likely(self, seen: Observations, share: float) -> NDArray[np.bool_]:
-        """(n, H) hypotheses whose score costs less than this share of the most that a score can cost."""
-        return np.asarray(seen.known & (self._emission(seen) < share * self._tuning.score_most))
-
     def doubt(self, seen: Observations, path: NDArray[np.int64], joints: NDArray[np.float32] | None = None) -> Array:
         """(n,) probability that head and tail are exchanged on this path: forward and backward through two states.
 

@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
 # nearer to the curve than so many predicted errors, a hypothesis that was passed by is a measurement after all, unless
-# its score costs more than this share of what a score can: then it is of something else, or of half the animal
-_ADMIT, _ADMIT_COST = 2.0, 2 / 3
+# it shows less than this share of what the animal usually shows: of half an animal beside a bar the pose is wrong
+_ADMIT, _WHOLE = 2.0, 0.6
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -78,9 +78,10 @@ def track_whole(
         used[rows] = curve.used
         return curve
 
+    shown = seen.along(seen.n_px, path)
+    least_px = _WHOLE * np.median(shown[path >= 0]) if (path >= 0).any() else 0.0
     for rows in _blocks(len(seen)):
-        likely = chain.likely(seen[rows], _ADMIT_COST)
-        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), likely)
+        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), least_px)
         _rest(track, seen)
     taken = admitted >= 0
     path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
@@ -136,14 +137,15 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
 
 
 def _admitted(
-    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, likely: NDArray[np.bool_]
+    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, least_px: float
 ) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the `likely` (n, H) hypothesis that lies on the curve all the same; NONE
-    elsewhere.
+    """(n,) of frames that were passed by, the hypothesis of at least so many pixels that lies on the curve all the
+    same; NONE elsewhere.
     """
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
     for h in range(seen.score.shape[1]):
-        rows = np.flatnonzero((path == NONE) & likely[:, h] & np.isfinite(curve.error_mm))
+        whole = seen.known[:, h] & (seen.n_px[:, h] >= least_px)
+        rows = np.flatnonzero((path == NONE) & whole & np.isfinite(curve.error_mm))
         if not len(rows):
             continue
         joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])

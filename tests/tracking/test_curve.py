@@ -123,6 +123,18 @@ def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_only_at_its_e
     assert np.isnan(none.joints_mm[50:58]).all()
 
 
+def test_what_looks_unlike_the_animal_is_measured_where_it_lies_on_the_curve_and_is_whole(measured):
+    seen = told(SECONDS, measured)
+    rows = slice(70, 74)
+    seen.score[rows], seen.error_mm[rows] = 1e4, 3.0 * seen.error_mm[rows]  # the metric has never seen such fur
+    track = track_whole(SUBJECT, seen).track
+    assert not track.bridged.any()
+    assert track.observed.all()
+    seen.n_px[rows] = 0.4 * np.median(seen.n_px[:, 0])
+    half = track_whole(SUBJECT, seen).track
+    assert np.flatnonzero(half.bridged).tolist() == [70, 71, 72, 73]
+
+
 def test_the_second_thing_is_taken_where_the_curve_leads_to_it(truth, measured):
     seen = told(SECONDS, measured)
     rows = slice(60, 66)
