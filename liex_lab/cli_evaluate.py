@@ -225,7 +225,7 @@ def evaluate_scale(
 ) -> None:
     """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes.
 
-    Takes about a quarter of an hour on two cores, and wants a machine without other work; with --minutes 10 alone, half
+    Takes about eleven minutes on two cores, and wants a machine without other work; with --minutes 10 alone, half
     of that.
     """
     from liex_lab.api import run_scale
