@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -83,6 +83,11 @@ def _reserve(file: IO[bytes], size: int) -> None:
     for start in range(0, size, _ZEROS):
         file.write(bytes(min(_ZEROS, size - start)))
     file.flush()
+
+
+def blocks(n: int, size: int) -> Iterator[slice]:
+    """The rows (n,) of something long, `size` at a time."""
+    return (slice(start, min(start + size, n)) for start in range(0, n, size))
 
 
 def let_go(*arrays: NDArray[Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -135,14 +136,16 @@ def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
     return PoseEstimator(Model.load(path), n_candidates)
 
 
-def build_tracker(recording: Recording, plan: Plan, estimator: PoseEstimator | None = None) -> FrameTracker:
-    """The tracker of a recording: its scene learned, the animal's size and girth found. estimator: the plan's, where it
-    is at hand.
+def build_tracker(
+    recording: Recording, plan: Plan, estimator_of: Callable[[], PoseEstimator] | None = None
+) -> FrameTracker:
+    """The tracker of a recording: its scene learned, the animal's size and girth found. estimator_of: waits for the
+    plan's, where that is being made already.
     """
     from liex_lab.tracking.tracker import FrameTracker
 
     build_zones(plan)  # a slip in their file is told before any work is done
-    estimator = estimator or build_estimator(plan)
+    estimator = estimator_of() if estimator_of else build_estimator(plan)
     scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
     limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
     return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)

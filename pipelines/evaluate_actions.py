@@ -135,11 +135,12 @@ def _recogniser(
 
 def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     """Every named bout of at least seven frames by itself."""
+    from liex_lab.actions.ethogram import runs_of
+
     found = []
     for one in tracks:
-        starts = np.flatnonzero(np.append(True, one.words[1:] != one.words[:-1]))
-        for start, stop in zip(starts, np.append(starts[1:], len(one)), strict=True):
-            if one.words[start] and stop - start >= _LEAST_FRAMES:
+        for start, stop, word in zip(*runs_of(one.words), strict=True):
+            if word and stop - start >= _LEAST_FRAMES:
                 found.append(one[slice(start, stop)])
     return found
 

@@ -18,7 +18,6 @@ from liex_lab.pipelines.build import (
     build_rules,
     build_surroundings,
     build_tracker,
-    build_zones,
 )
 from liex_lab.pipelines.crew import Crew
 from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
@@ -68,8 +67,7 @@ def measure_session(
         check_place(folder, overwrite)
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
-        build_zones(plan)  # a slip in their file is told before any work is done
-        tracker = build_tracker(opened, plan, estimator())
+        tracker = build_tracker(opened, plan, estimator)
         build_recogniser(plan, tracker.estimator.skeleton)  # a slip in its name is told before any work is done
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)

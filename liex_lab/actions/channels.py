@@ -7,14 +7,13 @@ part the track into stretches.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import VIEWS, Skeleton
-from liex_lab.memory import Room, let_go
+from liex_lab.memory import Room, blocks, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -149,14 +148,14 @@ def _stretch(
     """The channels of an unbroken stretch, a piece after the other."""
     found, m = _OnClock(track, rows, time_s, wall, clock), len(clock)
     heading, steep = np.empty(m), np.empty(m, np.bool_)
-    for piece in _pieces(m):
+    for piece in blocks(m, _PIECE):
         heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
         track.rest()
     heading = np.unwrap(heading)
     # a body that stands upright has no heading: it keeps the last one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
     values, step = room((m, len(channel_names(track.skeleton))), np.float64), clock[1] - clock[0]
-    for piece in _pieces(m):
+    for piece in blocks(m, _PIECE):
         # a channel looks two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
         channels = _channels(track.skeleton, length_mm, step, heading[around], *found.at(around))
@@ -164,10 +163,6 @@ def _stretch(
         track.rest()
         let_go(values)
     return Stretch(clock, values)
-
-
-def _pieces(m: int) -> Iterator[slice]:
-    return (slice(start, min(start + _PIECE, m)) for start in range(0, m, _PIECE))
 
 
 def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,12 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 
 UNLABELLED = ""  # the word of a frame that no action names
+
+
+def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]:
+    """Where the runs of equal values (m,), of which there are some, start and stop, and their values."""
+    starts = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
+    return starts, np.append(starts[1:], len(values)), values[starts]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.chain import ActionChain
-from liex_lab.actions.ethogram import UNLABELLED
+from liex_lab.actions.ethogram import UNLABELLED, runs_of
 from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.scores import timeline_scores
-from liex_lab.actions.timeline import Examples, Network, TimelineModel, clock_of, gather, runs_of
+from liex_lab.actions.timeline import Examples, Network, TimelineModel, clock_of, gather
 from liex_lab.errors import LiexError
 from liex_lab.progress import Progress, silent
 

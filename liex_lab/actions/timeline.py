@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.channels import Stretch, channel_names, stretches_of
-from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops
+from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.windows import window_features
@@ -76,11 +76,10 @@ class TimelineModel:
     definitions: dict[str, str] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
-    def log_probabilities(self, stretch: Stretch, names: Sequence[str]) -> Array:
-        """(m, K) of each word at each tick by itself."""
+    def log_probabilities(self, stretch: Stretch, names: Sequence[str], speed: Array) -> Array:
+        """(m, K) of each word at each tick by itself; speed (m,): the `steady_speed`."""
         margin = round(_MARGIN_S * self.clock_hz)
         out = np.empty((len(stretch.times_s), len(self.words)))
-        speed = steady_speed(stretch, names)[:, None]
         for start in range(0, len(out), _PIECE):
             stop = min(start + _PIECE, len(out))
             low, high = max(0, start - margin), min(len(out), stop + margin)
@@ -88,7 +87,7 @@ class TimelineModel:
             features = features[start - low : stop - low]
             let_go(stretch.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
-            now = speed[start:stop]
+            now = speed[start:stop, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (now > self.speeds[:, 1] * _SLACK + _STILL)
             out[start:stop] = np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
         return out
@@ -107,8 +106,9 @@ class TimelineModel:
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, room)):
-            scores = self.scores(self.log_probabilities(stretch, names))
-            decoded = self._decode(scores, steady_speed(stretch, names))
+            speed = steady_speed(stretch, names)
+            scores = self.scores(self.log_probabilities(stretch, names, speed))
+            decoded = self._decode(scores, speed)
             certain = self.chain.probabilities(scores, 1.0 / self.clock_hz)
             begin, step = stretch.times_s[0], 1.0 / self.clock_hz
             rows = np.arange(*np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step]))
@@ -161,8 +161,8 @@ class TimelineModel:
         total = np.zeros(len(self.words))
         names = channel_names(track.skeleton)
         for stretch in stretches_of(track, self.clock_hz, wall_mm):
-            log_p = self.log_probabilities(stretch, names) - np.log(np.maximum(self.share, 1e-3))
-            total += log_p.sum(axis=0)
+            log_p = self.log_probabilities(stretch, names, steady_speed(stretch, names))
+            total += (log_p - np.log(np.maximum(self.share, 1e-3))).sum(axis=0)
         if not total.any():
             return UNLABELLED
         named = [k for k, word in enumerate(self.words) if word != UNLABELLED]
@@ -193,12 +193,6 @@ class Examples:
     animal: NDArray[np.int64]
     recording: NDArray[np.int64]
     runs: list[list[tuple[int, float]]]
-
-
-def runs_of(values: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Where the runs of equal values (m,) start and stop, and their values."""
-    starts = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
-    return starts, np.append(starts[1:], len(values)), values[starts]
 
 
 def steady_speed(stretch: Stretch, names: Sequence[str]) -> Array:
@@ -242,9 +236,9 @@ def _runs(words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str,
     """The bouts (word, s) of a recording, those without a name among them."""
     if not len(words):
         return []
-    starts = np.flatnonzero(np.append(True, words[1:] != words[:-1]))
-    stops, ends = np.append(starts[1:], len(words)), frame_stops(times_ns)
-    return [(place[str(words[a])], float(ends[b - 1] - times_ns[a]) * 1e-9) for a, b in zip(starts, stops, strict=True)]
+    ends = frame_stops(times_ns)
+    return [(place[str(word)], float(ends[b - 1] - times_ns[a]) * 1e-9)
+            for a, b, word in zip(*runs_of(words), strict=True)]  # fmt: skip
 
 
 def _softmax(logits: Array) -> Array:

@@ -253,3 +253,12 @@ def box_around(shape, middle, radius, intrinsics, box):
         low, high = min(low / near, low / far) * f + c, max(high / near, high / far) * f + c
         box[2 * axis] = min(max(int(np.floor(low / BLOCK)) - 1, 0), last)
         box[2 * axis + 1] = min(max(int(np.ceil(high / BLOCK)) + 1, 0), last)
+
+
+@njit(cache=True)
+def relabel(labels, box, mark, slot):
+    """Give the blocks labelled `mark` within box (4,), see `box_around`, the label `slot`."""
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
+            if labels[i, j] == mark:
+                labels[i, j] = slot

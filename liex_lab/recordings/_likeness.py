@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from liex_lab.recordings._ends import AROUND_MM, box_around, point_of_block
+from liex_lab.recordings._ends import AROUND_MM, box_around, point_of_block, relabel
 from liex_lab.recordings._segment import BLOCK
 
 # what tells rendered hands from elbows, chests and heads by logistic regression, in units of the first: the logarithm
@@ -50,10 +50,7 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
                 inside = 0 <= r < n_rows and 0 <= c < n_columns
                 if not inside or (labels[r, c] != mark and labels[r, c] != slot):
                     around += side
-    for i in range(box[0], box[1] + 1):
-        for j in range(box[2], box[3] + 1):
-            if labels[i, j] == mark:
-                labels[i, j] = slot
+    relabel(labels, box, mark, slot)
     area, n = max(area, 1.0), max(n, 1)
     width = min(behind / (_WRIST_MM * _WIDE_MM * size * size), _MOST_WIDTHS)
     unlike = _PER_AREA * (np.log(area / (size * size)) - _AREA_LOG_MM2) ** 2

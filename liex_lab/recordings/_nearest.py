@@ -17,6 +17,7 @@ from liex_lab.recordings._ends import (
     label_surfaces,
     nearest_ends,
     point_of_block,
+    relabel,
 )
 from liex_lab.recordings._likeness import unlikeness
 from liex_lab.recordings._segment import BLOCK
@@ -288,10 +289,7 @@ def cut_end(
     plane = view_plane(rotation, distance[k], intrinsics)
     raw = np.empty((crop, crop), np.float32)
     cut_heights(depth, blocks, labels, found, plane, distance[k], intrinsics, origin[k], step, near, far, raw)
-    for i in range(box[0], box[1] + 1):
-        for j in range(box[2], box[3] + 1):
-            if labels[i, j] == MAX_SURFACES:
-                labels[i, j] = slot
+    relabel(labels, box, MAX_SURFACES, slot)
     segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * found[2] / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
@@ -115,6 +116,31 @@ class Foreground(Protocol):
 
     def every(self, step: int) -> Foreground:
         """The same with every `step`-th pixel along rows and columns."""
+
+
+class Cutter(ABC):
+    """What cuts the animal out of pictures, and what else may be it in the same pass; the part that scenes share."""
+
+    def extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+    ) -> Crops:
+        """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home length. camera_view:
+        heights are measured along the optical axis.
+        """
+        return self._extract(depths, size, parallel, camera_view, 1)
+
+    def extract_both(
+        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+    ) -> tuple[Crops, Crops]:
+        """`extract`, and the next thing that may be the animal after all."""
+        crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
+        return crops[:n], crops[n:]
+
+    @abstractmethod
+    def _extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+    ) -> Crops:
+        """The rows (n) of the most likely things, and then (n_things 2) those of the next."""
 
 
 def view_of(looks: Array) -> SE3:

@@ -15,7 +15,7 @@ from liex_lab.recordings import _crops as kernels
 from liex_lab.recordings._segment import MAX_BLOBS
 from liex_lab.recordings.arena import Floor, find_floor
 from liex_lab.recordings.background import floor_region, learn_background, sample_frames, stride_for
-from liex_lab.recordings.crops import CROP, Crops, Windows
+from liex_lab.recordings.crops import CROP, Crops, Cutter, Windows
 from liex_lab.recordings.recording import Recording
 from liex_lab.threads import threads
 
@@ -29,7 +29,7 @@ _TOUCH_SHARE = 0.9  # of the frames: a lump that the animal touches that often i
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Cutter):
     """What the camera sees without the animal, and what nearer than that counts as the animal.
 
     background (H, W) mm; limit (H, W) mm: a reading below it is in front of the background; on_floor (H, W): the floor,
@@ -222,28 +222,13 @@ class Scene:
         looks[:, 16] = crops.step
         return looks
 
-    def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
-    ) -> Crops:
-        """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home length.
-
-        depths: whole pictures, or a sample of them with the scene's own stride; the animal is the blob whose area is
-        nearest to its own. camera_view: heights are measured along the optical axis from the view's behind_mm behind
-        the animal's mean depth, as the paper's features see them; otherwise above the floor.
-        """
-        return self._extract(depths, size, parallel, camera_view, 1)
-
-    def extract_both(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
-    ) -> tuple[Crops, Crops]:
-        """`extract`, and the blob whose area is next near, which may be the animal after all."""
-        crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
-        return crops[:n], crops[n:]
-
     def _extract(
         self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
     ) -> Crops:
-        """The rows of what is nearest, and then of what is next near, if that is asked for."""
+        """See `Cutter`: the blobs whose areas are nearest to the animal's own. depths: whole pictures, or a sample of
+        them with the scene's own stride. camera_view: heights are measured from the view's behind_mm behind the
+        animal's mean depth, as the paper's features see them; otherwise above the floor.
+        """
         if depths.shape[1:] != self.limit.shape:
             depths = depths[:, :: self.stride, :: self.stride]
         crops = Crops.blank(n_things * len(depths), self.floor.distance_mm)

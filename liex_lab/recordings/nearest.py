@@ -13,7 +13,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.recordings import _nearest as kernels
 from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.background import sample_frames
-from liex_lab.recordings.crops import CROP, Crops, view_of
+from liex_lab.recordings.crops import CROP, Crops, Cutter, view_of
 from liex_lab.recordings.recording import Recording
 from liex_lab.threads import threads
 
@@ -25,7 +25,7 @@ _AREA_SD, _VOLUME_SD = 0.45, 0.45  # of the logarithms, from posture to posture 
 
 
 @dataclass(frozen=True)
-class NearestScene:
+class NearestScene(Cutter):
     """A scene in which the nearest thing is the hand; the same interface as `Scene`.
 
     floor: a plane across the optical axis behind the hand, which stands for the arena's: z points at the camera.
@@ -81,26 +81,12 @@ class NearestScene:
         middle = np.einsum("nij,nj->ni", T_camera_view.rotation, crops.centroid) + T_camera_view.translation
         return self.floor.T_arena_camera @ middle
 
-    def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
-    ) -> Crops:
-        """The hand of each frame (n, H, W) mm; `size` is its length over the skeleton's home length.
-
-        Heights are measured along the line of sight through the middle of the crop, from behind_mm (at home size)
-        behind the hand's middle; camera_view: along the optical axis.
-        """
-        return self._extract(depths, size, parallel, camera_view, 1)
-
-    def extract_both(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
-    ) -> tuple[Crops, Crops]:
-        """`extract`, and the next thing that is about as like a hand."""
-        crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
-        return crops[:n], crops[n:]
-
     def _extract(
         self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
     ) -> Crops:
+        """See `Cutter`: the nearest things of a hand's size. Heights are measured along the line of sight through the
+        middle of the crop, from behind_mm (at home size) behind the hand's middle; camera_view: along the optical axis.
+        """
         n = len(depths)
         with threads(parallel):
             return cut_nearest(depths, self._intrinsics(n), np.full(n, size), self.view, (self.near_mm, self.far_mm),

@@ -18,6 +18,7 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from numpy.typing import NDArray
 
 from liex_lab.geometry import SE3, so3
+from liex_lab.memory import blocks
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rows import Rows
 from liex_lab.tracking.track import Track
@@ -89,8 +90,8 @@ class McapWriter:
     def finish(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]) -> None:
         """Skeleton, transforms, actions and notes of the whole track; closes the file."""
         track = rows.track
-        for start in range(0, track.n_frames, _BLOCK):
-            self._log_track(track[start : start + _BLOCK])
+        for part in blocks(track.n_frames, _BLOCK):
+            self._log_track(track[part])
             track.rest()
         self._log_actions(rows, bouts, words)
         if len(track.times_ns):

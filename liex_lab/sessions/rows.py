@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions.ethogram import runs_of
 from liex_lab.geometry import so3
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
@@ -230,8 +231,7 @@ def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
     """Runs of equal labels (n,) as (start, stop, label), stop exclusive."""
     if len(labels) == 0:
         return []
-    starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
-    return [(int(a), int(b), labels[a]) for a, b in zip(starts, np.append(starts[1:], len(labels)), strict=True)]
+    return [(int(a), int(b), label) for a, b, label in zip(*runs_of(labels), strict=True)]
 
 
 def rows_only(rows: Rows) -> pd.DataFrame:

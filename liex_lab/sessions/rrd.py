@@ -5,7 +5,7 @@ Depth streams in as it comes; everything small is written at the end from the sa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
+from liex_lab.memory import blocks
 from liex_lab.recordings.rvl import rvl_message
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
@@ -119,7 +120,7 @@ class ReplayWriter:
                 scalars.append((f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float)))
         for entity, label, colour, values in scalars:
             self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True)
-            for part in _blocks(len(index)):
+            for part in blocks(len(index), _BLOCK):
                 columns = rr.Scalars.columns(scalars=values[part])
                 self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
             self._stream.flush()
@@ -209,7 +210,7 @@ class ReplayWriter:
         self._stream.log(UNCERTAINTY, look, static=True)
         girth = float(self._origin.animal_size.get("girth", 1.0))
         carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
-        for part in _blocks(track.n_frames):
+        for part in blocks(track.n_frames, _BLOCK):
             when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
             send_body(self._stream, track, part, when, carriers)
@@ -248,7 +249,7 @@ class ReplayWriter:
         if not seen.any():
             return
         self._stream.log(ROOT, rr.TransformAxes3D(0.02), static=True)
-        for part in _blocks(track.n_frames):
+        for part in blocks(track.n_frames, _BLOCK):
             where = part.start + np.flatnonzero(seen[part])
             if not len(where):
                 continue
@@ -263,7 +264,7 @@ class ReplayWriter:
             entity = f"{CANDIDATES}/{h + 1}"
             look = rr.LineStrips3D.from_fields(radii=0.0008, colors=_rgba([colour]))
             self._stream.log(entity, look, static=True)
-            for part in _blocks(len(seen)):
+            for part in blocks(len(seen), _BLOCK):
                 known = seen.known[part, h]
                 joints = seen[part].joints(range(seen.skeleton.n_joints))[known, h] / MM_PER_UNIT
                 strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
@@ -357,10 +358,6 @@ def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[f
     near, far = np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
     near = max(float(near), floor_distance_mm - 60.0) - 80.0  # a floor tilted by 10 degrees, but not the walls
     return max(near, 1.0), max(float(far), near + 10.0) + 10.0
-
-
-def _blocks(n: int) -> Iterator[slice]:
-    return (slice(start, min(start + _BLOCK, n)) for start in range(0, n, _BLOCK))
 
 
 def _timeline(index: NDArray[np.int64], elapsed_ns: NDArray[np.int64]) -> list[rr.TimeColumn]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.memory import Room, let_go
+from liex_lab.memory import Room, blocks, let_go
 from liex_lab.tracking import _chain as kernels
 from liex_lab.tracking.observations import Observations
 
@@ -73,9 +73,9 @@ class Chain:
         cost, parent = np.full((n, h), np.inf), np.full((n, h, 2), NONE, np.int64)
         live = np.zeros((_BEAM, 2), np.int64)
         joints, seconds, n_live = self.joints(seen) if joints is None else joints, seen.seconds, 0
-        for start in range(0, n, _BLOCK):
+        for rows in blocks(n, _BLOCK):
             n_live = kernels.extend_all(
-                start, min(start + _BLOCK, n), live, n_live, seconds, joints, seen.error_mm, emission, idle,
+                rows.start, rows.stop, live, n_live, seconds, joints, seen.error_mm, emission, idle,
                 self._levels, self._length, self._tuning.ceiling, cost, parent,
             )  # fmt: skip
             let_go(joints)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.camera import Camera
 from liex_lab.geometry import SE3, so3
-from liex_lab.memory import Room
+from liex_lab.memory import Room, blocks
 from liex_lab.tracking.chain import NONE, Chain
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import Curve, smooth
@@ -80,26 +80,22 @@ def track_whole(
 
     shown = seen.along(seen.n_px, path)
     least_px = _WHOLE * np.median(shown[path >= 0]) if (path >= 0).any() else 0.0
-    for rows in _blocks(len(seen)):
+    for rows in blocks(len(seen), _BLOCK):
         admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), least_px)
         _rest(track, seen)
     taken = admitted >= 0
     path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
-    for rows in _blocks(len(seen)):
+    for rows in blocks(len(seen), _BLOCK):
         if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
             draw(rows)
             _rest(track, seen)
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
-    for rows in _blocks(len(seen)):
+    for rows in blocks(len(seen), _BLOCK):
         _settle(subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows])
         _rest(track, seen)
     flips = _flips(seen, track)
     return Tracked(track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))))
-
-
-def _blocks(n: int) -> Iterator[slice]:
-    return (slice(start, min(start + _BLOCK, n)) for start in range(0, n, _BLOCK))
 
 
 def _rest(track: Track, seen: Observations) -> None:
@@ -265,7 +261,7 @@ def short_gaps(
 def _flips(seen: Observations, track: Track) -> list[Flip]:
     """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
     tip, exchanged = track.skeleton.tip, np.zeros(len(seen), np.bool_)
-    for rows in _blocks(len(seen)):
+    for rows in blocks(len(seen), _BLOCK):
         ends = seen[rows].joints([0, tip])[:, 0]
         along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]
         exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
