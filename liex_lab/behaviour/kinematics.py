@@ -49,13 +49,14 @@ class Spans:
     before: Rows
     after: Rows
     span_s: Array
-    rows: slice = slice(None)
+    rows: slice
 
     @staticmethod
     def of(time_s: Array, observed: NDArray[np.bool_], half_window_s: float) -> Spans:
         """The neighbours about `half_window_s` away; a frame that stands alone has an empty span."""
         before, after = neighbours(time_s, observed, half_window_s)
-        return Spans(before, after, np.where(after > before, time_s[after] - time_s[before], np.nan))
+        span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
+        return Spans(before, after, span_s, slice(None))
 
     def __getitem__(self, rows: slice) -> Spans:
         """Those of some of all frames."""
@@ -98,7 +99,7 @@ def kinematics(
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
     spans = Spans.of(time_s, observed, half_window_s)
-    block: dict[str, Any] = {name: frames[name].to_numpy() for name in ("frame_index", "time_s", "dt_s")}
+    block: dict[str, Any] = {name: _put_away(frames[name], room) for name in ("frame_index", "time_s", "dt_s")}
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
     block |= _moving(shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, room)
     block |= {"length_mm": shape.length_mm, "straightness": shape.straightness, "bend_rad": shape.bend_rad, **heights}
@@ -119,6 +120,14 @@ def _frame_by_frame(body: Body, joints: Joints, room: Room) -> tuple[Shape, dict
         shape.rest()
         let_go(*heights.values())
     return shape, heights
+
+
+def _put_away(column: pd.Series[Any], room: Room) -> NDArray[Any]:
+    """A column (n,) in that room."""
+    values = room((len(column),), column.dtype)
+    values[:] = column.to_numpy()
+    let_go(values)
+    return values
 
 
 def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> None:

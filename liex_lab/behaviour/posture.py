@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import Body
-from liex_lab.memory import Room, blocks, let_go
+from liex_lab.memory import Room, let_go
 
 Array = NDArray[np.float64]
 
@@ -159,8 +159,7 @@ class Shape:
         more = {"centre": (n, 3), "thirds_rad": (n, 3)}
         shape = Shape(*(room(more.get(one.name, (n,)), float) for one in fields(Shape)))
         for column in vars(shape).values():
-            for rows in blocks(n):
-                column[rows] = np.nan
+            column[:] = np.nan
             let_go(column)
         return shape
 

@@ -20,7 +20,7 @@ def tables_of(mouse: WalkingMouse) -> tuple[pd.DataFrame, pd.DataFrame]:
     times = mouse.times_ns
     rows = Rows(mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times)))
     poses = pd.concat([tables.to_pandas(tables.POSES, block) for block in rows.poses()], ignore_index=True)
-    return tables.to_pandas(tables.FRAMES, rows.frames()), poses
+    return rows.frames_table(), poses
 
 
 def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
