@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import runs_of
 from liex_lab.geometry import so3
-from liex_lab.memory import blocks
+from liex_lab.memory import blocks, give_back
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
 from liex_lab.sessions.tables import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
@@ -58,7 +58,9 @@ class Rows:
         import pandas as pd
 
         schema = [column for column in FRAMES if column.name in names]
-        return pd.concat([to_pandas(schema, block) for block in self.frames()], ignore_index=True)
+        table = pd.concat([to_pandas(schema, block) for block in self.frames()], ignore_index=True)
+        give_back()
+        return table
 
     def poses(self) -> Iterator[Block]:
         """The table `poses`, some hundred thousand rows at a time."""

@@ -135,6 +135,7 @@ class ReplayWriter:
             let_go(values)
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
+        rows.track.rest()
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(
@@ -266,6 +267,7 @@ class ReplayWriter:
             xyzw = np.roll(so3.quaternion(track.root_rotation[where]), -1, axis=-1)
             columns = rr.Transform3D.columns(translation=track.root_mm[where] / 1000.0, quaternion=xyzw)
             self._stream.send_columns(ROOT, _timeline(index[where], elapsed[where]), [*columns])
+            track.rest()
 
     def _log_candidates(self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The bones of every pose that a frame thought possible, each rank in its colour."""
