@@ -119,7 +119,7 @@ def train_model(
 
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
     """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and the calibration."""
-    from liex_lab.estimation.calibration import calibrate, with_corrector, with_settler
+    from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
     from liex_lab.recordings.worlds import world_of
@@ -151,6 +151,10 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         first = recipe.n_images + recipe.n_correction
         unseen = calibration_set(skeleton, method, recipe, first)
         model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
+    if method.tells_facing:
+        progress(steps - 1, steps, "learning to tell head from tail")
+        first = recipe.n_images + recipe.n_correction + recipe.n_calibration
+        model = with_facing(model, rendered_set(skeleton, method, recipe, first, recipe.n_images, silent), recipe.seed)
     return model
 
 

@@ -13,8 +13,9 @@ from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.ethogram import UNLABELLED, runs_of
 from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.scores import timeline_scores
-from liex_lab.actions.timeline import Examples, Network, TimelineModel, clock_of, gather
+from liex_lab.actions.timeline import Examples, TimelineModel, clock_of, gather
 from liex_lab.errors import LiexError
+from liex_lab.network import Network
 from liex_lab.progress import Progress, silent
 
 Array = NDArray[np.float64]

@@ -21,6 +21,7 @@ from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.windows import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.memory import Room, blocks, let_go
+from liex_lab.network import Network
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -28,32 +29,10 @@ Array = NDArray[np.float64]
 CLOCKS_HZ = {"fish": 50.0}
 _CLOCK_HZ = 30.0
 _PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
-_LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
 _SPEED_S, _SLACK, _STILL, _UNSEEN = 0.2, 1.25, 0.1, 6.0  # half window; how far beyond is meant, and what it costs
 _MOST_DECODED, _REFUSED = 6, 10.0  # how often bouts that are too slow are refused, and what that costs a tick
 _FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
 _RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
-
-
-@dataclass(frozen=True)
-class Network:
-    """A network with one hidden layer on standardised features: weights as they are multiplied, no code in them."""
-
-    centre: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
-
-    def logits(self, features: NDArray[np.float32]) -> Array:
-        """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's threads are not."""
-        from threadpoolctl import threadpool_limits
-
-        x = np.clip((features - self.centre) / self.scale, -_LIMIT, _LIMIT)
-        with threadpool_limits(1, user_api="blas"):
-            for k, (weights, bias) in enumerate(self.layers):
-                x = x @ weights + bias
-                if k + 1 < len(self.layers):
-                    x = np.maximum(x, 0.0)
-        return x.astype(np.float64)
 
 
 @dataclass(frozen=True)

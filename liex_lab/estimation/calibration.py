@@ -14,6 +14,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.correction import moves_to, pose_samples
 from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.facing import Facing, both_ways, laid_along
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
 from liex_lab.estimation.settle import Settler
@@ -53,13 +54,15 @@ class Trial:
 @dataclass(frozen=True)
 class _Group:
     """Images that share a guess of the size, as the frames of a recording do: their rows in the set, the guess over
-    home size, and the model's choices for them.
+    home size, the model's choices for them, and the candidates (m, K, J, 3) mm behind these with their scores (m, K).
     """
 
     rows: NDArray[np.int64]
     images: ImageSet
     size: float
     chosen: Chosen
+    positions: Array
+    scores: Array
 
 
 def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd: float = _SIZE_SD) -> Iterator[_Group]:
@@ -79,7 +82,8 @@ def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd:
             images.moments, looks[:, 13], np.ones(len(rows), np.int64),
         )  # fmt: skip
         rotations, positions, _, scores = estimator.candidates(crops, looks, size)
-        yield _Group(rows, images, size, estimator.pick(images, size, rotations, positions, scores))
+        chosen = estimator.pick(images, size, rotations, positions, scores)
+        yield _Group(rows, images, size, chosen, positions, scores)
 
 
 def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
@@ -140,6 +144,27 @@ def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> M
     images = ImageSet(data.images.heights[rows], data.images.looks[rows], data.images.moments[rows])
     settler = Settler.fit(model.skeleton, pose, images, sizes, data.truth.positions[rows], data.size[rows])
     return replace(model, settler=settler.table)
+
+
+def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
+    """The model with what tells head from tail, where the method has it, learned from candidates for images that no
+    tree has seen: the best one of each way.
+    """
+    skeleton = model.skeleton
+    if not model.method.tells_facing:
+        return model
+    pictures, right = [], []
+    for group in _choices(model, data, np.random.default_rng(seed)):
+        true = data.truth.positions[group.rows]
+        along = true[:, skeleton.tip] - true[:, 0]
+        best, opposite, behind, _ = both_ways(skeleton, group.positions, group.scores)
+        for k, there in ((best, np.isfinite(group.scores.min(axis=1))), (opposite, np.isfinite(behind))):
+            rows = np.flatnonzero(there)
+            joints = group.positions[rows, k[rows]]
+            images = ImageSet(*(values[rows] for values in vars(group.images).values()))
+            pictures.append(laid_along(skeleton, images, joints, np.full(len(rows), group.size)))
+            right.append(np.einsum("nd,nd->n", joints[:, skeleton.tip] - joints[:, 0], along[rows]) > 0)
+    return replace(model, facing=Facing.fit(np.concatenate(pictures), np.concatenate(right), seed))
 
 
 def _rows(samples: Samples, index: NDArray[np.int64]) -> Samples:

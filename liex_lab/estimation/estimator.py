@@ -18,6 +18,7 @@ from liex_lab.estimation import _estimate as kernels
 from liex_lab.estimation._explain import Body
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.correction import corrected
+from liex_lab.estimation.facing import Facing
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
@@ -194,7 +195,11 @@ class PoseEstimator:
                 crops.heights, looks, crops.moments, np.flatnonzero(crops.found), size, self._chain, *self._packed,
                 tuning, self._body, starts, poses,
             )  # fmt: skip
-        return poses
+            if self.model.facing is None or not n:
+                return poses
+            facing = Facing(skeleton, self.model.facing)
+            scores = facing.judged(ImageSet(crops.heights, looks, crops.moments), poses[1], poses[3], size)
+        return *poses[:3], scores
 
     def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""

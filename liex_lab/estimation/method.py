@@ -57,6 +57,7 @@ class Method:
     refine_steps: int = 0  # of taking a pose into the picture
     refined: int = 0  # candidates that are taken there beside the mean of the best; the one that fits is chosen
     explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
+    tells_facing: bool = False  # a network tells head from tail where the metric is unsure, see `facing`
 
     def rounds_of(self, joint: int) -> int:
         """Rounds of a joint."""
@@ -87,7 +88,7 @@ class Method:
 
 _UNSET: dict[str, Any] = {
     "home_turn": (0.0, 0.0, 0.0), "proposals": None, "proposal_reach_mm": 0.0, "base_rounds": 0, "refine_steps": 0,
-    "refined": 0, "explains": False, "settle": False,
+    "refined": 0, "explains": False, "settle": False, "tells_facing": False,
 }  # fmt: skip
 _FULL_TURN = 10.0  # rad: no filter
 
@@ -129,6 +130,7 @@ _HAND: dict[str, Any] = {
 
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
+    ("mouse", "default"): {"tells_facing": True},
     ("fish", "default"): {
         "rounds": 2, "training_candidates": 6, "n_candidates": 12, "survivors": 6,
         "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),

@@ -20,8 +20,9 @@ from liex_lab.estimation.cascade import Cascade
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest
+from liex_lab.network import Network
 
-SCHEMA = 2
+SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that does not
 # that follow the regressors, as far as a model has them
 _FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
 _DAMAGE = (
@@ -57,7 +58,7 @@ class Model:
 
     expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
     is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more; settler:
-    the table of `settle.Settler`, where the method settles.
+    the table of `settle.Settler`, where the method settles; facing: what tells head from tail, see `facing`.
     """
 
     cascade: Cascade
@@ -69,6 +70,7 @@ class Model:
     pruner: Forest | None = None
     corrector: Forest | None = None
     settler: NDArray[np.float64] | None = None
+    facing: Network | None = None
 
     @property
     def skeleton(self) -> Skeleton:
@@ -89,7 +91,7 @@ class Model:
         """The model file's content; equal models give equal bytes."""
         extra = [name for name in _FORESTS if getattr(self, name) is not None]
         head = {
-            "schema": SCHEMA,
+            "schema": 2 if self.facing is None else SCHEMA,
             "method": self.method.to_dict(),
             "skeleton": self.skeleton_table,
             "calibration": vars(self.calibration),
@@ -103,6 +105,8 @@ class Model:
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
         if self.settler is not None:
             arrays["settler"] = self.settler
+        if self.facing is not None:
+            arrays.update(_layers(self.facing))
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
             for name, values in arrays.items():
@@ -125,6 +129,7 @@ class Model:
                 names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
                 forests = [_join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names]
                 settler = archive["settler"] if "settler" in archive.files else None
+                facing = _network(archive) if f"{_LAYER}0_bias" in archive.files else None
             method = Method.from_dict(head["method"])
             values = head["calibration"]
             for name in ("quantiles", "joint_share"):
@@ -148,11 +153,34 @@ class Model:
         assert metric is not None
         expectation, pruner, corrector, proposals = others
         cascade = Cascade(skeleton, method, each, proposals)
-        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector, settler)
+        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector, settler, facing)
 
     def digest(self) -> str:
         """SHA-256 of the model file."""
         return hashlib.sha256(self.to_bytes()).hexdigest()
+
+
+_LAYER = "facing_"
+
+
+def _layers(network: Network) -> dict[str, NDArray[Any]]:
+    """A network's layers as the file holds them; its features are not standardised."""
+    return {
+        f"{_LAYER}{k}_{name}": values.astype(np.float16)
+        for k, layer in enumerate(network.layers)
+        for name, values in zip(("weights", "bias"), layer, strict=True)
+    }
+
+
+def _network(archive: Any) -> Network:
+    """The inverse of `_layers`."""
+    n_layers = sum(name.startswith(_LAYER) for name in archive.files) // 2
+    layers = tuple(
+        (archive[f"{_LAYER}{k}_weights"].astype(np.float32), archive[f"{_LAYER}{k}_bias"].astype(np.float32))
+        for k in range(n_layers)
+    )
+    n = len(layers[0][0])
+    return Network(np.zeros(n, np.float32), np.ones(n, np.float32), layers)
 
 
 _PARTS = ("tests", "threshold", "kind", "is_leaf", "roots", "leaves")

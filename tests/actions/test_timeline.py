@@ -19,9 +19,10 @@ from liex_lab.actions.learning import learn, leave_one_animal_out
 from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.storage import load_action_model, save_action_model
 from liex_lab.actions.suggestions import doubtful_stretches
-from liex_lab.actions.timeline import Network, TimelineModel
+from liex_lab.actions.timeline import TimelineModel
 from liex_lab.errors import LiexError, ModelError
 from liex_lab.memory import on_disk
+from liex_lab.network import Network
 from tests.actions.toy import GO, STAY, going_and_staying
 
 
