@@ -244,6 +244,7 @@ def _sensitivities(
     for variant in SWEPT[: 1 if budget.quick else None]:
         sweep = QUICK_SWEEP if budget.quick else Sweep()
         made = {**made_from(variant, skeleton), "sweep": plain(vars(sweep))}
+        made["method"].pop("tells_facing", None)  # no model of a sweep does
         known = kept.get(variant)
         if known is not None and known["made"]["from"] == made:
             curves[variant] = {**known, "origin": "kept"}
