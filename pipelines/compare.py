@@ -60,7 +60,7 @@ def compare_sessions(
     stats = compare(table, wanted, reference, engine=engine)
     target = Path(out)
     target.mkdir(parents=True, exist_ok=True)
-    write_table(target / "stats.parquet", STATS, [from_pandas(STATS, stats)], {"table": "stats"})
+    write_table(target / "stats.parquet", STATS, from_pandas(stats), {"table": "stats"})
     stats.to_csv(target / "stats.csv", index=False, lineterminator="\n")
     table.to_csv(target / "sessions.csv", index=False, lineterminator="\n")
     entries = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]

@@ -17,7 +17,6 @@ from liex_lab.progress import Progress, silent
 from liex_lab.sessions.corrections import FOLDER, LOG, REPLAY, BoutEdit, Correction, Log, basis, read_log
 
 if TYPE_CHECKING:
-    import pandas as pd
 
     from liex_lab.behaviour.summary import Behaviour
     from liex_lab.sessions import Session
@@ -126,10 +125,9 @@ def _behaviour(
     """
     from liex_lab.behaviour.summary import measure_rows, stated_by
     from liex_lab.sessions.applying import edited_bouts, spliced_bouts
-    from liex_lab.sessions.tables import FRAMES, to_pandas
 
     rules, around = stated_by(raw)
-    frames: pd.DataFrame = to_pandas(FRAMES, results.rows.frames())
+    frames = results.rows.frames_table()
     bouts, actions, facts = raw.bouts, dict(raw.metadata.get("actions") or {}), {}
     if len(found.turned):
         again, facts = measure_behaviour(results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin)

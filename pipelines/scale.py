@@ -159,6 +159,7 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
             depth, times = [to_millimetres(frame.depth) for frame in frames], [frame.time_ns for frame in frames]
             replay.add([frame.index for frame in frames], times, depth)
             messages.add(times, depth)
+        replay.flushed()
         replay.abandon()
         messages.abandon()
     return {"opening": opening, "decode": decode, "bound": time.perf_counter() - began}

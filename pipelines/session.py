@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
     from liex_lab.tracking.tracker import FrameTracker
 
+# of the table `frames`, what names of actions go by
+_NAMED_BY = ("session_id", "individual", "frame_index", "time_ns", "wall_distance_mm")
+
 
 def measure_session(
     recording: str | Path | Recording,
@@ -130,7 +133,7 @@ def measure_behaviour(
     named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, room)
     rows.track.rest()
     give_back()
-    return measure_rows(rows, build_rules(plan), build_surroundings(origin), **named), notes
+    return measure_rows(rows, build_rules(plan), build_surroundings(origin), room=room, **named), notes
 
 
 def name_actions(
@@ -140,9 +143,8 @@ def name_actions(
     and what the frame rate cannot tell.
     """
     from liex_lab.actions.tables import bout_rows
-    from liex_lab.sessions.tables import FRAMES, to_pandas
 
-    frames = to_pandas(FRAMES, rows.frames())
+    frames = rows.frames_table(_NAMED_BY)
     found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), room)
     notes = {
         "action_model": {"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},

@@ -14,15 +14,20 @@ _NEVER = -1e30
 
 
 @njit(cache=True)
-def best_path(scores, first, stay, leave, switch, label):
-    """The most probable actions, into label (m,)."""
-    m, n = scores.shape
+def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, stayed):
+    """The ways that end in each state at tick stop - 1, from those at tick start - 1.
+
+    value (states,): the log score of the best way to each, brought on; came_from (m, n): the action before, where one
+    begins at a tick; stayed (m, n): whether the best way was in an action's last state before.
+    """
+    n = scores.shape[1]
     total = first[n]
-    value, fresh = np.empty(total), np.empty(total)
-    came_from, stayed = np.empty((m, n), np.int16), np.zeros((m, n), np.bool_)
-    for k in range(n):
-        value[first[k] : first[k + 1]] = scores[0, k] - np.log(total)  # a recording may begin in the middle of one
-    for t in range(1, m):
+    fresh = np.empty(total)
+    if start == 0:
+        for k in range(n):
+            value[first[k] : first[k + 1]] = scores[0, k] - np.log(total)  # it may begin in the middle of one
+            came_from[0, k], stayed[0, k] = 0, False
+    for t in range(max(start, 1), stop):
         for k in range(n):
             best, source = _NEVER, 0
             for j in range(n):
@@ -30,7 +35,7 @@ def best_path(scores, first, stay, leave, switch, label):
                     reach = value[first[j + 1] - 1] + leave[j] + switch[j, k]
                     if reach > best:
                         best, source = reach, j
-            came_from[t, k] = source
+            came_from[t, k], stayed[t, k] = source, False
             last = first[k + 1] - 1
             for s in range(last, first[k], -1):
                 fresh[s] = value[s - 1]
@@ -40,11 +45,16 @@ def best_path(scores, first, stay, leave, switch, label):
             for s in range(first[k], last + 1):
                 fresh[s] += scores[t, k]
         value[:] = fresh
+
+
+@njit(cache=True)
+def trace_back(first, value, came_from, stayed, label):
+    """The most probable actions, into label (m,)."""
     state = int(np.argmax(value))
     k = 0
     while first[k + 1] <= state:
         k += 1
-    for t in range(m - 1, -1, -1):
+    for t in range(len(label) - 1, -1, -1):
         label[t] = k
         if t == 0:
             break

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions import _chain as kernels
+from liex_lab.memory import Room, blocks, let_go
 
 Array = NDArray[np.float64]
 
@@ -52,19 +53,27 @@ class ActionChain:
             switch = np.maximum(np.log(self.follow), -1e30)
         return np.concatenate([[0], np.cumsum(least)]), np.log(go), np.log1p(-go), switch
 
-    def decode(self, scores: Array, step_s: float) -> NDArray[np.int64]:
-        """The most probable word (m,) of every tick, from log scores (m, K)."""
-        label = np.zeros(len(scores), np.int64)
-        kernels.best_path(np.ascontiguousarray(scores), *self._terms(step_s), label)
+    def decode(self, scores: Array, step_s: float, room: Room = np.empty) -> NDArray[np.int64]:
+        """The most probable word (m,) of every tick, from log scores (m, K). room: for what takes much of it on the
+        way.
+        """
+        scores, terms = np.ascontiguousarray(scores), self._terms(step_s)
+        value, label = np.empty(terms[0][-1]), np.zeros(len(scores), np.int64)
+        came_from, stayed = room(scores.shape, np.int16), room(scores.shape, np.bool_)
+        for ticks in blocks(len(scores), _PIECE):
+            kernels.go_on(ticks.start, ticks.stop, scores, *terms, value, came_from, stayed)
+            let_go(scores, came_from, stayed)
+        kernels.trace_back(terms[0], value, came_from, stayed, label)
         return label
 
-    def probabilities(self, scores: Array, step_s: float) -> Array:
-        """The probability (m, K) of each word at every tick, given all of them."""
-        out, terms = np.empty(scores.shape), self._terms(step_s)
+    def probabilities(self, scores: Array, step_s: float, room: Room = np.empty) -> Array:
+        """The probability (m, K) of each word at every tick, given all of them; room: where they are to lie."""
+        out, terms = room(scores.shape, float), self._terms(step_s)
         for start in range(0, len(scores), _PIECE):
             stop = min(start + _PIECE, len(scores))
             low, high = max(0, start - _MARGIN), min(len(scores), stop + _MARGIN)
             piece = np.empty((high - low, scores.shape[1]))
             kernels.probabilities(np.ascontiguousarray(scores[low:high]), *terms, piece)
             out[start:stop] = piece[start - low : stop - low]
+            let_go(scores, out)
         return out

@@ -84,13 +84,19 @@ def _forward(skeleton: Skeleton) -> tuple[int, int]:
 def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[np.bool_]:
     """Which of the good frames point against what lies around them: head and tail were exchanged."""
     rear, front = _forward(track.skeleton)
-    axis = track.joints_mm[good, front] - track.joints_mm[good, rear]
-    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(axis, axis=0)])
-    times = time_s[good]
-    low, high = np.searchsorted(times, times - _FLIP_S, "left"), np.searchsorted(times, times + _FLIP_S, "right")
-    around = total[high] - total[low] - axis
-    return np.asarray(np.sum(axis * around, axis=1) < -0.5 * (high - low - 1).clip(1))
+    axis, total = np.empty((len(good), 3)), np.zeros((len(good) + 1, 3))
+    for some in blocks(len(good), _PIECE):
+        axis[some] = track.joints_mm[good[some], front] - track.joints_mm[good[some], rear]
+        axis[some] /= np.maximum(np.linalg.norm(axis[some], axis=1, keepdims=True), 1e-9)
+        track.rest()
+    np.cumsum(axis, axis=0, out=total[1:])
+    times, against = time_s[good], np.empty(len(good), np.bool_)
+    for some in blocks(len(good), _PIECE):
+        low = np.searchsorted(times, times[some] - _FLIP_S, "left")
+        high = np.searchsorted(times, times[some] + _FLIP_S, "right")
+        around = total[high] - total[low] - axis[some]
+        against[some] = np.sum(axis[some] * around, axis=1) < -0.5 * (high - low - 1).clip(1)
+    return against
 
 
 class _OnClock:

@@ -69,14 +69,15 @@ class Ethogram:
 
     @staticmethod
     def of_words(
-        words: Sequence[str] | NDArray[np.str_], times_ns: NDArray[np.int64],
+        words: Sequence[str] | NDArray[np.str_] | NDArray[np.int64], times_ns: NDArray[np.int64],
         vocabulary: Mapping[str, str] | None = None,
         score: NDArray[np.float64] | None = None, part: NDArray[np.int64] | None = None, source: str = "model",
+        names: Sequence[str] | None = None,
     ) -> Ethogram:  # fmt: skip
         """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never leaves its `part`
-        (n,), the unbroken stretch of the recording that it lies in.
+        (n,), the unbroken stretch of the recording that it lies in; names: `words` are places in it.
         """
-        label = np.asarray(words, dtype=np.str_)
+        label = np.asarray(words, np.str_ if names is None else np.int64)
         n = len(label)
         if n == 0:
             return Ethogram((), vocabulary or {}, source)
@@ -85,10 +86,11 @@ class Ethogram:
         starts = np.flatnonzero(np.append(True, changes))
         stops = np.append(starts[1:], n)
         stop_ns, sure = frame_stops(times_ns), np.ones(n) if score is None else score
+        named = [str(one if names is None else names[one]) for one in label[starts]]
         bouts = [
-            Bout(int(times_ns[a]), int(stop_ns[b - 1]), str(label[a]), float(sure[a:b].mean()))
-            for a, b in zip(starts, stops, strict=True)
-            if label[a] != UNLABELLED
+            Bout(int(times_ns[a]), int(stop_ns[b - 1]), word, float(sure[a:b].mean()))
+            for a, b, word in zip(starts, stops, named, strict=True)
+            if word != UNLABELLED
         ]
         return Ethogram(tuple(bouts), vocabulary or {}, source)
 

@@ -6,7 +6,7 @@ tick looks like, and a semi-Markov chain for what can follow what and for how lo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +20,7 @@ from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.windows import window_features
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.memory import Room, let_go
+from liex_lab.memory import Room, blocks, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -76,62 +76,73 @@ class TimelineModel:
     definitions: dict[str, str] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
-    def log_probabilities(self, stretch: Stretch, names: Sequence[str], speed: Array) -> Array:
-        """(m, K) of each word at each tick by itself; speed (m,): the `steady_speed`."""
-        margin = round(_MARGIN_S * self.clock_hz)
-        out = np.empty((len(stretch.times_s), len(self.words)))
-        for start in range(0, len(out), _PIECE):
-            stop = min(start + _PIECE, len(out))
-            low, high = max(0, start - margin), min(len(out), stop + margin)
+    def log_probabilities(
+        self, stretch: Stretch, names: Sequence[str], speed: Array
+    ) -> Iterator[tuple[slice, Array]]:  # fmt: skip
+        """(some, K) of each word at each of some consecutive ticks by itself; speed (m,): the `steady_speed`."""
+        margin, m = round(_MARGIN_S * self.clock_hz), len(stretch.times_s)
+        for ticks in blocks(m, _PIECE):
+            low, high = max(0, ticks.start - margin), min(m, ticks.stop + margin)
             features = window_features(Stretch(stretch.times_s[low:high], stretch.values[low:high]), names)
-            features = features[start - low : stop - low]
+            features = features[ticks.start - low : ticks.stop - low]
             let_go(stretch.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
-            now = speed[start:stop, None]
+            now = speed[ticks, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (now > self.speeds[:, 1] * _SLACK + _STILL)
-            out[start:stop] = np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
-        return out
+            yield ticks, np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
 
-    def scores(self, log_probabilities: Array) -> Array:
-        """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is."""
-        return self.sharpness * (log_probabilities - np.log(np.maximum(self.share, 1e-3)))
+    def scores(self, stretch: Stretch, names: Sequence[str], speed: Array, room: Room = np.empty) -> Array:
+        """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is; room: where they are to
+        lie.
+        """
+        scores = room((len(stretch.times_s), len(self.words)), float)
+        for ticks, log_p in self.log_probabilities(stretch, names, speed):
+            scores[ticks] = self.sharpness * (log_p - np.log(np.maximum(self.share, 1e-3)))
+            let_go(scores)
+        return scores
 
     def recognise(self, track: Track, wall_mm: Array | None = None, room: Room = np.empty) -> Recognised:
         """The ethogram of a track, and the probability of each word in each of its frames. room: for what takes much
         of it on the way.
         """
-        n, words = track.n_frames, np.array(self.words)
-        probability = np.full((n, len(words)), np.nan)
-        label, part = np.full(n, UNLABELLED, dtype=words.dtype), np.full(n, -1)
+        n = track.n_frames
+        probability, score = room((n, len(self.words)), float), np.zeros(n)
+        code, part = np.full(n, self.words.index(UNLABELLED)), np.full(n, -1)
+        for rows in blocks(n, _PIECE):
+            probability[rows] = np.nan
+            let_go(probability)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
-        names = channel_names(track.skeleton)
+        names, step = channel_names(track.skeleton), 1.0 / self.clock_hz
         for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, room)):
             speed = steady_speed(stretch, names)
-            scores = self.scores(self.log_probabilities(stretch, names, speed))
-            decoded = self._decode(scores, speed)
-            certain = self.chain.probabilities(scores, 1.0 / self.clock_hz)
-            begin, step = stretch.times_s[0], 1.0 / self.clock_hz
-            rows = np.arange(*np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step]))
-            tick = np.clip(np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1)
-            label[rows], probability[rows], part[rows] = words[decoded[tick]], certain[tick], number
-        code = np.array([self.words.index(word) for word in self.words])
-        chosen = np.searchsorted(words[np.argsort(words)], label)
-        score = np.take_along_axis(probability, code[np.argsort(words)][chosen][:, None], axis=1)[:, 0]
-        ethogram = Ethogram.of_words(label, track.times_ns, self.definitions, np.nan_to_num(score), part)
+            scores = self.scores(stretch, names, speed, room)
+            decoded = self._decode(scores, speed, room)
+            certain = self.chain.probabilities(scores, step, room)
+            begin = stretch.times_s[0]
+            first, last = np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step])
+            for piece in blocks(last - first, _PIECE):
+                rows = slice(first + piece.start, first + piece.stop)
+                tick = np.clip(np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1)
+                told = certain[tick]
+                code[rows], probability[rows], part[rows] = decoded[tick], told, number
+                score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
+                let_go(certain, probability)
+        ethogram = Ethogram.of_words(code, track.times_ns, self.definitions, score, part, names=self.words)
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
 
-    def _decode(self, scores: Array, speed: Array) -> NDArray[np.int64]:
+    def _decode(self, scores: Array, speed: Array, room: Room) -> NDArray[np.int64]:
         """The most probable words (m,) of bouts that are all as fast at some time as their words ask for; scores (m, K)
         of others are lowered in place.
         """
         for _ in range(_MOST_DECODED):
-            decoded = self.chain.decode(scores, 1.0 / self.clock_hz)
+            decoded = self.chain.decode(scores, 1.0 / self.clock_hz, room)
             starts, stops, words = runs_of(decoded)
             wrong = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
             if not wrong.any():
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
                 scores[start:stop, word] -= _REFUSED
+            let_go(scores)
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
@@ -161,8 +172,8 @@ class TimelineModel:
         total = np.zeros(len(self.words))
         names = channel_names(track.skeleton)
         for stretch in stretches_of(track, self.clock_hz, wall_mm):
-            log_p = self.log_probabilities(stretch, names, steady_speed(stretch, names))
-            total += (log_p - np.log(np.maximum(self.share, 1e-3))).sum(axis=0)
+            for _, log_p in self.log_probabilities(stretch, names, steady_speed(stretch, names)):
+                total += (log_p - np.log(np.maximum(self.share, 1e-3))).sum(axis=0)
         if not total.any():
             return UNLABELLED
         named = [k for k, word in enumerate(self.words) if word != UNLABELLED]

@@ -19,6 +19,7 @@ from liex_lab.behaviour.body import Body
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
+from liex_lab.memory import Room, blocks, let_go
 from liex_lab.sessions.rows import gap_follows, median_step, stop_times
 from liex_lab.sessions.tables import to_pandas
 from liex_lab.tracking.track import Track
@@ -30,22 +31,36 @@ HALF_WINDOW_S = 0.034  # speed at t uses neighbours this far away, as Live Mouse
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 ERROR_LASTS_S = 0.3  # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
 _BLOCK = 16_384  # frames whose postures are in memory at a time
+_MOVING = (
+    "x_mm", "y_mm", "z_mm", "position_sd_mm", "speed_mm_s", "speed_sd_mm_s", "vertical_speed_mm_s", "step_mm",
+    "acceleration_mm_s2", "acceleration_sd_mm_s2", "heading_rad", "heading_sd_rad", "yaw_rate_rad_s",
+    "yaw_rate_sd_rad_s", "body_pitch_rad", "body_pitch_sd_rad",
+)  # fmt: skip
+_HEIGHTS = ("nose_height_mm", "nose_height_sd_mm", "back_height_mm", "nose_over_rump_mm", "reach_mm")
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
 @dataclass(frozen=True)
 class Spans:
-    """Which frames (n,) a derivative at each frame is taken between, and the time from one to the other, s."""
+    """Which frames a derivative at each of some frames `rows` (m) is taken between, and the time from one to the other,
+    s. What it is taken of are always the values of all frames (n).
+    """
 
     before: Rows
     after: Rows
     span_s: Array
+    rows: slice
 
     @staticmethod
     def of(time_s: Array, observed: NDArray[np.bool_], half_window_s: float) -> Spans:
         """The neighbours about `half_window_s` away; a frame that stands alone has an empty span."""
         before, after = neighbours(time_s, observed, half_window_s)
-        return Spans(before, after, np.where(after > before, time_s[after] - time_s[before], np.nan))
+        span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
+        return Spans(before, after, span_s, slice(None))
+
+    def __getitem__(self, rows: slice) -> Spans:
+        """Those of some of all frames."""
+        return Spans(self.before[rows], self.after[rows], self.span_s[rows], rows)
 
     def rate(self, values: Array) -> Array:
         """Change per second of values (n,) or (n, k)."""
@@ -53,12 +68,13 @@ class Spans:
         return np.asarray((values[self.after] - values[self.before]) / span)
 
     def turning(self, angle: Array) -> Array:
-        """(n,) rad/s, adding the smallest turns from `before` over the frame itself to `after`."""
-        turn = smallest_turn(angle - angle[self.before]) + smallest_turn(angle[self.after] - angle)
+        """(m,) rad/s, adding the smallest turns from `before` over the frame itself to `after`."""
+        here = angle[self.rows]
+        turn = smallest_turn(here - angle[self.before]) + smallest_turn(angle[self.after] - here)
         return np.asarray(turn / self.span_s)
 
     def sd(self, sd: Array) -> Array:
-        """(n,) standard deviation of the rate of values with these (n,); the nearer two frames, the more they agree."""
+        """(m,) standard deviation of the rate of values with these (n,); the nearer two frames, the more they agree."""
         first, second = sd[self.before], sd[self.after]
         shared = np.exp(-self.span_s / ERROR_LASTS_S)
         return np.asarray(np.sqrt(first**2 + second**2 - 2.0 * shared * first * second) / self.span_s)
@@ -70,59 +86,87 @@ def kinematics(
     half_window_s: float = HALF_WINDOW_S,
     impossible_above_mm_s: float = IMPOSSIBLE_MM_S,
     surface_z_mm: float | None = None,
+    room: Room = np.empty,
 ) -> pd.DataFrame:
     """The table `kinematics` from the tables `frames` and `poses` (or its joints) of one animal: one row per frame.
 
-    surface_z_mm: height of the water's surface above the floor, for an animal that swims.
+    surface_z_mm: height of the water's surface above the floor, for an animal that swims. room: where its columns are
+    to lie.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = Body.of(joints.names)
-    shape, heights = _frame_by_frame(body, joints)
+    shape, heights = _frame_by_frame(body, joints, room)
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
     spans = Spans.of(time_s, observed, half_window_s)
-    block: dict[str, Any] = {name: frames[name].to_numpy() for name in ("frame_index", "time_s", "dt_s")}
+    block: dict[str, Any] = {name: _put_away(frames[name], room) for name in ("frame_index", "time_s", "dt_s")}
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
-    block |= _moving(shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s)
+    block |= _moving(shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, room)
     block |= {"length_mm": shape.length_mm, "straightness": shape.straightness, "bend_rad": shape.bend_rad, **heights}
     if body.swims:
         block |= _swimming(shape, time_s, segments(time_s, observed), surface_z_mm)
-    return to_pandas(kinematics_columns(body.swims), block)
+    return to_pandas(kinematics_columns(body.swims), block, copy=False)
 
 
-def _frame_by_frame(body: Body, joints: Joints) -> tuple[Shape, dict[str, Array]]:
+def _frame_by_frame(body: Body, joints: Joints, room: Room) -> tuple[Shape, dict[str, Array]]:
     """What each frame tells by itself, and of an animal that stands its heights; a block of frames is in memory."""
-    shape = Shape.empty(joints.n_frames)
-    heights: dict[str, Array] = {}
-    for start in range(0, max(joints.n_frames, 1), _BLOCK):
-        rows = slice(start, start + _BLOCK)
+    shape = Shape.empty(joints.n_frames, room)
+    heights = {} if body.swims else {name: room((joints.n_frames,), float) for name in _HEIGHTS}
+    for rows in blocks(joints.n_frames, _BLOCK):
         xyz, sd = joints.at(rows)
         shape.put(rows, Posture.of(body, xyz, sd))
-        for name, values in ({} if body.swims else _walking(body, xyz, sd)).items():
-            heights.setdefault(name, np.empty(joints.n_frames))[rows] = values
+        if not body.swims:
+            _put(heights, rows, _walking(body, xyz, sd))
+        shape.rest()
+        let_go(*heights.values())
     return shape, heights
 
 
-def _moving(shape: Shape, swims: bool, spans: Spans, hold_s: Array, impossible_above_mm_s: float) -> dict[str, Array]:
+def _put_away(column: pd.Series[Any], room: Room) -> NDArray[Any]:
+    """A column (n,) in that room."""
+    values = room((len(column),), column.dtype)
+    values[:] = column.to_numpy()
+    let_go(values)
+    return values
+
+
+def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> None:
+    """Values (m,) of some rows into their columns (n,)."""
+    for name, some in values.items():
+        columns[name][rows] = some
+
+
+def _moving(
+    shape: Shape, swims: bool, spans: Spans, hold_s: Array, impossible_above_mm_s: float, room: Room
+) -> dict[str, Array]:
     """Place, speed and turning of the body as a whole; hold_s (n,): how long each frame counts."""
-    centre, sd = shape.centre, shape.centre_sd
-    velocity = spans.rate(centre)
-    over = velocity if swims else velocity[:, :2]
-    speed = np.linalg.norm(over, axis=1)
-    speed = np.where(speed > impossible_above_mm_s, np.nan, speed)
-    speed_sd = spans.sd(sd)
-    flat = np.abs(shape.pitch_rad) < STEEP_RAD
-    heading = np.where(flat, shape.heading_rad, np.nan)
-    heading_sd = np.where(flat, shape.heading_sd_rad, np.nan)
-    return {
-        "x_mm": centre[:, 0], "y_mm": centre[:, 1], "z_mm": centre[:, 2], "position_sd_mm": sd,
-        "speed_mm_s": speed, "speed_sd_mm_s": speed_sd, "vertical_speed_mm_s": velocity[:, 2],
-        "acceleration_mm_s2": spans.rate(speed), "acceleration_sd_mm_s2": spans.sd(speed_sd),
-        "step_mm": speed * hold_s,
-        "heading_rad": heading, "heading_sd_rad": heading_sd,
-        "yaw_rate_rad_s": spans.turning(heading), "yaw_rate_sd_rad_s": spans.sd(heading_sd),
-        "body_pitch_rad": shape.pitch_rad, "body_pitch_sd_rad": shape.pitch_sd_rad,
-    }  # fmt: skip
+    columns = {name: room((len(hold_s),), float) for name in _MOVING}
+    speed, speed_sd, heading, heading_sd = (
+        columns[name] for name in ("speed_mm_s", "speed_sd_mm_s", "heading_rad", "heading_sd_rad")
+    )
+    for rows in blocks(len(hold_s), _BLOCK):
+        centre, velocity = shape.centre[rows], spans[rows].rate(shape.centre)
+        fast = np.linalg.norm(velocity if swims else velocity[:, :2], axis=1)
+        speed[rows] = np.where(fast > impossible_above_mm_s, np.nan, fast)
+        speed_sd[rows] = spans[rows].sd(shape.centre_sd)
+        flat = np.abs(shape.pitch_rad[rows]) < STEEP_RAD
+        heading[rows] = np.where(flat, shape.heading_rad[rows], np.nan)
+        heading_sd[rows] = np.where(flat, shape.heading_sd_rad[rows], np.nan)
+        _put(columns, rows, {
+            "x_mm": centre[:, 0], "y_mm": centre[:, 1], "z_mm": centre[:, 2], "position_sd_mm": shape.centre_sd[rows],
+            "vertical_speed_mm_s": velocity[:, 2], "step_mm": speed[rows] * hold_s[rows],
+            "body_pitch_rad": shape.pitch_rad[rows], "body_pitch_sd_rad": shape.pitch_sd_rad[rows],
+        })  # fmt: skip
+        shape.rest()
+        let_go(*columns.values())
+    for rows in blocks(len(hold_s), _BLOCK):  # now that those of the neighbours are known
+        here = spans[rows]
+        _put(columns, rows, {
+            "acceleration_mm_s2": here.rate(speed), "acceleration_sd_mm_s2": here.sd(speed_sd),
+            "yaw_rate_rad_s": here.turning(heading), "yaw_rate_sd_rad_s": here.sd(heading_sd),
+        })  # fmt: skip
+        let_go(*columns.values())
+    return columns
 
 
 def _walking(body: Body, xyz: Array, sd: Array) -> dict[str, Array]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import Body
+from liex_lab.memory import Room, let_go
 
 Array = NDArray[np.float64]
 
@@ -153,10 +154,18 @@ class Shape:
     rear_sd_mm: Array
 
     @staticmethod
-    def empty(n: int) -> Shape:
-        """Room for n frames."""
+    def empty(n: int, room: Room = np.empty) -> Shape:
+        """For n frames; room: where they are to lie."""
         more = {"centre": (n, 3), "thirds_rad": (n, 3)}
-        return Shape(*(np.full(more.get(one.name, (n,)), np.nan) for one in fields(Shape)))
+        shape = Shape(*(room(more.get(one.name, (n,)), float) for one in fields(Shape)))
+        for column in vars(shape).values():
+            column[:] = np.nan
+            let_go(column)
+        return shape
+
+    def rest(self) -> None:
+        """Let go of the memory of columns that lie on disk, until they are looked at again."""
+        let_go(*vars(self).values())
 
     def put(self, rows: slice, posture: Posture) -> None:
         """What a posture tells of some frames."""

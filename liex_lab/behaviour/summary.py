@@ -27,8 +27,9 @@ from liex_lab.behaviour.places import (
 )
 from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
 from liex_lab.behaviour.transitions import transitions
+from liex_lab.memory import Room
 from liex_lab.sessions.rows import stop_times
-from liex_lab.sessions.tables import FRAMES, GAPS, empty_table, to_pandas
+from liex_lab.sessions.tables import GAPS, empty_table, let_table_go, to_pandas
 
 if TYPE_CHECKING:
     from liex_lab.sessions import Session
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+# of the table `frames`, what behaviour is measured by
+_FRAMES = ("session_id", "individual", "frame_index", "time_s", "dt_s", "wall_distance_mm", "zone", "spine_mm", "flag")
 TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
 
 
@@ -75,33 +78,38 @@ def measure(
     *,
     bouts: pd.DataFrame | None = None,
     actions: Mapping[str, str] | None = None,
+    room: Room = np.empty,
 ) -> Behaviour:
     """The behaviour tables of one animal from its tables `frames` and `poses` (or its joints), and `gaps` where there
     are any.
 
     bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`), with its vocabulary `actions`, word ->
-    definition; None takes the rules'. around: arena, zones and water.
+    definition; None takes the rules'. around: arena, zones and water. room: where the table `kinematics` is to lie.
     """
     rules, around = rules or MouseRules(), around or Surroundings()
-    moved = kinematics(frames, poses, rules.speed_half_window_s, rules.impossible_above_mm_s, around.surface_z_mm)
+    moved = kinematics(frames, poses, rules.speed_half_window_s, rules.impossible_above_mm_s, around.surface_z_mm, room)
     named = find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved)
     actions = dict(rules.definitions() if actions is None else actions)
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), "tail_angle_rad" in moved)
     gaps = empty_table(GAPS) if gaps is None else gaps
-    return Behaviour(
-        moved, named, summarise(frames, moved, named, words, around),
-        transitions(named, words.words, gaps, rules.merge_pauses_s), activity(moved, named, words.words),
-        visits(frames, moved, words.zones, rules), rules, words, actions,
+    let_table_go(moved)
+    summary = summarise(frames, moved, named, words, around)
+    let_table_go(moved)
+    behaviour = Behaviour(
+        moved, named, summary, transitions(named, words.words, gaps, rules.merge_pauses_s),
+        activity(moved, named, words.words), visits(frames, moved, words.zones, rules), rules, words, actions,
     )  # fmt: skip
+    let_table_go(moved)
+    return behaviour
 
 
 def measure_rows(
-    rows: Rows, rules: MouseRules | None = None, around: Surroundings | None = None, **named: Any
+    rows: Rows, rules: MouseRules | None = None, around: Surroundings | None = None, **how: Any
 ) -> Behaviour:  # fmt: skip
-    """`measure` of a track that is not in a session yet."""
-    frames, gaps = to_pandas(FRAMES, rows.frames()), to_pandas(GAPS, rows.gaps())
-    return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **named)
+    """`measure` of a track that is not in a session yet; how: what else that may be told."""
+    frames, gaps = rows.frames_table(_FRAMES), to_pandas(GAPS, rows.gaps())
+    return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **how)
 
 
 def stated_by(session: Session) -> tuple[MouseRules, Surroundings]:

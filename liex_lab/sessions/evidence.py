@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
+from liex_lab.memory import blocks, let_go
 from liex_lab.recordings.times import Gap
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.reading import reading_from
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
+_BLOCK = 16_384  # frames that are in memory at a time
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
@@ -33,7 +36,16 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
         "bridge_s": subject.bridge_s, "joint_share": list(subject.joint_share), "stretch_sd": subject.stretch_sd,
     }  # fmt: skip
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
-    np.savez_compressed(folder / FILE, subject=told, **{name: getattr(seen, name) for name in COLUMNS})
+    columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
+    with zipfile.ZipFile(folder / FILE, "w", zipfile.ZIP_DEFLATED) as kept:  # as np.savez_compressed, a part at a time
+        for name, values in columns.items():
+            with kept.open(f"{name}.npy", "w", force_zip64=True) as file:
+                kind = np.lib.format.dtype_to_descr(values.dtype)
+                head = {"descr": kind, "fortran_order": False, "shape": values.shape}
+                np.lib.format.write_array_header_1_0(file, head)
+                for rows in blocks(len(values), _BLOCK):
+                    file.write(np.ascontiguousarray(values[rows]).tobytes())
+                    let_go(values)
 
 
 def read_skeleton(session: Session) -> Skeleton | None:

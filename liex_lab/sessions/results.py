@@ -32,7 +32,7 @@ class Results:
         """The tables of the track itself: frames, poses, rotations, gaps, flips, sessions."""
         rows, described = self.rows, self.origin.table_metadata()
         own: dict[str, Any] = {
-            "frames": [rows.frames()], "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
+            "frames": rows.frames(), "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
             "flips": [rows.flips(self.flips)],
             "sessions": [self.session_row()],
         }  # fmt: skip
@@ -46,12 +46,11 @@ class Results:
             schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
             if not schema:  # kinematics without any measure
                 continue
-            block = tables.from_pandas(schema, result)
             if name == "summary":
-                tables.check_described(block, schema, name)
+                tables.check_described(result.columns, schema, name)
                 result.map(tables.harmless).to_csv(folder / "summary.csv", index=False, lineterminator="\n")
             else:
-                tables.write_table(folder / f"{name}.parquet", schema, [block], described)
+                tables.write_table(folder / f"{name}.parquet", schema, tables.from_pandas(result), described)
         text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
         (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import runs_of
 from liex_lab.geometry import so3
+from liex_lab.memory import blocks, give_back
 from liex_lab.recordings.walls import UNKNOWN, Arena
 from liex_lab.recordings.zones import Zone, zone_names
 from liex_lab.sessions.tables import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.times)
 _Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
 LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
+_ALL = frozenset(column.name for column in FRAMES)
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -46,17 +48,33 @@ class Rows:
         """(n,) seconds since the first frame."""
         return seconds(self.track.times_ns)
 
-    @property
-    def dt_s(self) -> Array:
-        """(n,) seconds since the previous frame, NaN at the first."""
-        return np.concatenate([[np.nan], np.diff(self.track.times_ns) * 1e-9])[: self.track.n_frames]
+    def frames(self) -> Iterator[Block]:
+        """The table `frames`, some hundred thousand rows at a time."""
+        missing = self.missing_before()
+        return (self._frame_rows(part, missing[part]) for part in self._parts(1))
 
-    def frames(self) -> Block:
-        """The block of the table `frames`."""
-        track = self.track
+    def frames_table(self, names: Container[str] = _ALL) -> pd.DataFrame:
+        """The table `frames`, or those columns of it."""
+        import pandas as pd
+
+        schema = [column for column in FRAMES if column.name in names]
+        table = pd.concat([to_pandas(schema, block) for block in self.frames()], ignore_index=True)
+        give_back()
+        return table
+
+    def poses(self) -> Iterator[Block]:
+        """The table `poses`, some hundred thousand rows at a time."""
+        return (self._pose_rows(part) for part in self._parts(self.track.skeleton.n_joints))
+
+    def rotations(self) -> Iterator[Block]:
+        """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
+        return (self._rotation_rows(part) for part in self._parts(self.track.skeleton.n_joints + 1))
+
+    def _frame_rows(self, part: slice, missing: NDArray[np.int64]) -> Block:
+        track = self.track[part]
         return {
-            **self._who, **self._when(slice(None), 1),
-            "time_ns": track.times_ns, "gap_before": self.missing_before(),
+            **self._who, **self._when(part, 1),
+            "time_ns": track.times_ns, "gap_before": missing,
             "predicted_error_mm": track.predicted_error_mm, "residual_mm": track.residual_mm,
             "n_foreground_px": track.n_foreground_px,
             **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
@@ -67,40 +85,32 @@ class Rows:
             "p_flip": track.p_flip, "bridged": track.bridged, "flag": track.flag,
         }  # fmt: skip
 
-    def poses(self) -> Iterator[Block]:
-        """The table `poses`, some hundred thousand rows at a time."""
-        track = self.track
-        names, n_joints = track.skeleton.names, track.skeleton.n_joints
-        for part in self._parts(n_joints):
-            joints, uv, sd = track.joints_mm[part], track.uv_px[part], track.sd_mm[part]
-            yield {
-                **self._who, **self._when(part, n_joints),
-                "joint": Words(np.tile(np.arange(n_joints), len(joints)), tuple(names)),
-                **{f"{axis}_mm": joints[:, :, k].ravel() for k, axis in enumerate("xyz")},
-                **{f"{axis}_px": uv[:, :, k].ravel() for k, axis in enumerate("uv")},
-                "score": nearness(sd, _NEAR * track.spine_mm[part][:, None]).ravel(),
-                "sd_mm": sd.ravel(),
-            }  # fmt: skip
+    def _pose_rows(self, part: slice) -> Block:
+        track, n_joints = self.track[part], self.track.skeleton.n_joints
+        return {
+            **self._who, **self._when(part, n_joints),
+            "joint": Words(np.tile(np.arange(n_joints), track.n_frames), tuple(track.skeleton.names)),
+            **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
+            **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
+            "score": nearness(track.sd_mm, _NEAR * track.spine_mm[:, None]).ravel(), "sd_mm": track.sd_mm.ravel(),
+        }  # fmt: skip
 
-    def rotations(self) -> Iterator[Block]:
-        """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
-        track = self.track
-        n_rows = track.skeleton.n_joints + 1
-        for part in self._parts(n_rows):
-            root = _log(track.root_rotation[part])[:, None]
-            turn = np.concatenate([root, track.angles_rad[part]], axis=1)
-            spread = np.concatenate([track.sd_root[part][:, None, :3], track.sd_angles_rad[part]], axis=1)
-            shift, sd_shift = np.full(turn.shape, np.nan), np.full(turn.shape, np.nan)
-            shift[:, 0], sd_shift[:, 0] = track.root_mm[part], track.sd_root[part][:, 3:]
-            together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
-            together[:, 0] = track.cov_root[part][:, *np.triu_indices(6, 1)]
-            yield {
-                **self._who, **self._when(part, n_rows),
-                "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
-                **_xyz("w{}_rad", turn), **_xyz("sd_w{}_rad", spread),
-                **_xyz("t{}_mm", shift), **_xyz("sd_t{}_mm", sd_shift),
-                **{name: together[..., k].ravel() for k, name in enumerate(ROOT_COVARIANCES)},
-            }  # fmt: skip
+    def _rotation_rows(self, part: slice) -> Block:
+        track, n_rows = self.track[part], self.track.skeleton.n_joints + 1
+        turn = np.concatenate([_log(track.root_rotation)[:, None], track.angles_rad], axis=1)
+        sd_root = track.sd_root
+        spread = np.concatenate([sd_root[:, None, :3], track.sd_angles_rad], axis=1)
+        shift, sd_shift = np.full(turn.shape, np.nan), np.full(turn.shape, np.nan)
+        shift[:, 0], sd_shift[:, 0] = track.root_mm, sd_root[:, 3:]
+        together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
+        together[:, 0] = track.cov_root[:, *np.triu_indices(6, 1)]
+        return {
+            **self._who, **self._when(part, n_rows),
+            "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
+            **_xyz("w{}_rad", turn), **_xyz("sd_w{}_rad", spread), **_xyz("t{}_mm", shift),
+            **_xyz("sd_t{}_mm", sd_shift),
+            **{name: together[..., k].ravel() for k, name in enumerate(ROOT_COVARIANCES)},
+        }  # fmt: skip
 
     def missing_before(self) -> NDArray[np.int64]:
         """(n,) frames that the camera did not deliver just before each frame."""
@@ -168,13 +178,17 @@ class Rows:
         return {"session_id": self.session_id, "individual": self.individual}
 
     def _when(self, part: slice, repeat: int) -> dict[str, Any]:
-        columns = {"frame_index": self.frame_index, "time_s": self.time_s, "dt_s": self.dt_s}
-        return {name: np.repeat(column[part], repeat) for name, column in columns.items()}
+        times = self.track.times_ns
+        since = np.diff(times[max(part.start - 1, 0) : part.stop]) * 1e-9
+        columns = {
+            "frame_index": self.frame_index[part], "time_s": (times[part] - times[:1]).astype(np.float64) * 1e-9,
+            "dt_s": since if part.start else np.concatenate([[np.nan], since])[: len(times[part])],
+        }  # fmt: skip
+        return {name: np.repeat(column, repeat) for name, column in columns.items()}
 
     def _parts(self, rows_per_frame: int) -> Iterator[slice]:
-        step = max(1, ROWS_PER_GROUP // rows_per_frame)
-        for start in range(0, self.track.n_frames, step):
-            yield slice(start, start + step)
+        for part in blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame)):
+            yield part
             self.track.rest()
 
 
@@ -236,7 +250,4 @@ def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
 
 def rows_only(rows: Rows) -> pd.DataFrame:
     """A kinematics table without any measure."""
-    return to_pandas(FRAMES[:5], {k: v for k, v in rows.frames().items() if k in _ROW_NAMES})
-
-
-_ROW_NAMES = {column.name for column in FRAMES[:5]}
+    return rows.frames_table([column.name for column in FRAMES[:5]])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
-from liex_lab.memory import blocks
+from liex_lab.memory import blocks, let_go
 from liex_lab.recordings.rvl import rvl_message
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
@@ -43,6 +43,7 @@ ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
 _PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
 _NOISY_PNG = (16, 1, 17, 2)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
+_TOGETHER = 32  # pictures in one message: for each the index that ends the file takes some 5 kB of memory
 _BLOCK = 8192  # frames of small things sent in one go
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
@@ -66,6 +67,7 @@ class ReplayWriter:
     def __init__(self, path: Path, origin: Provenance, blueprint: Any = None, *, corrected: bool = False) -> None:
         self._origin = origin
         self._first_ns: int | None = None
+        self._waiting: list[tuple[int, int, NDArray[np.uint8], str]] = []  # frame, ns since the first, depth, its kind
         stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
         stream.set_log_time_enabled(False)
         self._stream: Any = _Renamed(stream) if corrected else stream
@@ -87,15 +89,20 @@ class ReplayWriter:
         if self._first_ns is None:
             self._first_ns = int(times_ns[0])
             self._log_depth_kind(depth[0])
-        elapsed = np.asarray(times_ns, np.int64) - self._first_ns
-        index = np.asarray(frame_index, np.int64)
-        for start in range(0, len(depth), 8):  # larger calls were slower and hold more memory
-            part = slice(start, start + 8)
-            blobs, kinds = zip(*(packed(image) for image in depth[part]), strict=True)
+        for index, time_ns, image in zip(frame_index, times_ns, depth, strict=True):
+            self._waiting.append((int(index), int(time_ns) - self._first_ns, *packed(image)))
+            if len(self._waiting) == _TOGETHER:
+                self._send_depth()
+
+    def _send_depth(self) -> None:
+        """Write the depth that waits."""
+        if self._waiting:
+            index, elapsed, blobs, kinds = zip(*self._waiting, strict=True)
             columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
-            self._stream.send_columns(DEPTH, _timeline(index[part], elapsed[part]), [*columns])
+            self._stream.send_columns(DEPTH, _timeline(np.array(index), np.array(elapsed)), [*columns])
+            self._stream.flush()
             self._n_sent += 1
-        self._stream.flush()
+            self._waiting.clear()
 
     def finish(
         self, rows: Rows, kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str],
@@ -104,6 +111,7 @@ class ReplayWriter:
         """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the ethogram's vocabulary;
         candidates: what single frames thought possible, where that is to be seen, too.
         """
+        self._send_depth()
         index, elapsed = rows.frame_index, rows.track.times_ns - rows.track.times_ns[:1]
         self._log_skeleton(rows, index, elapsed)
         self._log_root(rows, index, elapsed)
@@ -124,8 +132,10 @@ class ReplayWriter:
                 columns = rr.Scalars.columns(scalars=values[part])
                 self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
             self._stream.flush()
+            let_go(values)
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
+        rows.track.rest()
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(
@@ -140,6 +150,7 @@ class ReplayWriter:
 
         Rerun does not tell when the disk is full, so the messages on disk are counted.
         """
+        self._send_depth()
         self._stream.flush()
         size = self._path.stat().st_size
         with self._path.open("rb") as file:
@@ -211,7 +222,7 @@ class ReplayWriter:
         girth = float(self._origin.animal_size.get("girth", 1.0))
         carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
         for part in blocks(track.n_frames, _BLOCK):
-            when, seen = _timeline(index[part], elapsed[part]), track.posed[part]
+            when, seen = _timeline(index[part], elapsed[part]), track[part].posed
             self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
             send_body(self._stream, track, part, when, carriers)
             self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
@@ -256,6 +267,7 @@ class ReplayWriter:
             xyzw = np.roll(so3.quaternion(track.root_rotation[where]), -1, axis=-1)
             columns = rr.Transform3D.columns(translation=track.root_mm[where] / 1000.0, quaternion=xyzw)
             self._stream.send_columns(ROOT, _timeline(index[where], elapsed[where]), [*columns])
+            track.rest()
 
     def _log_candidates(self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The bones of every pose that a frame thought possible, each rank in its colour."""

@@ -88,7 +88,8 @@ def log_body(stream: Any, skeleton: Skeleton, girth: float) -> list[int]:
 
 def send_body(stream: Any, track: Track, rows: slice, when: list[Any], carriers: list[int]) -> None:
     """Where the parts are in some frames of a track; without a pose they shrink to nothing."""
-    part, seen = track[rows], track.posed[rows]
+    part = track[rows]
+    seen = part.posed
     pose = Pose(part.root, part.angles_rad, part.scale)[seen]
     frames = pose.frames(track.skeleton)
     for joint in carriers:

@@ -13,6 +13,7 @@ import numpy as np
 from liex_lab.camera import Camera
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
+from liex_lab.memory import give_back
 from liex_lab.recordings.walls import Arena
 from liex_lab.recordings.zones import Zone
 from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
@@ -201,7 +202,7 @@ class Session:
             if path.is_file():
                 with reading_from(path):
                     known = pq.read_schema(path).names
-                other.__dict__[name] = self.table(name, [column for column in columns if column in known])
+                    other.__dict__[name] = _narrow(path, [column for column in columns if column in known])
         return other
 
     def table(self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None) -> pd.DataFrame:
@@ -212,9 +213,36 @@ class Session:
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
-        rows = None if frame_index is None else [("frame_index", "in", frame_index)]
         with reading_from(path):
-            return pd.read_parquet(path, columns=columns, filters=rows)
+            if frame_index is None:
+                return pd.read_parquet(path, columns=columns)
+            return _rows_of(path, columns, frame_index)
+
+
+def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
+    """Some columns of a long table, without much else of it in memory."""
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        read = file.read(columns, use_threads=False)
+    table: pd.DataFrame = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
+    del read
+    give_back()
+    return table
+
+
+def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
+    """The rows of some frames of a long table, of which no more than a group of rows is in memory."""
+    import pandas as pd
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        wanted = None if columns is None else [*dict.fromkeys([*columns, "frame_index"])]
+        groups = (file.read_row_group(k, wanted, use_threads=False).to_pandas() for k in range(file.num_row_groups))
+        found = [group[group["frame_index"].isin(frame_index)] for group in groups]
+    give_back()
+    rows = pd.concat(found, ignore_index=True)
+    return rows if columns is None else rows[columns]
 
 
 def _keep_inside(metadata: dict[str, Any]) -> None:

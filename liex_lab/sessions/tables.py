@@ -7,7 +7,7 @@ make (behaviour) bring their own `Column` entries; a column without an entry is 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.memory import blocks, give_back, let_go
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -227,6 +228,8 @@ def write_table(path: Path, schema: Sequence[Column], blocks: Iterable[Block], m
             batch = _arrow_block(block, schema, arrow)
             n_rows += batch.num_rows
             writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
+            del block, batch  # before the next one is made
+    give_back()
     return n_rows
 
 
@@ -289,8 +292,11 @@ def as_it_was(value: Any) -> Any:
     return value[1:] if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA else value
 
 
-def to_pandas(schema: Sequence[Column], block: Block) -> pd.DataFrame:
-    """A block as a data frame of the schema's dtypes, as reading the table back would give it."""
+def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:
+    """A block as a data frame of the schema's dtypes, as reading the table back would give it.
+
+    copy: False where the block's arrays may go on as the table's columns, wherever they lie.
+    """
     import pandas as pd
 
     n = max((len(v) for v in block.values() if _is_array(v)), default=1)
@@ -303,7 +309,7 @@ def to_pandas(schema: Sequence[Column], block: Block) -> pd.DataFrame:
             value = np.array(value.words, dtype=object)[value.codes]
         elif not _is_array(value):
             value = [value] * n
-        data[column.name] = pd.Series(value, dtype=_pandas_dtype(column), copy=True)
+        data[column.name] = pd.Series(value, dtype=_pandas_dtype(column), copy=copy)
     return pd.DataFrame(data, copy=False)
 
 
@@ -312,9 +318,16 @@ def empty_table(schema: Sequence[Column]) -> pd.DataFrame:
     return to_pandas(schema, {column.name: [] for column in schema})
 
 
-def from_pandas(schema: Sequence[Column], table: pd.DataFrame) -> Block:
-    """A data frame's columns as a block for `write_table`."""
-    return {str(name): table[name].to_numpy() for name in table.columns}
+def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
+    """A data frame's columns as blocks for `write_table`."""
+    for part in blocks(max(len(table), 1), ROWS_PER_GROUP):
+        yield {str(name): table[name].iloc[part].to_numpy() for name in table.columns}
+        let_table_go(table)
+
+
+def let_table_go(table: pd.DataFrame) -> None:
+    """Let go of the memory of a table's columns that lie on disk, until they are looked at again."""
+    let_go(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
 
 
 def _pandas_dtype(column: Column) -> str:

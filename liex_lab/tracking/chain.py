@@ -59,18 +59,20 @@ class Chain:
         return seen.joints(self._joints, room)
 
     def path(
-        self, seen: Observations, told: NDArray[np.int64] | None = None, joints: NDArray[np.float32] | None = None
-    ) -> NDArray[np.int64]:
+        self, seen: Observations, told: NDArray[np.int64] | None = None, joints: NDArray[np.float32] | None = None,
+        room: Room = np.empty,
+    ) -> NDArray[np.int64]:  # fmt: skip
         """(n,) the hypothesis of each frame that lies on the curve, or NONE.
 
-        told (m,): of the first m frames it is known already; joints: those of `joints`, where they are at hand.
+        told (m,): of the first m frames it is known already; joints: those of `joints`, where they are at hand; room:
+        for what takes much of it on the way.
         """
         n, h = seen.score.shape
-        emission = self._emission(seen)
+        emission = self._emission(seen, room)
         if told is not None:
             emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
         idle = np.concatenate([[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))])
-        cost, parent = np.full((n, h), np.inf), np.full((n, h, 2), NONE, np.int64)
+        cost, parent = room((n, h), float), room((n, h, 2), np.int64)
         live = np.zeros((_BEAM, 2), np.int64)
         joints, seconds, n_live = self.joints(seen) if joints is None else joints, seen.seconds, 0
         for rows in blocks(n, _BLOCK):
@@ -78,24 +80,31 @@ class Chain:
                 rows.start, rows.stop, live, n_live, seconds, joints, seen.error_mm, emission, idle,
                 self._levels, self._length, self._tuning.ceiling, cost, parent,
             )  # fmt: skip
-            let_go(joints)
+            let_go(joints, emission, cost, parent)
         path = np.full(n, NONE, np.int64)
         if n_live:
             kernels.trace_back(live[0, 0], live[0, 1], parent, 0, path)
         return path
 
-    def _emission(self, seen: Observations) -> Array:
+    def _emission(self, seen: Observations, room: Room) -> Array:
         """What each hypothesis (n, H) costs by itself."""
-        return np.minimum(seen.score.astype(float) / self._score_mm, self._tuning.score_most)
+        cost = room(seen.score.shape, float)
+        for rows in blocks(len(cost), _BLOCK):
+            cost[rows] = np.minimum(seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most)
+            let_go(cost)
+        return cost
 
-    def doubt(self, seen: Observations, path: NDArray[np.int64], joints: NDArray[np.float32] | None = None) -> Array:
+    def doubt(
+        self, seen: Observations, path: NDArray[np.int64], joints: NDArray[np.float32] | None = None,
+        room: Room = np.empty,
+    ) -> Array:  # fmt: skip
         """(n,) probability that head and tail are exchanged on this path: forward and backward through two states.
 
         What a frame says is the difference between its hypothesis and the same thing turned round; between frames, how
         likely it is that an animal turns round, or does not, in the time between them.
         """
         rows, other = np.arange(len(path)), np.where(path >= 0, path ^ 1, NONE)
-        emission = self._emission(seen)
+        emission = self._emission(seen, room)
         here = np.where(path >= 0, emission[rows, np.maximum(path, 0)], 0.0)
         turned = np.where(path >= 0, emission[rows, np.maximum(other, 0)], 0.0)
         evidence = np.where(np.isfinite(turned), turned, self._tuning.score_most + here) - here
@@ -104,9 +113,12 @@ class Chain:
         if not len(used):
             return doubt
         joints = self.joints(seen) if joints is None else joints
-        one, two = joints[used, path[used]], joints[used, path[used] ^ 1]
-        let_go(joints)
-        two = np.where(np.isfinite(two), two, one[:, ::-1])
+        one, two = (room((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
+        for part in blocks(len(used), _BLOCK):
+            taken = path[used[part]]
+            one[part], other_way = joints[used[part], taken], joints[used[part], taken ^ 1]
+            two[part] = np.where(np.isfinite(other_way), other_way, one[part, ::-1])
+            let_go(joints, one, two)
         error = seen.error_mm[used, path[used]].astype(float)
         at_used = np.empty(len(used))
         kernels.two_ways(seen.seconds[used], one, two, error, evidence[used], self._levels, self._length,

@@ -61,8 +61,8 @@ def track_whole(
     tuning = tuning or Tuning.of(subject.skeleton.name)
     chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
     joints = chain.joints(seen, room)
-    path = chain.path(seen, joints=joints)
-    doubt = chain.doubt(seen, path, joints)
+    path = chain.path(seen, joints=joints, room=room)
+    doubt = chain.doubt(seen, path, joints, room)
     del joints
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.memory import Room, let_go
+from liex_lab.memory import Room, blocks, let_go
 
 Array = NDArray[np.float64]
 
+_BLOCK = 16_384  # frames that are in memory at a time
 CORRECTED = "corrected"  # the flag of a pose of which a person placed joints
 FLAGS = {
     "": "a pose was measured and is trusted",
@@ -100,7 +101,11 @@ class Track:
     @property
     def posed(self) -> NDArray[np.bool_]:
         """(n,) True where there is a pose, measured or bridged."""
-        return np.isfinite(self.joints_mm[:, 0, 0])
+        there = np.empty(self.n_frames, np.bool_)
+        for rows in blocks(self.n_frames, _BLOCK):
+            there[rows] = np.isfinite(self.joints_mm[rows, 0, 0])
+            let_go(self.joints_mm)
+        return there
 
     @property
     def observed(self) -> NDArray[np.bool_]:

@@ -21,6 +21,7 @@ from liex_lab.actions.storage import load_action_model, save_action_model
 from liex_lab.actions.suggestions import doubtful_stretches
 from liex_lab.actions.timeline import Network, TimelineModel
 from liex_lab.errors import LiexError, ModelError
+from liex_lab.memory import on_disk
 from tests.actions.toy import GO, STAY, going_and_staying
 
 
@@ -51,6 +52,13 @@ def test_no_bout_crosses_a_gap_and_every_frame_with_a_pose_has_probabilities(mod
     assert np.isnan(found.probability[330]).all()
     np.testing.assert_allclose(np.nansum(found.probability, axis=1)[:300], 1.0, atol=1e-5)
     assert all(0.0 <= bout.score <= 1.0 for bout in found.ethogram)
+
+
+def test_what_lies_on_disk_on_the_way_is_named_as_in_memory(model: TimelineModel, tmp_path: Path) -> None:
+    one = going_and_staying(14)
+    in_memory, on_the_disk = model.recognise(one.track), model.recognise(one.track, room=on_disk(tmp_path))
+    assert on_the_disk.ethogram == in_memory.ethogram
+    np.testing.assert_array_equal(on_the_disk.probability, in_memory.probability)
 
 
 def test_what_a_frame_rate_cannot_resolve_is_told(model: TimelineModel) -> None:

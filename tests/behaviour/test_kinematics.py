@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,9 +11,11 @@ import pytest
 from liex_lab.behaviour.body import Body
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
+from liex_lab.memory import on_disk
 from liex_lab.recordings.times import find_gaps, median_step
 from liex_lab.sessions import tables
 from liex_lab.sessions.rows import Rows
+from tests.behaviour.swimming_fish import SwimmingFish
 from tests.sessions.walking_mouse import WalkingMouse, steady
 
 
@@ -20,7 +24,7 @@ def tables_of(mouse: WalkingMouse) -> tuple[pd.DataFrame, pd.DataFrame]:
     times = mouse.times_ns
     rows = Rows(mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times)))
     poses = pd.concat([tables.to_pandas(tables.POSES, block) for block in rows.poses()], ignore_index=True)
-    return tables.to_pandas(tables.FRAMES, rows.frames()), poses
+    return rows.frames_table(), poses
 
 
 def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
@@ -36,6 +40,18 @@ def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
 def test_the_speed_does_not_depend_on_the_frame_rate(fps):
     moved = kinematics(*tables_of(WalkingMouse(steady(3.0, fps), speed_mm_s=150.0, radius_mm=300.0)))
     np.testing.assert_allclose(moved["speed_mm_s"], 150.0, rtol=2e-3)
+
+
+@pytest.mark.parametrize("swims", [False, True])
+def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, monkeypatch):
+    fish = SwimmingFish(np.delete(steady(3.0), [30, 31, 60]), beat_hz=4.0, lost=(10, 11, 25))
+    mouse = WalkingMouse(np.delete(steady(3.0), [30, 31, 60]), radius_mm=100.0, rear_s=(1.0, 2.0), lost=(10, 11, 25))
+    told = fish.tables() if swims else tables_of(mouse)
+    in_memory = kinematics(*told, surface_z_mm=90.0)
+    monkeypatch.setattr(import_module("liex_lab.behaviour.kinematics"), "_BLOCK", 16)
+    on_the_disk = kinematics(*told, surface_z_mm=90.0, room=on_disk(tmp_path))
+    tables.let_table_go(on_the_disk)
+    pd.testing.assert_frame_equal(on_the_disk, in_memory, check_exact=True)
 
 
 def test_a_dropped_frame_and_an_uneven_clock_leave_the_speed_as_it_is():
