@@ -22,9 +22,10 @@ from liex_lab.tracking.tuning import Tuning
 Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
-# nearer to the curve than so many predicted errors, a hypothesis that was passed by is a measurement after all, unless
-# it shows less than this share of what the animal usually shows: of half an animal beside a bar the pose is wrong
-_ADMIT, _WHOLE = 2.0, 0.6
+# nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was passed by is a
+# measurement after all, unless it shows less than this share of what the animal usually shows, for of half an animal
+# beside a bar the pose is wrong, or more than that many times as much
+_ADMIT, _WHOLE, _MOST = 1.5, 0.6, 1.5
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -34,7 +35,8 @@ class Subject:
 
     length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long a
     stretch without a measurement is bridged, and half as far into a longer one from both its ends; joint_share (J,):
-    each joint's error over the mean.
+    each joint's error over the mean. stretch_sd: by which share all distances from the base may be off throughout, for
+    an animal whose ends a sensor eats is taken for a smaller one; None where nothing is known of it.
     """
 
     skeleton: Skeleton
@@ -44,6 +46,7 @@ class Subject:
     doubtful_mm: float
     bridge_s: float
     joint_share: tuple[float, ...]
+    stretch_sd: float | None = None
 
 
 def track_whole(
@@ -79,9 +82,9 @@ def track_whole(
         return curve
 
     shown = seen.along(seen.n_px, path)
-    least_px = _WHOLE * np.median(shown[path >= 0]) if (path >= 0).any() else 0.0
+    usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
     for rows in blocks(len(seen), _BLOCK):
-        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), least_px)
+        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), usual_px)
         _rest(track, seen)
     taken = admitted >= 0
     path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
@@ -133,19 +136,21 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
 
 
 def _admitted(
-    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, least_px: float
+    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, usual_px: float
 ) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the hypothesis of at least so many pixels that lies on the curve all the
-    same; NONE elsewhere.
+    """(n,) of frames that were passed by, the hypothesis of about as many pixels as usual that lies on the curve for
+    all that, as far as one knows in a gap where the curve is; NONE elsewhere.
     """
     found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
     for h in range(seen.score.shape[1]):
-        whole = seen.known[:, h] & (seen.n_px[:, h] >= least_px)
+        shown = seen.n_px[:, h]
+        whole = seen.known[:, h] & (shown >= _WHOLE * usual_px) & (shown <= _MOST * usual_px)
         rows = np.flatnonzero((path == NONE) & whole & np.isfinite(curve.error_mm))
         if not len(rows):
             continue
         joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
-        off = np.linalg.norm(joints - curve.joints[rows], axis=-1).mean(axis=1) / seen.error_mm[rows, h]
+        off = np.linalg.norm(joints - curve.joints[rows], axis=-1).mean(axis=1)
+        off /= np.hypot(seen.error_mm[rows, h], curve.error_mm[rows])
         better = off < best[rows]
         found[rows[better]], best[rows[better]] = h, off[better]
     return found
@@ -171,10 +176,13 @@ def to_track(
 def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None:
     """A curve into the rows (n) of a track, whether anything was measured there or not."""
     pose, motion = curve.pose, tuning.motion
-    track.joints_mm[:], track.predicted_error_mm[:] = curve.joints, curve.error_mm
+    track.joints_mm[:] = curve.joints
     track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
     track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
-    track.sd_mm[:] = (curve.error_mm / _ERROR_PER_SD)[:, None] * np.array(subject.joint_share)
+    stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
+    away = stretch_of(stretch, curve.joints)
+    track.sd_mm[:] = np.hypot((curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away)
+    track.predicted_error_mm[:] = np.hypot(curve.error_mm, ERROR_PER_SD * away.mean(axis=1))
     honest = np.array(motion.honest_root)
     track.cov_root[:] = covariance_of_root(curve) * (honest[:, None] * honest)
     track.sd_angles_rad[:] = (curve.sd_bend * motion.honest_bend)[:, None] * subject.skeleton.axes
@@ -215,8 +223,15 @@ def covariance_of_root(curve: Curve) -> Array:
     return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
 
+def stretch_of(stretch_sd: float, joints: Array) -> Array:
+    """Standard deviations (n, J) mm along one axis of joints (n, J, 3) mm whose distances from the base are all off by
+    about this share.
+    """
+    return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
+
+
 # a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
-_ERROR_PER_SD = 1.4
+ERROR_PER_SD = 1.4
 
 
 def _add_sight(track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]) -> None:
