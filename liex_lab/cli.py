@@ -183,7 +183,7 @@ def train(
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
 
     `liex train actions` makes the model that names actions: from sessions that people labelled, or, without any, from
-    virtual animals that act. `liex train tracking` measures how far off an animal's tracks may be: the file tunings.toml.
+    virtual animals that act. `liex train tracking` measures how far off an animal's tracks may be (tunings.toml).
     """
     if animal == "actions":
         from liex_lab.pipelines.actions import train_actions
