@@ -23,9 +23,10 @@ Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
 # nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was passed by is a
-# measurement after all, unless it shows less than this share of what the animal usually shows, for of half an animal
-# beside a bar the pose is wrong, or more than that many times as much
-_ADMIT, _WHOLE, _MOST = 1.5, 0.6, 1.5
+# measurement after all, unless it shows less than this share of what the animal usually shows, or more than that many
+# times as much; of half an animal beside a bar the pose errs by this share of the length that is not seen. Each time
+# that some are taken, the curve comes nearer to others.
+_ADMIT, _LEAST, _MOST, _UNSEEN, _TIMES = 1.0, 0.5, 1.5, 0.4, 2
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -67,10 +68,9 @@ def track_whole(
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
     track = Track.empty(subject.skeleton, seen.times_ns, room=room)
-    used, admitted = np.zeros(len(seen), np.bool_), np.full(len(seen), NONE)
-    seconds = seen.seconds
+    used, seconds = np.zeros(len(seen), np.bool_), seen.seconds
 
-    def draw(rows: slice) -> Curve:
+    def draw(rows: slice) -> None:
         first, last = max(0, rows.start - MARGIN), min(len(seen), rows.stop + MARGIN)
         around = slice(first, last)
         pose = seen[around].pose(path[around])
@@ -79,18 +79,20 @@ def track_whole(
         curve = curve[rows.start - first : rows.stop - first]
         _write(subject, track[rows], curve, tuning)
         used[rows] = curve.used
-        return curve
 
     shown = seen.along(seen.n_px, path)
     usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
     for rows in blocks(len(seen), _BLOCK):
-        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), usual_px)
+        draw(rows)
         _rest(track, seen)
-    taken = admitted >= 0
-    path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
-    for rows in blocks(len(seen), _BLOCK):
-        if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
-            draw(rows)
+    for _ in range(_TIMES):
+        taken = path == NONE
+        for rows in blocks(len(seen), _BLOCK):
+            _admit(subject, seen[rows], path[rows], error[rows], track[rows], usual_px)
+        taken &= path != NONE
+        for rows in blocks(len(seen), _BLOCK):
+            if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
+                draw(rows)
             _rest(track, seen)
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
@@ -135,25 +137,27 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
         pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
 
 
-def _admitted(
-    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, usual_px: float
-) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the hypothesis of about as many pixels as usual that lies on the curve for
-    all that, as far as one knows in a gap where the curve is; NONE elsewhere.
+def _admit(
+    subject: Subject, seen: Observations, path: NDArray[np.int64], error: Array, track: Track, usual_px: float
+) -> None:  # fmt: skip
+    """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames that were passed by.
+
+    It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an animal how it lies.
     """
-    found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
+    best = np.full(len(seen), _ADMIT)
+    passed = (path == NONE) & np.isfinite(track.predicted_error_mm)
     for h in range(seen.score.shape[1]):
-        shown = seen.n_px[:, h]
-        whole = seen.known[:, h] & (shown >= _WHOLE * usual_px) & (shown <= _MOST * usual_px)
-        rows = np.flatnonzero((path == NONE) & whole & np.isfinite(curve.error_mm))
+        shown = seen.n_px[:, h] / max(usual_px, 1.0)
+        rows = np.flatnonzero(passed & seen.known[:, h] & (shown >= _LEAST) & (shown <= _MOST))
         if not len(rows):
             continue
-        joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
-        off = np.linalg.norm(joints - curve.joints[rows], axis=-1).mean(axis=1)
-        off /= np.hypot(seen.error_mm[rows, h], curve.error_mm[rows])
+        joints = joints_of(subject.skeleton, seen.pose(np.full(len(seen), h))[rows])
+        unseen = _UNSEEN * subject.length_mm * np.maximum(1.0 - shown[rows], 0.0)
+        said = np.hypot(seen.error_mm[rows, h], unseen)
+        off = np.linalg.norm(joints - track.joints_mm[rows], axis=-1).mean(axis=1)
+        off /= np.hypot(said, track.predicted_error_mm[rows])
         better = off < best[rows]
-        found[rows[better]], best[rows[better]] = h, off[better]
-    return found
+        path[rows[better]], best[rows[better]], error[rows[better]] = h, off[better], said[better]
 
 
 def to_track(
