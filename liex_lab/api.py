@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError
 from liex_lab.plan import Plan
-from liex_lab.progress import Board, Progress, progress_board, silent
+from liex_lab.progress import Board, Progress, progress_board, silent, telling_of_compiling
 from liex_lab.study import Study
 
 if TYPE_CHECKING:
@@ -52,10 +52,11 @@ def run_session(
     plan = plan or Plan.load("mouse")
     if workers > 1 and crew is None:
         crew = Processes(workers)
-    return measure_session(
-        recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
-        report=write_views, crew=crew, progress=progress,
-    )  # fmt: skip
+    with telling_of_compiling(progress) as progress:
+        return measure_session(
+            recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
+            report=write_views, crew=crew, progress=progress,
+        )  # fmt: skip
 
 
 def correct_session(

@@ -183,7 +183,7 @@ def train(
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
 
     `liex train actions` makes the model that names actions: from sessions that people labelled, or, without any, from
-    virtual animals that act. `liex train tracking` finds what the tracker believes of an animal.
+    virtual animals that act. `liex train tracking` measures how far off an animal's tracks may be (tunings.toml).
     """
     if animal == "actions":
         from liex_lab.pipelines.actions import train_actions
@@ -201,8 +201,8 @@ def train(
         from liex_lab.pipelines.tracking_fit import train_tracking
 
         with progress_bar() as progress:
-            table = train_tracking(of, out or Path(f"{of}-tracking.toml"), progress=progress)
-        typer.echo(f"table for tunings.toml: {table}")
+            table = train_tracking(of, out or Path("tunings.toml"), workers=workers, progress=progress)
+        typer.echo(f"tunings: {table}")
         return
     from liex_lab.pipelines.train import train_model
 

@@ -48,6 +48,40 @@ def progress_bar() -> Iterator[Progress]:
         yield report
 
 
+COMPILING = "compiling, once on this machine: a minute or two"
+
+
+@contextmanager
+def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
+    """The same progress, which within the block also hears of kernels being compiled, and then again what it heard
+    last.
+    """
+    from numba.core import event
+
+    last: tuple[int, int | None, str] = (0, None, "beginning")
+    under_way = 0
+
+    def tell(done: int, total: int | None, what: str) -> None:
+        nonlocal last
+        last = (done, total, what)
+        progress(done, total, what)
+
+    class Compiles(event.Listener):
+        def on_start(self, event: object) -> None:
+            nonlocal under_way
+            under_way += 1
+            progress(0, None, COMPILING)
+
+        def on_end(self, event: object) -> None:
+            nonlocal under_way
+            under_way -= 1
+            if not under_way:
+                progress(*last)
+
+    with event.install_listener("numba:compile", Compiles()):
+        yield tell
+
+
 class Board:
     """How far many jobs are that run at once: a bar for each that runs, one for all, and a line for each that ended."""
 

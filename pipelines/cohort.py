@@ -1,7 +1,8 @@
 """The job `liex cohort`: every session of a study on the workers of a Dask cluster. Dask is imported here alone.
 
 A session is one task. It may run twice (a worker dies, and another takes over): it leaves its results on disk, goes on
-where it was, and done twice it does the same.
+where it was, and done twice it does the same. Sessions are done side by side, each by one worker; where fewer are left
+than there are workers, these share the stretches of each.
 """
 
 from __future__ import annotations
@@ -56,18 +57,26 @@ def measure_cohort(
         return []
     with _client(len(planned), workers, threads, scheduler, slurm) as client:
         client.subscribe_topic(TOPIC, lambda event: told(*event[1]))
-        return list(_results(client, planned, run, finished))
+        count = slurm.jobs if slurm else len(client.nthreads())
+        return list(_results(client, planned, run, finished, n_shared(len(planned), count)))
+
+
+def n_shared(n: int, n_workers: int) -> int:
+    """How many of n sessions, the last ones, are cut into stretches for all workers to look at: as many as would leave
+    workers idle if each were measured by one. Cutting costs: what each worker wrote is copied into one.
+    """
+    return n % max(n_workers, 1)
 
 
 def _results(
-    client: Client, planned: dict[str, PlannedSession], run: RunSession, finished: Finished
+    client: Client, planned: dict[str, PlannedSession], run: RunSession, finished: Finished, shared: int
 ) -> Iterator[dict[str, Any]]:
     from distributed import as_completed
 
     run_id = f"{os.getpid()}-{time.monotonic_ns()}"
     submitted = [
-        client.submit(_on_worker, session, run, run_id, key=f"{id}-{run_id}", pure=False)
-        for id, session in planned.items()
+        client.submit(_on_worker, session, run, run_id, k >= len(planned) - shared, key=f"{id}-{run_id}", pure=False)
+        for k, (id, session) in enumerate(planned.items())
     ]
     sessions = {future.key: session for future, session in zip(submitted, planned.values(), strict=True)}
     completed = as_completed(submitted, loop=client.loop)
@@ -93,8 +102,8 @@ def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
     return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
 
 
-def _on_worker(session: PlannedSession, run: RunSession, run_id: str) -> dict[str, Any]:
-    """The task: one session, its progress sent to whoever started the study."""
+def _on_worker(session: PlannedSession, run: RunSession, run_id: str, shared: bool) -> dict[str, Any]:
+    """The task: one session, its progress sent to whoever started the study. shared: by all workers."""
     from distributed import get_worker
 
     worker, last = get_worker(), 0.0
@@ -106,7 +115,7 @@ def _on_worker(session: PlannedSession, run: RunSession, run_id: str) -> dict[st
             last = now
             worker.log_event(TOPIC, [session.id, done, total, what])
 
-    return measure_one(session, run, tell, run_id, Workers())
+    return measure_one(session, run, tell, run_id, Workers() if shared else None)
 
 
 class Workers:

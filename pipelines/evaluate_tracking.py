@@ -29,14 +29,16 @@ Array = NDArray[np.float64]
 ROWS = ("single", "algorithm3", "online", "smoothed")
 ONLINE_LAG = 5  # frames
 _CHUNK = 32
+_TIMED, _AGAIN = 3, 3  # chunks that the tracker is timed on, and how often
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A sequence and what each row made of it: joints (n, J, 3) mm in the true arena frame."""
+    """A sequence and what each row made of it: joints (n, J, 3) mm in the true arena frame; speed: see `_speed`."""
 
     sequence: TestSequence
     rows: dict[str, Followed]
+    speed: dict[str, float]
 
 
 def evaluate_tracking(
@@ -71,7 +73,7 @@ def evaluate_tracking(
              for name in measured[0].rows if name in rows}  # fmt: skip
     result = {
         "animal": animal, "sequence": sequence, "n_frames": sum(len(m.sequence) for m in measured), "rows": table,
-        "online_lag_frames": ONLINE_LAG, "protocol": TRACKING_PROTOCOL,
+        "speed": measured[0].speed, "online_lag_frames": ONLINE_LAG, "protocol": TRACKING_PROTOCOL,
     }  # fmt: skip
     if draw is not None:
         draw(measured[0].sequence, measured[0].rows)
@@ -126,7 +128,28 @@ def follow_sequence(
         joints, sd = _algorithm3(tracker, recording, plan.seed)
         found["algorithm3"] = Followed(recording.T_arena_camera @ joints, recording.joints_arena, sd,
                                        n / (time.perf_counter() - began), tip)  # fmt: skip
-    return Measured(recording, {name: found[name] for name in ROWS if name in found})
+    progress(0, n, "timing the tracker")
+    return Measured(recording, {name: found[name] for name in ROWS if name in found}, _speed(tracker, recording))
+
+
+def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
+    """Frames/s of the default tracker, from pictures in memory to the smoothed track, on one core and on all of them:
+    the best of some tries in turn over the sequence's first frames.
+    """
+    import numba
+
+    from liex_lab.threads import threads
+    from liex_lab.tracking.observations import Observations
+
+    chunks = [frames for frames, _ in zip(recording.chunks(_CHUNK), range(_TIMED), strict=False)]
+    best = {"frames_per_s_1core": 0.0, "frames_per_s_all_cores": 0.0}
+    for _ in range(_AGAIN):
+        for name, parallel in zip(best, (False, True), strict=True):
+            began = time.perf_counter()
+            with threads(parallel):
+                tracker.track(Observations.join([tracker.observe(frames) for frames in chunks]))
+            best[name] = max(best[name], sum(map(len, chunks)) / (time.perf_counter() - began))
+    return {**best, "cores": float(numba.get_num_threads())}
 
 
 def _online(tracker: FrameTracker, seen: Observations) -> Track:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import heapq
 import json
+import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from liex_lab.study import Study
 RunSession = Callable[..., Path]
 _VIRTUAL = "synthetic:walk?seed={seed}&frames=150&sensor=primesense"
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
+_CREWS = {"1": (1, 1), "2": (2, 2), "1, free": (1, 2)}  # name -> processes, and the cores of all of them
 _N_SIMULATED = 2000  # sessions
 _FPS = 30
 ASSUMPTIONS = (
@@ -32,6 +36,18 @@ ASSUMPTIONS = (
     "take the measured times, drawn with replacement and stretched to an hour of recording; they are handed out one by "
     "one, and the scheduler spends its measured time on each, one after the other; starting workers is not counted"
 )
+
+DEFINITIONS = {
+    "times_decode_and_write": "all of `liex run` but Python's start and the loading of what it needs, over opening the "
+    "recording, decoding every frame and writing depth into both logs",
+    "times_decode_and_write_without_opening": "the same over decoding and writing alone",
+    "times_decode_and_write_once_begun": "from the first frame that is looked at to the finished session, over "
+    "decoding and writing alone",
+    "looking": "frames that processes with one thread for kernels read, look at and write, once each has done its "
+    "first stretch; two on two cores, one on one; free: one that may use both, as its logs are packed beside it",
+    "two_workers_over_one": "sessions an hour of a study, the workers' start included; two workers on two cores over "
+    "one on one; free: over one that may use both, which reads ahead and packs its logs beside its work",
+}
 
 
 def evaluate_scale(
@@ -59,9 +75,9 @@ def evaluate_scale(
     hour = [seconds * 3600 * _FPS / n_frames for seconds in workers["seconds_each"]]
     simulated = simulate(hour, workers["scheduler_s_per_session"])
     return {
-        **stages, **looking, "sessions_per_hour": workers["sessions_per_hour"], "two_workers_over_one": workers["gain"],
+        **stages, **looking, **workers["study"],
         "memory_mb_by_length": memory, "simulated_sessions_per_hour": simulated, "assumptions": ASSUMPTIONS,
-        "n_frames": n_frames,
+        "definitions": DEFINITIONS, "n_frames": n_frames,
     }  # fmt: skip
 
 
@@ -97,6 +113,7 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
             if name not in ("opening", "bound", "prepare")
         },
         "times_decode_and_write": whole / (bound["opening"] + bound["bound"]),
+        "times_decode_and_write_without_opening": whole / bound["bound"],
         "times_decode_and_write_once_begun": spent["total"] / bound["bound"],
         "peak_memory_mb": session.metadata["peak_memory_mb"],
     }  # fmt: skip
@@ -117,20 +134,35 @@ class _Timed:
 
 
 def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
-    """Frames a second that are read, looked at and written by one process and by two, of one core each, once each
-    process has done its first stretch: they take some seconds to begin.
+    """Frames a second that are read, looked at and written by one process and by two, once each process has done its
+    first stretch: they take some seconds to begin.
     """
     plan, found = Plan.load("mouse"), {}
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
         whole = Stretch(str(recording), plan, tracker, build_provenance(opened, plan, tracker), folder, 0, len(opened))
-    for count in (1, 2):
+    for name, (count, n_cores) in _CREWS.items():
         crew = _Timed(Processes(count, threads=1))
-        look_side_by_side(crew, whole, folder / f"stretches-{count}.liex", silent)
+        with _on_cores(n_cores):
+            look_side_by_side(crew, whole, folder / f"stretches {name}.liex", silent)
         (begun, _), later = crew.came[count - 1], crew.came[count:]
-        found[count] = sum(n for _, n in later) / (later[-1][0] - begun)
-    return {"looking_frames_per_s": {str(count): rate for count, rate in found.items()},
-            "looking_two_processes_over_one": found[2] / found[1]}  # fmt: skip
+        found[name] = sum(n for _, n in later) / (later[-1][0] - begun)
+    return {"looking_frames_per_s": found, "looking_two_processes_over_one": found["2"] / found["1"],
+            "looking_two_processes_over_one_free": found["2"] / found["1, free"]}  # fmt: skip
+
+
+@contextmanager
+def _on_cores(n: int) -> Iterator[None]:
+    """Processes that are started in the block are kept on so many cores, where the system can do that."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[:n])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) -> dict[str, float]:
@@ -166,7 +198,7 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
 
 
 def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str, Any]:
-    """The same sessions on one worker and on two, each with one core, by the wall clock."""
+    """The same sessions on one worker and on two, by the wall clock."""
     from liex_lab.pipelines.cohort import measure_cohort
     from liex_lab.pipelines.study_state import standings
 
@@ -175,20 +207,25 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
         "sessions": [{"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
                      for path in recordings for k in range(2)],
     }  # fmt: skip
-    wall: dict[int, float] = {}
-    each: list[float] = []
-    for workers in (1, 2):
-        study = Study.from_table({**table, "results": f"derivatives/w{workers}"}, folder / "study.toml")
+    wall: dict[str, float] = {}
+    each: dict[str, list[float]] = {}
+    for k, (name, (count, n_cores)) in enumerate(_CREWS.items()):
+        study = Study.from_table({**table, "results": f"derivatives/w{k}"}, folder / "study.toml")
         began = time.perf_counter()
-        results = measure_cohort(standings(study), run, workers=workers, threads=1)
-        wall[workers] = time.perf_counter() - began
-        each = [result["seconds"] for result in results] if workers == 1 else each
+        with _on_cores(n_cores):
+            results = measure_cohort(standings(study), run, workers=count, threads=1)
+        wall[name] = time.perf_counter() - began
+        each[name] = [result["seconds"] for result in results]
+        shutil.rmtree(folder / "derivatives" / f"w{k}")
     n = len(table["sessions"])
-    return {
-        "sessions_per_hour": {str(workers): 3600 * n / seconds for workers, seconds in wall.items()},
-        "gain": wall[1] / wall[2], "seconds_each": each,
-        "scheduler_s_per_session": max(wall[1] - sum(each), 0.0) / n,
+    study_told = {
+        "sessions_per_hour": {name: 3600 * n / seconds for name, seconds in wall.items()},
+        "two_workers_over_one": wall["1"] / wall["2"], "two_workers_over_one_free": wall["1, free"] / wall["2"],
     }  # fmt: skip
+    return {
+        "study": study_told, "seconds_each": each["1"],
+        "scheduler_s_per_session": max(wall["1"] - sum(each["1"]), 0.0) / n,
+    }
 
 
 def simulate(

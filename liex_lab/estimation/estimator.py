@@ -321,14 +321,17 @@ class PoseEstimator:
         uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
             estimates = uncorrected.estimate(sample, scene, guess)
-            scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
-            seen = np.flatnonzero(estimates.found)
-            if not len(seen):
+            if not estimates.found.any():
                 raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
-            n_trusted = len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
-            trusted = seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]
-            guess = float(np.median(scale[trusted]))
+            guess = float(np.median(self.sizes_told(estimates)))
         return guess
+
+    def sizes_told(self, estimates: Estimates) -> Array:
+        """What frames tell of the animal's size over the home size, those of them that the model trusts most."""
+        scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
+        seen = np.flatnonzero(estimates.found)
+        n_trusted = len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+        return np.asarray(scale[seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]])
 
     def size_from_area(self, area_mm2: float) -> float:
         """A first guess of the size from the animal's usual area."""

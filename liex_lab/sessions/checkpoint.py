@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -26,6 +25,7 @@ from liex_lab.sessions.lock import take_lock
 
 EVERY_S = 3.0  # between two checkpoints: as much work is lost at most, besides what it takes to begin
 _STATE, _LOCK, _SEEN, _INPUT, STRETCHES = "checkpoint.json", "lock", "seen", "input.json", "stretches"
+_MOST_S = 1e10  # of work: three hundred years; whole numbers beyond what a float holds are no seconds either
 _MOST = 1 << 20  # values of one column that a frame may have
 OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES)  # what is no part of the finished session
 
@@ -290,7 +290,7 @@ def _read_state(path: Path) -> State | None:
         state = State(**json.loads(path.read_text(encoding="utf-8")))
         sizes = [size for log in state.logs.values() for size in log]
         counts = [state.n_frames, state.runs, state.stretches, *sizes]
-        sound = isinstance(state.key, str) and 0.0 <= state.seconds < math.inf
+        sound = isinstance(state.key, str) and 0.0 <= state.seconds < _MOST_S
         sound = sound and all(isinstance(n, int) and n >= 0 for n in counts)
         sound = sound and all(log in LOGS and len(parts) == state.runs for log, parts in state.logs.items())
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):

@@ -33,7 +33,7 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     """Write observations.npz: every frame's hypotheses, and whom they are of; no pickle."""
     facts = {
         "skeleton": subject.skeleton.table, "length_mm": subject.length_mm, "doubtful_mm": subject.doubtful_mm,
-        "bridge_s": subject.bridge_s, "joint_share": list(subject.joint_share),
+        "bridge_s": subject.bridge_s, "joint_share": list(subject.joint_share), "stretch_sd": subject.stretch_sd,
     }  # fmt: skip
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
@@ -70,9 +70,11 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
         skeleton = Skeleton.from_table(facts["skeleton"], str(path))
         seen = Observations(skeleton, *(kept[name] for name in COLUMNS))
         _check_shapes(seen, len(session.frames))
+        stretch = facts.get("stretch_sd")  # sessions of earlier versions do not tell
         subject = Subject(
             skeleton, session.camera, session.T_arena_camera, float(facts["length_mm"]), float(facts["doubtful_mm"]),
             float(facts["bridge_s"]), tuple(float(share) for share in facts["joint_share"]),
+            None if stretch is None else float(stretch),
         )  # fmt: skip
     return seen, subject
 

@@ -22,9 +22,11 @@ from liex_lab.tracking.tuning import Tuning
 Array = NDArray[np.float64]
 
 _BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
-# nearer to the curve than so many predicted errors, a hypothesis that was passed by is a measurement after all, unless
-# it shows less than this share of what the animal usually shows: of half an animal beside a bar the pose is wrong
-_ADMIT, _WHOLE = 2.0, 0.6
+# nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was passed by is a
+# measurement after all, unless it shows less than this share of what the animal usually shows, or more than that many
+# times as much; of half an animal beside a bar the pose errs by this share of the length that is not seen. Each time
+# that some are taken, the curve comes nearer to others.
+_ADMIT, _LEAST, _MOST, _UNSEEN, _TIMES = 1.0, 0.5, 1.5, 0.4, 2
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -34,7 +36,8 @@ class Subject:
 
     length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long a
     stretch without a measurement is bridged, and half as far into a longer one from both its ends; joint_share (J,):
-    each joint's error over the mean.
+    each joint's error over the mean. stretch_sd: by which share all distances from the base may be off throughout, for
+    an animal whose ends a sensor eats is taken for a smaller one; None where nothing is known of it.
     """
 
     skeleton: Skeleton
@@ -44,6 +47,7 @@ class Subject:
     doubtful_mm: float
     bridge_s: float
     joint_share: tuple[float, ...]
+    stretch_sd: float | None = None
 
 
 def track_whole(
@@ -64,10 +68,9 @@ def track_whole(
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
     track = Track.empty(subject.skeleton, seen.times_ns, room=room)
-    used, admitted = np.zeros(len(seen), np.bool_), np.full(len(seen), NONE)
-    seconds = seen.seconds
+    used, seconds = np.zeros(len(seen), np.bool_), seen.seconds
 
-    def draw(rows: slice) -> Curve:
+    def draw(rows: slice) -> None:
         first, last = max(0, rows.start - MARGIN), min(len(seen), rows.stop + MARGIN)
         around = slice(first, last)
         pose = seen[around].pose(path[around])
@@ -76,18 +79,20 @@ def track_whole(
         curve = curve[rows.start - first : rows.stop - first]
         _write(subject, track[rows], curve, tuning)
         used[rows] = curve.used
-        return curve
 
     shown = seen.along(seen.n_px, path)
-    least_px = _WHOLE * np.median(shown[path >= 0]) if (path >= 0).any() else 0.0
+    usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
     for rows in blocks(len(seen), _BLOCK):
-        admitted[rows] = _admitted(subject.skeleton, seen[rows], path[rows], draw(rows), least_px)
+        draw(rows)
         _rest(track, seen)
-    taken = admitted >= 0
-    path, error = np.where(taken, admitted, path), np.where(taken, seen.along(seen.error_mm, admitted), error)
-    for rows in blocks(len(seen), _BLOCK):
-        if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
-            draw(rows)
+    for _ in range(_TIMES):
+        taken = path == NONE
+        for rows in blocks(len(seen), _BLOCK):
+            _admit(subject, seen[rows], path[rows], error[rows], track[rows], usual_px)
+        taken &= path != NONE
+        for rows in blocks(len(seen), _BLOCK):
+            if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
+                draw(rows)
             _rest(track, seen)
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
@@ -132,23 +137,27 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
         pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
 
 
-def _admitted(
-    skeleton: Skeleton, seen: Observations, path: NDArray[np.int64], curve: Curve, least_px: float
-) -> NDArray[np.int64]:
-    """(n,) of frames that were passed by, the hypothesis of at least so many pixels that lies on the curve all the
-    same; NONE elsewhere.
+def _admit(
+    subject: Subject, seen: Observations, path: NDArray[np.int64], error: Array, track: Track, usual_px: float
+) -> None:  # fmt: skip
+    """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames that were passed by.
+
+    It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an animal how it lies.
     """
-    found, best = np.full(len(seen), NONE, np.int64), np.full(len(seen), _ADMIT)
+    best = np.full(len(seen), _ADMIT)
+    passed = (path == NONE) & np.isfinite(track.predicted_error_mm)
     for h in range(seen.score.shape[1]):
-        whole = seen.known[:, h] & (seen.n_px[:, h] >= least_px)
-        rows = np.flatnonzero((path == NONE) & whole & np.isfinite(curve.error_mm))
+        shown = seen.n_px[:, h] / max(usual_px, 1.0)
+        rows = np.flatnonzero(passed & seen.known[:, h] & (shown >= _LEAST) & (shown <= _MOST))
         if not len(rows):
             continue
-        joints = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
-        off = np.linalg.norm(joints - curve.joints[rows], axis=-1).mean(axis=1) / seen.error_mm[rows, h]
+        joints = joints_of(subject.skeleton, seen.pose(np.full(len(seen), h))[rows])
+        unseen = _UNSEEN * subject.length_mm * np.maximum(1.0 - shown[rows], 0.0)
+        said = np.hypot(seen.error_mm[rows, h], unseen)
+        off = np.linalg.norm(joints - track.joints_mm[rows], axis=-1).mean(axis=1)
+        off /= np.hypot(said, track.predicted_error_mm[rows])
         better = off < best[rows]
-        found[rows[better]], best[rows[better]] = h, off[better]
-    return found
+        path[rows[better]], best[rows[better]], error[rows[better]] = h, off[better], said[better]
 
 
 def to_track(
@@ -171,10 +180,13 @@ def to_track(
 def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None:
     """A curve into the rows (n) of a track, whether anything was measured there or not."""
     pose, motion = curve.pose, tuning.motion
-    track.joints_mm[:], track.predicted_error_mm[:] = curve.joints, curve.error_mm
+    track.joints_mm[:] = curve.joints
     track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
     track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
-    track.sd_mm[:] = (curve.error_mm / _ERROR_PER_SD)[:, None] * np.array(subject.joint_share)
+    stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
+    away = stretch_of(stretch, curve.joints)
+    track.sd_mm[:] = np.hypot((curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away)
+    track.predicted_error_mm[:] = np.hypot(curve.error_mm, ERROR_PER_SD * away.mean(axis=1))
     honest = np.array(motion.honest_root)
     track.cov_root[:] = covariance_of_root(curve) * (honest[:, None] * honest)
     track.sd_angles_rad[:] = (curve.sd_bend * motion.honest_bend)[:, None] * subject.skeleton.axes
@@ -215,8 +227,15 @@ def covariance_of_root(curve: Curve) -> Array:
     return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
 
+def stretch_of(stretch_sd: float, joints: Array) -> Array:
+    """Standard deviations (n, J) mm along one axis of joints (n, J, 3) mm whose distances from the base are all off by
+    about this share.
+    """
+    return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
+
+
 # a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
-_ERROR_PER_SD = 1.4
+ERROR_PER_SD = 1.4
 
 
 def _add_sight(track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]) -> None:

@@ -38,7 +38,10 @@ class Motion:
     about theirs; size: of the logarithm of the bones' scale. freedom of the t distribution of errors; reject: off by
     more than this many predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
     have in common and no smoother takes away; honest: what is left of an error over what the filter says is left, at
-    some of the latter over the animal's length (pairs, in rising order; between them by the logarithm). honest_root,
+    some of the latter over the animal's length (pairs, in rising order; between them by the logarithm), beside what a
+    wrong size does: stretch is what the share by which distances from the base may be off (see `Subject`) grows with,
+    how far the body lies from the depth seen, over its length, and the standard deviation of the logarithm of the size
+    that frames tell; usual_stretch: that share of a session of which neither is known. honest_root,
     honest_bend: the same of the base's rotation and place about and along its own axes, and of the other joints' angles
     about theirs, over what that leaves.
     """
@@ -53,6 +56,8 @@ class Motion:
     reject: float
     lasting: float
     honest: tuple[tuple[float, float], ...]
+    stretch: tuple[float, float] = (0.0, 0.0)
+    usual_stretch: float = 0.0
     honest_root: tuple[float, float, float, float, float, float] = (1.0,) * 6
     honest_bend: tuple[float, float, float] = (1.0,) * 3
 

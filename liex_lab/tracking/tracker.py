@@ -20,6 +20,7 @@ from liex_lab.tracking.curve import Subject, single_frames, track_whole
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.tuning import Tuning
 
 BRIDGE_S = 0.5
 
@@ -30,7 +31,8 @@ class FrameTracker:
 
     size: the animal's spine over the skeleton's home length, a fact of the session. size_origin says where the size
     comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long
-    a stretch without a measurement is bridged.
+    a stretch without a measurement is bridged. blur: how far the body lies from the depth seen, over its length, and
+    size_spread: standard deviation of the logarithm of the size that frames tell; both of the sampled frames.
     """
 
     estimator: PoseEstimator
@@ -40,6 +42,8 @@ class FrameTracker:
     body: BodyResidual
     doubtful_mm: float
     bridge_s: float = BRIDGE_S
+    blur: float = 0.0
+    size_spread: float = 0.0
 
     @staticmethod
     def prepare(
@@ -64,7 +68,12 @@ class FrameTracker:
         camera_view = estimator.model.method.camera_view
         body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view)
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
-        return FrameTracker(estimator, scene, size, "plan" if spine_mm else "recording", body, limit, bridge_s)
+        off = body.of(pose[used], crops[used], scene)
+        off = off[np.isfinite(off)]
+        blur = float(np.median(off)) / (home * size) if len(off) else 0.0
+        spread = float(np.log(estimator.sizes_told(estimates)).std())
+        origin = "plan" if spine_mm else "recording"
+        return FrameTracker(estimator, scene, size, origin, body, limit, bridge_s, blur, spread)
 
     @property
     def spine_mm(self) -> float:
@@ -77,7 +86,13 @@ class FrameTracker:
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
         return Subject(skeleton, self.scene.camera, self.scene.floor.T_arena_camera, self.spine_mm, self.doubtful_mm,
-                       self.bridge_s, share)  # fmt: skip
+                       self.bridge_s, share, self.stretch_sd)  # fmt: skip
+
+    @property
+    def stretch_sd(self) -> float:
+        """See `Subject`."""
+        per_blur, per_spread = Tuning.of(self.estimator.skeleton.name).motion.stretch
+        return float(np.hypot(per_blur * self.blur, per_spread * self.size_spread))
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
         """What consecutive frames say, each by itself."""

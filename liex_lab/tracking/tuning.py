@@ -40,7 +40,7 @@ class Tuning:
         for group in ("turn", "bend"):
             motion[group] = tuple(Wandering(*row) for row in motion[group])
         motion["size"] = Wandering(*motion["size"])
-        for name in ("place_error", "place_drive", "honest_root", "honest_bend"):
+        for name in ("place_error", "place_drive", "stretch", "honest_root", "honest_bend"):
             motion[name] = tuple(motion[name])
         motion["honest"] = tuple((said, factor) for said, factor in motion["honest"])
         return Tuning(ChainTuning(**table["chain"]), Motion(**motion))
@@ -54,6 +54,14 @@ class Tuning:
             rows = list(value.values()) if key == "size" else rows
             lines.append(f"{key} = {_text(rows)}")
         return "\n".join(lines) + "\n"
+
+
+def tunings_with(name: str, tuning: Tuning) -> str:
+    """The file `tunings.toml` with an animal's table replaced, or added to it."""
+    text = TUNINGS.read_text(encoding="utf-8")
+    head = text[: text.index("\n[")]
+    known = {animal: Tuning.from_table(table) for animal, table in tomllib.loads(text).items()} | {name: tuning}
+    return "\n".join([head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())])
 
 
 def _text(value: Any) -> str:

@@ -54,6 +54,7 @@ def pretended_run(
         "input": {"sha256": file_digest([Path(recording)]), **notes["input"]}, "run_id": notes["run_id"],
         "frames": {"n_frames": N_FRAMES, "n_observed": 39, "observed_s": 1.3}, "frames_per_s": 100.0,
         "peak_memory_mb": 500.0, "threads": os.environ.get("NUMBA_NUM_THREADS"),
+        "shared": crew is not None,
     }  # fmt: skip
     (folder / "session.json").write_text(json.dumps(document))
     return folder

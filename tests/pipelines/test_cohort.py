@@ -42,9 +42,9 @@ def make_study(folder: Path, names: list[str], **more: str) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
-    """Sixteen sessions on two workers, six of them broken: the study's file, what was printed, the exit code."""
+    """Seventeen sessions on two workers, six of them broken: the study's file, what was printed, the exit code."""
     folder = tmp_path_factory.mktemp("study")
-    names = [f"good{k}" for k in range(9)] + ["unlucky", *BROKEN]
+    names = [f"good{k}" for k in range(9)] + ["unlucky", *BROKEN, "last"]
     file = make_study(folder, [*names, "skipped"], skipped='exclude = "fell asleep"')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(api, "run_session", pretended_run)
@@ -58,8 +58,8 @@ def test_what_can_be_done_is_done_and_the_rest_is_quarantined(finished: tuple[Pa
     states = {one.session.animal.id: one.state for one in standings(Study.load(file))}
     assert {name for name, state in states.items() if state == "failed"} == set(BROKEN)
     assert {name for name, state in states.items() if state == "excluded"} == {"skipped"}
-    assert list(states.values()).count("done") == 10, "a worker that dies once is no reason to give up its session"
-    assert "17 sessions: 10 done, 1 excluded, 6 failed" in printed
+    assert list(states.values()).count("done") == 11, "a worker that dies once is no reason to give up its session"
+    assert "18 sessions: 11 done, 1 excluded, 6 failed" in printed
     assert f"liex cohort {file} --retry" in printed
 
 
@@ -95,10 +95,10 @@ def test_every_session_ends_with_exactly_one_of_two_files(finished: tuple[Path, 
 def test_the_studys_table_lists_every_session_and_holds_no_formula(finished: tuple[Path, str, int]) -> None:
     folder = Study.load(finished[0]).cohort_folder
     table = pd.read_parquet(folder / "study.parquet")
-    assert table["state"].value_counts().to_dict() == {"done": 10, "failed": 6, "excluded": 1}
+    assert table["state"].value_counts().to_dict() == {"done": 11, "failed": 6, "excluded": 1}
     assert (table["group"] == "@g").all()
     rows = list(csv.reader((folder / "study.csv").read_text(encoding="utf-8").splitlines()))
-    assert len(rows) == 18
+    assert len(rows) == 19
     assert not [cell for row in rows for cell in row if cell[:1] in ("=", "+", "-", "@") and not cell[1:].isdigit()]
     described = {entry["name"] for entry in json.loads((folder / "study_columns.json").read_text())}
     assert described == set(table.columns)
@@ -108,6 +108,15 @@ def test_workers_share_the_cores(finished: tuple[Path, str, int]) -> None:
     done = next(one for one in standings(Study.load(finished[0])) if one.state == "done")
     told = json.loads((done.session.folder / "session.json").read_text())["threads"]
     assert int(told) == max(1, len(os.sched_getaffinity(0)) // 2)
+
+
+def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(finished: tuple[Path, str, int]) -> None:
+    assert [cohort.n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
+    assert [cohort.n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
+    assert cohort.n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
+    done = [one.session for one in standings(Study.load(finished[0])) if one.state == "done"]
+    shared = {one.animal.id: json.loads((one.folder / "session.json").read_text())["shared"] for one in done}
+    assert [name for name, so in shared.items() if so] == ["last"]
 
 
 def test_all_workers_share_the_stretches_of_one_session() -> None:

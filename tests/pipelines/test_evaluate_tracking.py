@@ -27,6 +27,7 @@ def test_the_smoothed_track_is_better_than_its_frames(tmp_path):
     assert single["ratio_to_single"] == 1.0
     assert smoothed["ratio_to_single"] < 0.9
     assert smoothed["longest_flip_frames"] <= 5
+    assert result["speed"]["frames_per_s_1core"] > 0 < result["speed"]["frames_per_s_all_cores"]
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

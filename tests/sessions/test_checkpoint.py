@@ -153,7 +153,8 @@ def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, undisturbed: Path, m
     assert tables_of(tmp_path / "circle.liex") == tables_of(undisturbed)
 
 
-@pytest.mark.parametrize("damage", ["other facts", "short log", "short column", "no state", "no JSON", "empty"])
+@pytest.mark.parametrize("damage", ["other facts", "short log", "short column", "no state", "no JSON", "empty",
+                                    "no float"])  # fmt: skip
 def test_what_cannot_be_gone_on_with_is_begun_anew(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
@@ -168,6 +169,8 @@ def test_what_cannot_be_gone_on_with_is_begun_anew(
         (part / "seen" / "root_mm.bin").write_bytes(b"")
     elif damage == "no state":
         state.unlink()
+    elif damage == "no float":  # found by `python -m tests.campaign fuzz`
+        state.write_text(json.dumps({**json.loads(state.read_text()), "seconds": 10**400}))
     else:
         state.write_text("{" if damage == "no JSON" else "{}")
     write_session(str(place))

@@ -135,6 +135,20 @@ def test_what_looks_unlike_the_animal_is_measured_where_it_lies_on_the_curve_and
     assert np.flatnonzero(half.bridged).tolist() == [70, 71, 72, 73]
 
 
+def test_of_half_an_animal_something_is_measured_and_trusted_less(truth, measured):
+    seen = told(SECONDS, measured)
+    hidden, half = slice(60, 72), slice(66, 72)
+    seen.score[half], seen.n_px[half] = 1e4, 0.55 * np.median(seen.n_px[:, 0])
+    lose(seen, slice(hidden.start, half.start))
+    track = track_whole(SUBJECT, seen).track
+    assert track.observed[half].all()
+    lose(seen, hidden)
+    gone = track_whole(SUBJECT, seen).track
+    error, without = (joint_error(each.joints_mm, truth)[half].mean() for each in (track, gone))
+    assert error < 0.8 * without
+    assert track.sd_mm[69].mean() > 1.2 * track.sd_mm[30].mean()
+
+
 def test_the_second_thing_is_taken_where_the_curve_leads_to_it(truth, measured):
     seen = told(SECONDS, measured)
     rows = slice(60, 66)
