@@ -43,7 +43,8 @@ ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
 _PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
 _NOISY_PNG = (16, 1, 17, 2)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
-_TOGETHER = 32  # pictures in one message: for each the index that ends the file takes some 5 kB of memory
+# pictures, and their bytes, in one message: for each message the index that ends the file takes some 5 kB of memory
+_TOGETHER, _TOGETHER_BYTES = 64, 1 << 23
 _BLOCK = 8192  # frames of small things sent in one go
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
@@ -91,7 +92,7 @@ class ReplayWriter:
             self._log_depth_kind(depth[0])
         for index, time_ns, image in zip(frame_index, times_ns, depth, strict=True):
             self._waiting.append((int(index), int(time_ns) - self._first_ns, *packed(image)))
-            if len(self._waiting) == _TOGETHER:
+            if len(self._waiting) == _TOGETHER or sum(blob.nbytes for _, _, blob, _ in self._waiting) > _TOGETHER_BYTES:
                 self._send_depth()
 
     def _send_depth(self) -> None:
