@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 LONGEST_GAP_S = 0.4  # is bridged; within a longer one nobody knows what happened
 _FLIP_S = 0.15  # to either side: a body that points the other way for a moment was measured wrongly
 _WALL_BL = 0.6  # a wall this many lengths away hardly matters
+_DOUBT = 1.5  # the usual error's logarithm is one of order one
 _AXIS = {1: 0.75, -1: 0.4}  # of the chain is the trunk, for bases at the rear and at the front
 _GROUPS = 3  # parts of the chain whose bends are added up
 _PIECE = 4096  # ticks whose channels are made at once
@@ -55,9 +56,12 @@ def stretches_of(
         return []
     good = good[~_reversed(track, good, time_s)]
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
+    # a doubt is one beside the recording's usual errors: how large these are depends on camera and animal, and on how
+    # errors are predicted, and says nothing of actions
+    usual_mm = float(np.nanmedian(track.predicted_error_mm[good])) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
-    return [_stretch(track, rows, time_s, wall, length_mm, _clock(time_s[rows], rate_hz), room)
+    return [_stretch(track, rows, time_s, wall, (length_mm, usual_mm), _clock(time_s[rows], rate_hz), room)
             for rows in np.split(good, cuts)]  # fmt: skip
 
 
@@ -149,9 +153,10 @@ class _OnClock:
 
 
 def _stretch(
-    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, length_mm: float, clock: Array, room: Room
-) -> Stretch:
-    """The channels of an unbroken stretch, a piece after the other."""
+    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, units_mm: tuple[float, float], clock: Array,
+    room: Room,
+) -> Stretch:  # fmt: skip
+    """The channels of an unbroken stretch, a piece after the other. units_mm: the length and the usual error."""
     found, m = _OnClock(track, rows, time_s, wall, clock), len(clock)
     heading, steep = np.empty(m), np.empty(m, np.bool_)
     for piece in blocks(m, _PIECE):
@@ -164,7 +169,7 @@ def _stretch(
     for piece in blocks(m, _PIECE):
         # a channel looks two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
-        channels = _channels(track.skeleton, length_mm, step, heading[around], *found.at(around))
+        channels = _channels(track.skeleton, units_mm, step, heading[around], *found.at(around))
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
         track.rest()
         let_go(values)
@@ -180,13 +185,13 @@ def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.boo
 
 
 def _channels(
-    skeleton: Skeleton, length_mm: float, step: float, heading: Array, joints: Array, angles: Array, wall: Array,
-    error: Array,
+    skeleton: Skeleton, units_mm: tuple[float, float], step: float, heading: Array, joints: Array, angles: Array,
+    wall: Array, error: Array,
 ) -> Array:  # fmt: skip
     """Channels (m, C) of headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and predicted
     errors (m,) mm on a clock whose ticks are `step` s apart.
     """
-    rear, front = _forward(skeleton)
+    (rear, front), (length_mm, usual_mm) = _forward(skeleton), units_mm
     axis = joints[:, front] - joints[:, rear]
     climb = np.arctan2(axis[:, 2], np.hypot(axis[:, 0], axis[:, 1]))
     middle = joints.mean(axis=1) / length_mm
@@ -208,7 +213,7 @@ def _channels(
     if _stands(skeleton):
         z = joints[..., 2] / length_mm
         columns += [z[:, -1], z.mean(axis=1), z[:, 0], z[:, -1] - z[:, 0]]
-    columns += [np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)), np.log1p(30.0 * error / length_mm)]
+    columns += [np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)), np.log1p(_DOUBT * error / usual_mm)]
     return np.concatenate([c[:, None] if c.ndim == 1 else c for c in columns], axis=1)
 
 

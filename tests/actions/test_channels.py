@@ -53,6 +53,16 @@ def test_a_body_that_points_backwards_for_a_moment_is_left_out() -> None:
     assert np.abs(stretches_of(track, 30.0)[0].values[:, column]).max() < 0.1
 
 
+def test_a_camera_that_errs_more_throughout_changes_no_channel() -> None:
+    clock = np.arange(0.0, 4.0, 1.0 / 30.0)
+    track = straight_track("mouse", clock, 100.0 * clock)
+    track.predicted_error_mm[:] = np.random.default_rng(3).uniform(1.0, 4.0, track.n_frames)
+    values = stretches_of(track, 30.0)[0].values.copy()
+    track.predicted_error_mm[:] *= 2.5
+    np.testing.assert_allclose(stretches_of(track, 30.0)[0].values, values, atol=1e-9)
+    assert np.ptp(values[:, channel_names(track.skeleton).index("doubt")]) > 0.5
+
+
 def test_no_pose_at_all_gives_no_stretch() -> None:
     assert stretches_of(Track.empty(Skeleton.load("mouse"), np.arange(9) * 10**7), 30.0) == []
 
