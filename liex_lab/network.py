@@ -22,7 +22,7 @@ class Network:
     scale: NDArray[np.float32]
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
 
-    def logits(self, features: NDArray[np.float32]) -> Array:
+    def logits(self, features: NDArray[np.floating]) -> Array:
         """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's threads are not."""
         from threadpoolctl import threadpool_limits
 

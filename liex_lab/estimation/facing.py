@@ -23,7 +23,7 @@ _ALONG_MM, _ACROSS_MM, _STEP_MM = 50.0, 25.0, 2.5
 _HEIGHT_MM = 10.0  # what stands for one in the network
 UNSURE_MM = 15.0  # scores of both ways nearer than this, at the reference length, are doubted
 _MM_PER_LOGIT = 4.0  # what the network's word weighs against scores, at the reference length
-_MOST_LOGIT = 6.0
+_MOST_LOGIT, _DECIMALS = 6.0, 6
 _HIDDEN, _EPOCHS, _BATCH, _RATE, _WEIGHT_DECAY = (128, 32), 15, 256, 1e-3, 1e-2
 
 
@@ -61,10 +61,15 @@ class Facing:
         )  # fmt: skip
 
     def logits(self, images: ImageSet, joints: Array, size: float) -> Array:
-        """How much speaks for it (n,) that poses with these joints (n, J, 3) mm, view frame, point the right way."""
+        """How much speaks for it (n,) that poses with these joints (n, J, 3) mm, view frame, point the right way.
+
+        In double precision and then rounded: a product's last bits depend on how many frames are asked about at once,
+        and a frame's pose must not.
+        """
         pictures = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
-        both = [self.network.logits(_flat(view))[:, 0] for view in (pictures, pictures[:, :, ::-1])]
-        return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0)
+        views = (pictures, pictures[:, :, ::-1])
+        both = [self.network.logits(_flat(view).astype(np.float64))[:, 0] for view in views]
+        return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(_DECIMALS)
 
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
         """The scores (n, K) mm at home size of candidates (n, K, J, 3) mm after the network's word.

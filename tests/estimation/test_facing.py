@@ -65,6 +65,14 @@ def test_a_network_tells_mice_that_it_has_not_seen(network):
     assert np.mean(said[0] > said[1]) > 0.97
 
 
+def test_what_is_said_of_a_frame_does_not_depend_on_the_others(mice, network):
+    images, right, _, _ = mice
+    whole = facing(network).logits(images, right, 1.0)
+    for n in (1, 2, 3, 5, 17, 64):
+        few = type(images)(*(values[:n] for values in vars(images).values()))
+        np.testing.assert_array_equal(facing(network).logits(few, right[:n], 1.0), whole[:n])
+
+
 def test_the_word_counts_where_scores_are_near_and_only_there(mice, network):
     images, right, wrong, size = mice
     skeleton = toy_mice(1, seed=0).skeleton
