@@ -58,8 +58,8 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     """The picture without what hangs together with the animal in it alone, and whether there is such a thing.
 
     Of two layers far from one another the animal is the one whose area is nearer to its own. What lies before it hides
-    parts of it, and is taken for unread; what lies behind it there is background. Elsewhere nothing is: of a bar and some
-    specks the bar is likest to the animal, which may swim beside them.
+    parts of it, and is taken for unread; what lies behind it there is background. Elsewhere nothing is: of a bar and
+    some specks the bar is likest to the animal, which may swim beside them.
     """
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
