@@ -11,6 +11,7 @@ AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is
 BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
 _MORE = 1.3  # times the area of the animal: there may be something with it
 _APART = 2.0  # roots of the animal's area: what lies farther before the animal is not a part of it
+_LAYERS = 3  # so often: before the animal a bar, behind it a speck
 _FAR = 65_535  # mm: behind everything
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
 
@@ -57,7 +58,8 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     """The picture without what hangs together with the animal in it alone, and whether there is such a thing.
 
     Of two layers far from one another the animal is the one whose area is nearer to its own. What lies before it hides
-    parts of it, and is taken for unread; what lies behind it is background.
+    parts of it, and is taken for unread; what lies behind it there is background. Elsewhere nothing is: of a bar and
+    some specks the bar is likest to the animal, which may swim beside them.
     """
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
@@ -65,14 +67,27 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
             if cut > 0.0:
                 behind = abs(np.log(far * mm2_per_px / area)) < abs(np.log(near * mm2_per_px / area))
                 out = depth.copy()
-                for v in range(depth.shape[0]):
-                    for u in range(depth.shape[1]):
-                        if behind and depth[v, u] < cut:
-                            out[v, u] = 0
-                        elif not behind and depth[v, u] > cut:
-                            out[v, u] = _FAR
+                if behind:
+                    for v in range(depth.shape[0]):
+                        for u in range(depth.shape[1]):
+                            if depth[v, u] < cut:
+                                out[v, u] = 0
+                else:
+                    _push_back(out, labels, slot, cut)
                 return out, True
     return depth, False
+
+
+@njit(cache=True)
+def _push_back(depth, labels, slot, cut):
+    """Make background of what lies farther than `cut` in a blob and at its border."""
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if segment.is_animal_block(labels, i, j, slot):
+                for v in range(i * segment.BLOCK, (i + 1) * segment.BLOCK):
+                    for u in range(j * segment.BLOCK, (j + 1) * segment.BLOCK):
+                        if depth[v, u] > cut:
+                            depth[v, u] = _FAR
 
 
 @njit(cache=True)
@@ -91,10 +106,11 @@ def extract_one(
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
     bridge = BRIDGE if behind_mm > 0.0 else 0
     n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
-    if parts and area > 0.0:
+    for _ in range(_LAYERS if parts and area > 0.0 else 0):
         depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
-        if changed:
-            n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+        if not changed:
+            break
+        n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
     for rank in range(n_things):
         row = k + rank * (len(n_px) // n_things)

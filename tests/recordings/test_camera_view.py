@@ -90,6 +90,31 @@ def test_a_larger_thing_far_behind_the_animal_is_background_though_they_touch_in
     np.testing.assert_array_equal(crops.heights, same.heights)
 
 
+def test_an_animal_between_a_thing_before_it_and_specks_far_behind_it_is_told_apart_from_both():
+    alone = bar(turned=0.0)
+    alone[alone < FLOOR.distance_mm - 20.0] -= 60.0
+    known = replace(scene("camera"), area_mm2=280.0)
+    frame, unread = alone.copy(), alone.copy()
+    frame[:, 150:230], unread[:, 150:230] = 150.0, 0.0
+    frame[60:72, 146:150] = FLOOR.distance_mm - 10.0
+    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
+    assert crops.n_px[0] > 0
+    np.testing.assert_array_equal(crops.n_px, same.n_px)
+    np.testing.assert_array_equal(crops.moments, same.moments)
+
+
+def test_a_thing_elsewhere_that_hangs_together_with_specks_behind_it_does_not_take_the_animal_away():
+    known = replace(scene("camera"), area_mm2=480.0)
+    alone = bar()
+    frame = alone.copy()
+    frame[:, :40] = 200.0  # larger than the animal, and likest to it of what hangs together there
+    frame[60:72, 40:44] = FLOOR.distance_mm - 10.0
+    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, alone))
+    assert crops.n_blobs[0] == 2
+    np.testing.assert_array_equal(crops.n_px, same.n_px)
+    np.testing.assert_array_equal(crops.heights, same.heights)
+
+
 def test_readings_missing_across_the_body_do_not_part_it():
     frame = bar(turned=0.0)
     frame[60:120, 100:112] = 0.0  # 12 pixels, 5 mm
