@@ -46,8 +46,9 @@ def panel(session: Session, opened: bool) -> html.Details:
         html.P("Corrections lie beside the session, never over it, and are applied whenever it is read.",
                className="muted"),
         _row("a span of time", field("from", "Span from, s"), here[0], field("to", "to, s"), here[1], do("flip")),
-        _row("bouts", choice("action", "Action", words), do("rename"), do("recut"),
-             do("delete"), do("add")),
+        _row("bouts", choice("action", "Action", words),
+             html.Label([html.Span("or a new word"), dcc.Input(id="correct-new", type="text")]),
+             do("rename"), do("recut"), do("delete"), do("add")),
         html.P("A click on the picture fills in the pixel for the joint that is chosen here.", className="muted"),
         _row("a joint by its pixel", choice("joint", "Joint", list(session.metadata["animal"]["joints"])),
              field("u", "pixel u"), field("v", "v"), do("pixel")),
@@ -80,7 +81,8 @@ def _made(session: Session) -> html.Div:
 def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) -> Correction:
     """The correction that a button asks for, with what stands in the form.
 
-    told: from, to (s), action, joint, u, v (px), x, y, z (mm). Raises SessionError where it is not enough.
+    told: from, to (s), action, new (an action that the ethogram has no word for), joint, u, v (px), x, y, z (mm).
+    Raises SessionError where it is not enough, or too much.
     """
 
     def number(*names: str) -> list[float]:
@@ -94,16 +96,23 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
             raise SessionError(f"this needs the {name}; choose one")
         return str(told[name])
 
+    def action() -> tuple[str, bool]:
+        new = str(told.get("new") or "").strip()
+        if new and told.get("action"):
+            raise SessionError(f"this needs one action, got {told['action']} and the new word {new}; empty one of them")
+        return (new, True) if new else (word("action"), False)
+
+    if what in ("rename", "add"):
+        name, new_word = action()
+        if what == "rename":
+            return correcting.rename_bout(session, at_s, name, new_word=new_word)
+        return correcting.add_bout(session, name, *number("from", "to"), new_word=new_word)
     if what == "flip":
         return correcting.flip_span(session, *number("from", "to"))
-    if what == "rename":
-        return correcting.rename_bout(session, at_s, word("action"))
     if what == "recut":
         return correcting.recut_bout(session, at_s, *number("from", "to"))
     if what == "delete":
         return correcting.delete_bout(session, at_s)
-    if what == "add":
-        return correcting.add_bout(session, word("action"), *number("from", "to"))
     frames = session.frames
     frame = int(frames["frame_index"].iloc[int((frames["time_s"] - at_s).abs().to_numpy().argmin())])
     if what == "pixel":
@@ -113,7 +122,7 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
 
 def register(app: Dash, data: StudyData, correct: Correct) -> None:
     """What happens in the form."""
-    names = ("from", "to", "action", "joint", *_PLACE)
+    names = ("from", "to", "action", "new", "joint", *_PLACE)
 
     @app.callback(
         Output("url", "href", allow_duplicate=True), Output("correct-said", "children"),

@@ -4,10 +4,14 @@ cores.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from liex_lab.threads import serial_products
 
 Array = NDArray[np.float64]
 
@@ -24,12 +28,32 @@ class Network:
 
     def logits(self, features: NDArray[np.floating]) -> Array:
         """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's threads are not."""
-        from threadpoolctl import threadpool_limits
-
         x = np.clip((features - self.centre) / self.scale, -LIMIT, LIMIT)
-        with threadpool_limits(1, user_api="blas"):
+        with serial_products():
             for k, (weights, bias) in enumerate(self.layers):
                 x = x @ weights + bias
                 if k + 1 < len(self.layers):
                     x = np.maximum(x, 0.0)
         return x.astype(np.float64)
+
+
+def descend(
+    inputs: NDArray[np.floating], labels: NDArray[Any], hidden: Sequence[int], *, epochs: int, batch: int, rate: float,
+    least_rate: float, weight_decay: float, seed: int,
+) -> list[tuple[Array, Array]]:  # fmt: skip
+    """Layers (weights, bias) that tell the labels (m,) of inputs (m, F), by scikit-learn's stochastic gradient descent
+    (Adam), whose rate falls with a cosine; the last gives one number where there are two labels, else one for each. The
+    same bits on any number of cores.
+    """
+    from sklearn.neural_network import MLPClassifier
+
+    classifier = MLPClassifier(
+        tuple(hidden), alpha=weight_decay, batch_size=batch, learning_rate_init=rate, max_iter=1, warm_start=True,
+        random_state=seed,
+    )  # fmt: skip
+    present = np.unique(labels)
+    with serial_products():
+        for epoch in range(epochs):
+            classifier.learning_rate_init = rate * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs)) + least_rate
+            classifier.partial_fit(inputs, labels, classes=present if epoch == 0 else None)
+    return list(zip(classifier.coefs_, classifier.intercepts_, strict=True))

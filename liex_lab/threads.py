@@ -1,4 +1,4 @@
-"""How many cores a parallel kernel may use: one, or as many as numba has."""
+"""How many cores a kernel or a product may use: one, or as many as there are."""
 
 from __future__ import annotations
 
@@ -52,3 +52,12 @@ def threads(parallel: bool) -> Iterator[None]:
         yield
     finally:
         numba.set_num_threads(before)
+
+
+@contextmanager
+def serial_products() -> Iterator[None]:
+    """Within the block, BLAS multiplies on one thread: the same bits on any number of cores."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, user_api="blas"):
+        yield

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.progress import Progress, silent
+from liex_lab.threads import serial_products
 
 if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
@@ -117,6 +118,7 @@ def train_model(
     return path
 
 
+@serial_products()
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
     """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and the calibration."""
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler

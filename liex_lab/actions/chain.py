@@ -69,11 +69,10 @@ class ActionChain:
     def probabilities(self, scores: Array, step_s: float, room: Room = np.empty) -> Array:
         """The probability (m, K) of each word at every tick, given all of them; room: where they are to lie."""
         out, terms = room(scores.shape, float), self._terms(step_s)
-        for start in range(0, len(scores), _PIECE):
-            stop = min(start + _PIECE, len(scores))
-            low, high = max(0, start - _MARGIN), min(len(scores), stop + _MARGIN)
+        for ticks in blocks(len(scores), _PIECE):
+            low, high = max(0, ticks.start - _MARGIN), min(len(scores), ticks.stop + _MARGIN)
             piece = np.empty((high - low, scores.shape[1]))
             kernels.probabilities(np.ascontiguousarray(scores[low:high]), *terms, piece)
-            out[start:stop] = piece[start - low : stop - low]
+            out[ticks] = piece[ticks.start - low : ticks.stop - low]
             let_go(scores, out)
         return out

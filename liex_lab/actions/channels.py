@@ -58,7 +58,7 @@ def stretches_of(
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
     # a doubt is one beside the recording's usual errors: how large these are depends on camera and animal, and on how
     # errors are predicted, and says nothing of actions
-    usual_mm = float(np.nanmedian(track.predicted_error_mm[good])) or 1.0
+    usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
     return [_stretch(track, rows, time_s, wall, (length_mm, usual_mm), _clock(time_s[rows], rate_hz), room)

@@ -15,7 +15,7 @@ from liex_lab.actions.labelled import LabelledTrack
 from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.timeline import Examples, TimelineModel, clock_of, gather
 from liex_lab.errors import LiexError
-from liex_lab.network import Network
+from liex_lab.network import LIMIT, Network, descend
 from liex_lab.progress import Progress, silent
 
 Array = NDArray[np.float64]
@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 _HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 10, 512, 2
 _LEAST_STEPS, _MOST_EPOCHS = 1500, 200  # of few labels
 _WEIGHT_DECAY = 2e-3
+_RATE, _LEAST_RATE = 1.5e-3, 1e-5
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
 _USUAL, _LEAST_PEAK = (0.005, 0.99), 0.01  # quantiles of the speeds of a word, and of its bouts' highest ones
@@ -85,30 +86,24 @@ def peaks_of(examples: Examples, n_words: int) -> Array:
 
 
 def train_network(examples: Examples, n_words: int, seed: int) -> Network:
-    """A network with one hidden layer, by scikit-learn's stochastic gradient descent (Adam)."""
-    from sklearn.neural_network import MLPClassifier
-
+    """A network with one hidden layer, see `descend`."""
     step = max(1, -(-len(examples.code) // _MOST_TICKS))
     rows = np.arange(seed % step, len(examples.code), step)
     features, code = examples.features[rows], examples.code[rows]
     centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
-    inputs = np.clip((features - centre) / scale, -6.0, 6.0)
+    inputs = np.clip((features - centre) / scale, -LIMIT, LIMIT)
     batch = int(np.clip(len(code) // 8, 1, _BATCH))
     epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
     present = np.unique(code)  # of the vocabulary; stretches without a name may be missing
-    classifier = MLPClassifier(
-        (_HIDDEN,), alpha=_WEIGHT_DECAY, batch_size=batch, learning_rate_init=1.5e-3, max_iter=1, warm_start=True,
-        random_state=seed,
+    (first, (weights, bias)) = descend(
+        inputs, code, (_HIDDEN,), epochs=epochs, batch=batch, rate=_RATE, least_rate=_LEAST_RATE,
+        weight_decay=_WEIGHT_DECAY, seed=seed,
     )  # fmt: skip
-    for epoch in range(epochs):
-        classifier.learning_rate_init = 1.5e-3 * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs)) + 1e-5
-        classifier.partial_fit(inputs, code, classes=present if epoch == 0 else None)
-    weights, bias = classifier.coefs_[-1], classifier.intercepts_[-1]
     if len(present) == 2:  # one number decides between two words
         weights, bias = np.hstack([0 * weights, weights]), np.hstack([0 * bias, bias])
     last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
     last[0][:, present], last[1][present] = weights, bias
-    layers = (classifier.coefs_[0], classifier.intercepts_[0]), last
+    layers = first, last
     return Network(
         centre.astype(np.float32), scale.astype(np.float32),
         tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers),

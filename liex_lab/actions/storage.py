@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.actions._plain_skops import read_plain
+from liex_lab.actions._plain_skops import read_plain, write_plain
 from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.catalog import MODELS, sha256
@@ -21,8 +21,6 @@ _FORMAT, _WITHOUT_PEAKS = 2, 1
 
 def save_action_model(model: TimelineModel, path: str | Path) -> Path:
     """Write a model; returns the path. Equal models give files of equal content."""
-    from skops import io
-
     target = Path(path).with_suffix(SUFFIX)
     target.parent.mkdir(parents=True, exist_ok=True)
     document: dict[str, Any] = {
@@ -37,7 +35,7 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
         ],
     }  # fmt: skip
     unfinished = target.with_name(f"{target.name}.part")
-    io.dump(document, unfinished, compression=8)  # zip's deflate
+    write_plain(document, unfinished)
     unfinished.replace(target)
     return target
 

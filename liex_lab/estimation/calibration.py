@@ -75,8 +75,8 @@ def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd:
     for rows in np.array_split(order, max(1, len(order) // _GROUP)):
         size = float(np.median(data.size[rows]) * np.exp(size_sd * rng.standard_normal()))
         size = size if model.method.session_size else 1.0
-        looks = data.images.looks[rows]
-        images = ImageSet(data.images.heights[rows], looks, data.images.moments[rows])
+        images = data.images[rows]
+        looks = images.looks
         crops = Crops(
             images.heights, looks[:, 14:16].astype(np.int32), looks[:, 16].astype(np.int32), np.full(len(rows), 1),
             images.moments, looks[:, 13], np.ones(len(rows), np.int64),
@@ -141,8 +141,7 @@ def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> M
     rows = np.concatenate([group.rows for group in groups])
     sizes = np.concatenate([np.full(len(group.rows), group.size) for group in groups])
     pose = Pose.join([group.chosen.pose for group in groups])
-    images = ImageSet(data.images.heights[rows], data.images.looks[rows], data.images.moments[rows])
-    settler = Settler.fit(model.skeleton, pose, images, sizes, data.truth.positions[rows], data.size[rows])
+    settler = Settler.fit(model.skeleton, pose, data.images[rows], sizes, data.truth.positions[rows], data.size[rows])
     return replace(model, settler=settler.table)
 
 
@@ -157,12 +156,11 @@ def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
     for group in _choices(model, data, np.random.default_rng(seed)):
         true = data.truth.positions[group.rows]
         along = true[:, skeleton.tip] - true[:, 0]
-        best, opposite, behind, _ = both_ways(skeleton, group.positions, group.scores)
+        best, opposite, behind, _ = both_ways(group.positions, group.scores, skeleton.tip)
         for k, there in ((best, np.isfinite(group.scores.min(axis=1))), (opposite, np.isfinite(behind))):
             rows = np.flatnonzero(there)
             joints = group.positions[rows, k[rows]]
-            images = ImageSet(*(values[rows] for values in vars(group.images).values()))
-            pictures.append(laid_along(skeleton, images, joints, np.full(len(rows), group.size)))
+            pictures.append(laid_along(skeleton, group.images[rows], joints, np.full(len(rows), group.size)))
             right.append(np.einsum("nd,nd->n", joints[:, skeleton.tip] - joints[:, 0], along[rows]) > 0)
     return replace(model, facing=Facing.fit(np.concatenate(pictures), np.concatenate(right), seed))
 

@@ -58,6 +58,10 @@ class ImageSet:
     looks: Array
     moments: Array
 
+    def __getitem__(self, rows: NDArray[np.int64]) -> ImageSet:
+        """Some of them."""
+        return ImageSet(self.heights[rows], self.looks[rows], self.moments[rows])
+
 
 def mm_per_px(looks: Array) -> Array:
     """How many mm (m,) a pixel of each height map covers at the distance of its view's origin; looks (m, 17)."""

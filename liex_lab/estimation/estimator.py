@@ -18,7 +18,7 @@ from liex_lab.estimation import _estimate as kernels
 from liex_lab.estimation._explain import Body
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.correction import corrected
-from liex_lab.estimation.facing import Facing
+from liex_lab.estimation.facing import Facing, both_ways
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
@@ -95,12 +95,9 @@ class _Sight:
         """The same with only the candidates that point away from where the one with the lowest score does, in frames
         `usable`, from base to `tip`; the best of them takes the others' places, so that their number stays.
         """
-        rows = np.arange(len(self.scores))
-        best = np.where(usable[:, None], self.scores, 0.0).argmin(axis=1)
-        along = self.positions[:, :, tip] - self.positions[:, :, 0]
-        away = np.einsum("nkd,nd->nk", along, along[rows, best]) < 0
-        scores = np.where(away & usable[:, None], self.scores, np.inf)
-        taken = np.where(away, np.arange(scores.shape[1]), scores.argmin(axis=1)[:, None])
+        _, other, _, away = both_ways(self.positions, self.scores, tip)
+        rows, scores = np.arange(len(self.scores)), np.where(away & usable[:, None], self.scores, np.inf)
+        taken = np.where(away, np.arange(scores.shape[1]), other[:, None])
         some = away.any(axis=1) & usable
         return _Sight(
             self.crops, self.looks, self.rotations[rows[:, None], taken], self.positions[rows[:, None], taken],

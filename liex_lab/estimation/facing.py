@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _facing as kernels
 from liex_lab.estimation.cascade import ImageSet
-from liex_lab.network import Network
+from liex_lab.network import Network, descend
 
 Array = NDArray[np.float64]
 
@@ -39,20 +39,12 @@ class Facing:
         """Learned from pictures (m, A, B), see `laid_along`, and whether the poses point the right way (m,); what an
         animal looks like in a mirror is learned, too.
         """
-        from sklearn.neural_network import MLPClassifier
-        from threadpoolctl import threadpool_limits
-
         inputs = np.concatenate([_flat(pictures), _flat(pictures[:, :, ::-1])])
         labels = np.concatenate([right, right])
-        classifier = MLPClassifier(
-            _HIDDEN, alpha=_WEIGHT_DECAY, batch_size=min(_BATCH, len(inputs)), learning_rate_init=_RATE, max_iter=1,
-            warm_start=True, random_state=seed,
+        layers = descend(
+            inputs, labels, _HIDDEN, epochs=_EPOCHS, batch=min(_BATCH, len(inputs)), rate=_RATE,
+            least_rate=1e-2 * _RATE, weight_decay=_WEIGHT_DECAY, seed=seed,
         )  # fmt: skip
-        with threadpool_limits(1, user_api="blas"):
-            for epoch in range(_EPOCHS):
-                classifier.learning_rate_init = 0.5 * _RATE * (1.0 + np.cos(np.pi * epoch / _EPOCHS)) + 1e-2 * _RATE
-                classifier.partial_fit(inputs, labels, classes=np.array([False, True]) if epoch == 0 else None)
-        layers = zip(classifier.coefs_, classifier.intercepts_, strict=True)
         n = inputs.shape[1]
         # rounded to what the model file holds
         return Network(
@@ -67,8 +59,8 @@ class Facing:
         and a frame's pose must not.
         """
         pictures = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
-        views = (pictures, pictures[:, :, ::-1])
-        both = [self.network.logits(_flat(view).astype(np.float64))[:, 0] for view in views]
+        views = np.concatenate([pictures, pictures[:, :, ::-1]])
+        both = self.network.logits(_flat(views).astype(np.float64)).reshape(2, -1)
         return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(_DECIMALS)
 
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
@@ -78,14 +70,12 @@ class Facing:
         difference, the candidates of the way that was ahead fall behind, by as much as it is outweighed.
         """
         unit = self.skeleton.relative_size
-        best, opposite, ahead, away = both_ways(self.skeleton, positions, scores)
+        best, opposite, ahead, away = both_ways(positions, scores, self.skeleton.tip)
         doubted = np.flatnonzero(ahead < UNSURE_MM * unit)
         if not len(doubted):
             return scores
-        seen = ImageSet(images.heights[doubted], images.looks[doubted], images.moments[doubted])
-        first, second = (
-            self.logits(seen, np.ascontiguousarray(positions[doubted, k[doubted]]), size) for k in (best, opposite)
-        )
+        seen, poses = images[np.tile(doubted, 2)], [positions[doubted, k[doubted]] for k in (best, opposite)]
+        first, second = np.split(self.logits(seen, np.concatenate(poses), size), 2)
         total = ahead[doubted] + _MM_PER_LOGIT * unit * (first - second)
         wrong, behind = doubted[total < 0], (ahead[doubted] - total)[total < 0]
         judged = scores.copy()
@@ -94,13 +84,13 @@ class Facing:
 
 
 def both_ways(
-    skeleton: Skeleton, positions: Array, scores: Array
+    positions: Array, scores: Array, tip: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, NDArray[np.bool_]]:
     """Of candidates (n, K, J, 3) mm with scores (n, K): which (n,) is best, which is best of those that point the other
-    way, by how much (n,) it is behind, infinite or NaN where there is none, and which (n, K) do.
+    way, from base to `tip`, by how much (n,) it is behind, infinite or NaN where there is none, and which (n, K) do.
     """
     rows, best = np.arange(len(scores)), scores.argmin(axis=1)
-    way = positions[:, :, skeleton.tip] - positions[:, :, 0]
+    way = positions[:, :, tip] - positions[:, :, 0]
     away = np.einsum("nkd,nd->nk", way, way[rows, best]) < 0
     other = np.where(away, scores, np.inf)
     opposite = other.argmin(axis=1)

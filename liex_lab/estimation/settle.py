@@ -25,6 +25,7 @@ N_OTHERS = 15  # clues that are not of one joint
 _RIDGE = 1e-2  # of the features' variance
 _LEAST_SPREAD = 1e-6
 _TAIL = 0.01  # of what a clue was seen to be: beyond it is taken for the last that was seen
+_DECIMALS = 12  # a product's last bits depend on how many frames are asked about at once, and a frame's pose must not
 _SLID_SHARE, _SIZE_LOG = 0.1, 0.25  # of the length, and in logarithms: poses farther off are not learned from
 
 
@@ -67,7 +68,7 @@ class Settler:
         skeleton, n = self.skeleton, len(pose.scale)
         joints = pose.joints(skeleton)
         seen = clues(skeleton, pose, joints, images, np.full(n, size))
-        told = np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]
+        told = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(_DECIMALS)
         length = skeleton.length * size
         moved = joints + length * told[:, -2, None, None] * tangents(joints)
         moved[..., 2] += length * told[:, :-2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from skops import io
 from threadpoolctl import threadpool_limits
 
 from liex_lab.actions import storage
@@ -96,6 +98,12 @@ def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(model: Tim
     assert again.definitions == model.definitions
     with zipfile.ZipFile(path) as archive:
         assert not [name for name in archive.namelist() if name.endswith((".pkl", ".pickle"))]
+
+
+def test_equal_models_are_equal_bytes_that_skops_reads(model: TimelineModel, tmp_path: Path) -> None:
+    first, second = (save_action_model(m, tmp_path / f"{k}.skops") for k, m in enumerate([model, deepcopy(model)]))
+    assert first.read_bytes() == second.read_bytes()
+    np.testing.assert_array_equal(io.load(first)["networks"][0]["centre"], model.networks[0].centre)
 
 
 def test_a_bout_that_is_never_as_fast_as_its_word_asks_for_gets_another_word(model: TimelineModel) -> None:

@@ -139,6 +139,15 @@ def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(served: Served,
     expect(page.get_by_role("button", name="Take back")).to_have_count(1)
     assert "pause" not in set(Session.open(folder).bouts["action"])
     assert len(read_log(folder).entries) == 3
+    page.locator("#correct-new").fill("tail rattle")
+    page.get_by_role("button", name="Rename the bout").click()
+    page.get_by_text("is tail rattle").wait_for()
+    assert "tail rattle" in set(Session.open(folder).bouts["action"])
+    page.locator("#correct-action").click()
+    page.get_by_role("option", name="tail rattle").click()  # no longer new
+    page.locator("#correct-new").fill("hop")
+    page.get_by_role("button", name="Rename the bout").click()
+    expect(page.get_by_role("alert")).to_contain_text("got tail rattle and the new word hop")
     page.get_by_role("button", name="Cut that bout to the span").click()
     expect(page.get_by_role("alert")).to_contain_text("fill in from, to")
     watched.nothing_went_wrong()
