@@ -90,4 +90,5 @@ def test_what_is_seen_whole_stays_where_it_is_and_what_is_not_found_is_nowhere()
     assert ENDS.slid(WHOLE, crops, PICTURE[None]).root.translation == pytest.approx(WHOLE.root.translation)
     gone = crops[np.array([0])]
     gone.n_px[:], gone.heights[:] = 0, 0
-    assert np.isnan(ENDS.slid(Pose(WHOLE.root, WHOLE.angles, np.full(1, np.nan)), gone, PICTURE[None]).joints(FISH)).all()
+    nowhere = ENDS.slid(replace(WHOLE, scale=np.full(1, np.nan)), gone, PICTURE[None])
+    assert np.isnan(nowhere.joints(FISH)).all()
