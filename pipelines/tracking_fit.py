@@ -39,7 +39,7 @@ Knots = tuple[tuple[float, float], ...]
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 _EASY_WEIGHT = 2.0  # never worse than single frames where these are good
 _STEP = 0.5  # sd of the logarithm of a number that is changed
-_BINS, _Z90, _FACTORS = 3, 1.645, (0.1, 3.0)
+_BINS, _Z90, _FACTORS, _LEAST = 3, 1.645, (0.3, 3.0), 0.01
 # how fast a session's stretch may grow with what it is told by, see `Motion.stretch`
 _PER_BLUR, _PER_SPREAD = np.arange(0.0, 6.5, 0.5), np.arange(0.0, 3.5, 0.5)
 _FOUND_OTHERWISE = ("ceiling", "lasting", "honest", "stretch", "usual_stretch", "honest_root", "honest_bend")
@@ -229,11 +229,17 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
     knots = []
     for rows in np.array_split(np.argsort(said, kind="stable"), min(_BINS, len(said))):
-        least, most = _FACTORS
-        while most > 1.001 * least:
-            factor = np.sqrt(least * most)
+
+        def too_wide(factor: float, rows: NDArray[np.int64] = rows) -> bool:
             inside = off[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
-            least, most = (least, factor) if inside.mean() > 0.9 else (factor, most)
+            return bool(inside.mean() > 0.9)
+
+        least, most = _FACTORS
+        while too_wide(least) and least > _LEAST:
+            least, most = 0.1 * least, least
+        while most > 1.001 * least:
+            factor = float(np.sqrt(least * most))
+            least, most = (least, factor) if too_wide(factor) else (factor, most)
         knots.append((round(float(np.median(said[rows])), 5), round(float(most), 3)))
     return tuple(knots)
 
