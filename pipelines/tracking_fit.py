@@ -39,7 +39,7 @@ Knots = tuple[tuple[float, float], ...]
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 _EASY_WEIGHT = 2.0  # never worse than single frames where these are good
 _STEP = 0.5  # sd of the logarithm of a number that is changed
-_BINS, _Z90, _FACTORS = 3, 1.645, (0.3, 3.0)
+_BINS, _Z90, _FACTORS = 3, 1.645, (0.1, 3.0)
 # how fast a session's stretch may grow with what it is told by, see `Motion.stretch`
 _PER_BLUR, _PER_SPREAD = np.arange(0.0, 6.5, 0.5), np.arange(0.0, 3.5, 0.5)
 _FOUND_OTHERWISE = ("ceiling", "lasting", "honest", "stretch", "usual_stretch", "honest_root", "honest_bend")

@@ -17,6 +17,7 @@ from liex_lab.recordings.crops import Foreground
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.threads import threads
 from liex_lab.tracking.curve import Subject, single_frames, track_whole
+from liex_lab.tracking.hidden import FreeEnds
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -33,6 +34,7 @@ class FrameTracker:
     comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long
     a stretch without a measurement is bridged. blur: how far the body lies from the depth seen, over its length, and
     size_spread: standard deviation of the logarithm of the size that frames tell; both of the sampled frames.
+    free_ends: puts an animal that swims where the end of it that is seen says.
     """
 
     estimator: PoseEstimator
@@ -44,6 +46,7 @@ class FrameTracker:
     bridge_s: float = BRIDGE_S
     blur: float = 0.0
     size_spread: float = 0.0
+    free_ends: FreeEnds | None = None
 
     @staticmethod
     def prepare(
@@ -72,8 +75,11 @@ class FrameTracker:
         off = off[np.isfinite(off)]
         blur = float(np.median(off)) / (home * size) if len(off) else 0.0
         spread = float(np.log(estimator.sizes_told(estimates)).std())
+        ends = None
+        if camera_view and estimator.skeleton.is_chain:  # one that stands on the floor is seen from above: it may rear
+            ends = FreeEnds.fit(estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], sample[used])
         origin = "plan" if spine_mm else "recording"
-        return FrameTracker(estimator, scene, size, origin, body, limit, bridge_s, blur, spread)
+        return FrameTracker(estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends)
 
     @property
     def spine_mm(self) -> float:
@@ -102,7 +108,7 @@ class FrameTracker:
         seen.has_depth[:] = (depths > 0).any(axis=(1, 2))
         with threads(len(frames) > 1):  # kernels share frames out: of one, the other cores would only wait
             for h, estimates in enumerate(self.estimator.hypotheses(depths, self.scene, self.size)):
-                self._put(seen, h, estimates)
+                self._put(seen, h, estimates, depths)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:
@@ -117,11 +123,12 @@ class FrameTracker:
         """The track of a whole recording; room: where it is to lie."""
         return track_whole(self.subject, seen, corrections, room=room)
 
-    def _put(self, seen: Observations, h: int, estimates: Estimates) -> None:
+    def _put(self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]) -> None:
         """What the estimator says as hypothesis h, and what is seen of the thing that it is of."""
         found = np.flatnonzero(estimates.found)
         chosen, crops = estimates.chosen, estimates.crops
-        pose = chosen.pose.moved(self.scene.floor.T_arena_camera)
+        in_camera = chosen.pose if self.free_ends is None else self.free_ends.slid(chosen.pose, crops, depths)
+        pose = in_camera.moved(self.scene.floor.T_arena_camera)
         seen.put_pose(h, pose)
         seen.error_mm[:, h], seen.score[:, h] = chosen.error_mm, chosen.score
         seen.n_px[found, h] = crops.n_px[found]
@@ -129,8 +136,8 @@ class FrameTracker:
             return
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
         seen.centroid_mm[found, h] = centre
-        in_camera = self.scene.floor.T_arena_camera.inverse() @ centre
-        seen.centroid_px[found, h] = self.scene.camera.project(in_camera)
+        from_camera = self.scene.floor.T_arena_camera.inverse() @ centre
+        seen.centroid_px[found, h] = self.scene.camera.project(from_camera)
         if h % 2:  # the body turned round covers the same pixels, nearly
             seen.residual_mm[found, h] = seen.residual_mm[found, h - 1]
         else:
