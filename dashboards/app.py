@@ -9,15 +9,16 @@ from typing import Any
 from urllib.parse import parse_qs, unquote
 
 from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc, html
-from liex_lab.dashboards import app_correct, app_groups, app_session, app_study, app_tables
-from liex_lab.dashboards.app_correct import Correct
-from liex_lab.dashboards.app_data import StudyData
-from liex_lab.dashboards.app_frames import Frames
-from liex_lab.dashboards.app_guard import LOOPBACK, add_downloads, guard
-from liex_lab.dashboards.app_parts import aria
-from liex_lab.dashboards.app_session import ShowReplay
 
 from liex_lab.errors import LiexError
+
+from . import app_correct, app_groups, app_session, app_study, app_tables
+from .app_correct import Correct
+from .app_data import StudyData
+from .app_frames import Frames
+from .app_guard import LOOPBACK, add_downloads, guard
+from .app_parts import aria
+from .app_session import ShowReplay
 
 _ASSETS = Path(__file__).parent / "app_assets"
 _PAGES = (("/", "Sessions"), ("/ethograms", "Ethograms"), ("/groups", "Groups"))

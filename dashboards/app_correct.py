@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from dash import ALL, Dash, Input, Output, State, ctx, dcc, html, no_update
-from liex_lab.dashboards.app_data import StudyData
-from liex_lab.dashboards.app_parts import aria
-from liex_lab.dashboards.app_tables import session_address
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.corrections import Correction, author_name, read_log
+
+from .app_data import StudyData
+from .app_parts import aria
+from .app_tables import session_address
 
 Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
 _DEEDS = (("flip", "Exchange head and tail in the span"), ("rename", "Rename the bout at this moment"),

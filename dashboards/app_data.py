@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.dashboards.figures import ACTION_COLOURS, action_colour
 
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError
@@ -18,6 +17,8 @@ from liex_lab.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
 from liex_lab.sessions.listed import WHO, Entry
+
+from .figures import ACTION_COLOURS, action_colour
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,10 +7,11 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.dashboards import app_plots as plots
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
+
+from . import app_plots as plots
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from dash import Dash, Input, Output, dcc, html, no_update
-from liex_lab.dashboards import app_plots as plots
-from liex_lab.dashboards.app_data import StudyData
-from liex_lab.dashboards.app_parts import graph
-from liex_lab.dashboards.app_tables import block, columns_of, number, records, session_address
 
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError
+
+from . import app_plots as plots
+from .app_data import StudyData
+from .app_parts import graph
+from .app_tables import block, columns_of, number, records, session_address
 
 ALL = "every pair"
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from flask import Flask, Response, abort, redirect, request, stream_with_context
-from liex_lab.dashboards import app_tables as tables
-from liex_lab.dashboards.app_data import StudyData
 
 from liex_lab.errors import LiexError
+
+from . import app_tables as tables
+from .app_data import StudyData
 
 if TYPE_CHECKING:
     import pandas as pd

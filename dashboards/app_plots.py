@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from liex_lab.dashboards.app_data import GREY, NO_POSE, OTHER, Ethogram, raster
-from liex_lab.dashboards.figures import Array, kept_rows, png_uri, shade
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.design import animal_means
+
+from .app_data import GREY, NO_POSE, OTHER, Ethogram, raster
+from .figures import Array, kept_rows, png_uri, shade
 
 INK, MUTED, LINE = "#1f2328", "#626a73", "#d9dbd7"
 BLUE, GREEN, RED, PURPLE = "#4477AA", "#228833", "#EE6677", "#AA3377"

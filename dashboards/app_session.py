@@ -10,16 +10,17 @@ from urllib.parse import quote
 
 import numpy as np
 from dash import ALL, Dash, Input, Output, Patch, State, ctx, dcc, html, no_update
-from liex_lab.dashboards import app_correct
-from liex_lab.dashboards import app_plots as plots
-from liex_lab.dashboards.app_data import StudyData, colours_of, shown_words
-from liex_lab.dashboards.app_frames import Frames
-from liex_lab.dashboards.app_parts import aria, download, graph
-from liex_lab.dashboards.app_tables import block, number, session_address, session_tables
-from liex_lab.dashboards.charts import traces
-from liex_lab.dashboards.quality import warnings
 
 from liex_lab.errors import LiexError
+
+from . import app_correct
+from . import app_plots as plots
+from .app_data import StudyData, colours_of, shown_words
+from .app_frames import Frames
+from .app_parts import aria, download, graph
+from .app_tables import block, number, session_address, session_tables
+from .charts import traces
+from .quality import warnings
 
 if TYPE_CHECKING:
     from liex_lab.sessions import Session

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from dash import Dash, Input, Output, State, dcc, html, no_update
-from liex_lab.dashboards import app_plots as plots
-from liex_lab.dashboards.app_data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
-from liex_lab.dashboards.app_parts import download, graph
-from liex_lab.dashboards.app_tables import STATES, block, csv_address, session_address
-from liex_lab.dashboards.figures import ACTION_COLOURS
+
+from . import app_plots as plots
+from .app_data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
+from .app_parts import download, graph
+from .app_tables import STATES, block, csv_address, session_address
+from .figures import ACTION_COLOURS
 
 MOST_COLOURS = len(ACTION_COLOURS)
 

@@ -10,11 +10,12 @@ from urllib.parse import quote
 
 import numpy as np
 from dash import dcc, html
-from liex_lab.dashboards.app_data import DONE, StudyData
-from liex_lab.dashboards.app_parts import aria, download
 
 from liex_lab.errors import SessionError
 from liex_lab.sessions.tables import harmless
+
+from .app_data import DONE, StudyData
+from .app_parts import aria, download
 
 if TYPE_CHECKING:
     import pandas as pd

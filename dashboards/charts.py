@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.dashboards import figures, figures_sums
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.around import around_onsets
 from liex_lab.sessions import Session
+
+from . import figures, figures_sums
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,8 +47,9 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
     drawn["error"] = figures.curve(time_s, _across_gaps(error, frames), time, "mm", _RED, last=True)
     drawn["errors"] = figures.histogram(error.to_numpy(float), "mm", _RED)
     if session.has("kinematics.parquet"):
-        place = (_across_gaps(session.kinematics[name], frames) for name in ("x_mm", "y_mm"))
-        drawn["way"] = figures.trajectory(*place, time_s, outlines(session))
+        x_mm = _across_gaps(session.kinematics["x_mm"], frames)
+        y_mm = _across_gaps(session.kinematics["y_mm"], frames)
+        drawn["way"] = figures.trajectory(x_mm, y_mm, time_s, outlines(session))
     if session.has("summary.csv"):
         row = session.summary.iloc[0]
         shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
@@ -170,8 +172,9 @@ def _matrix(table: pd.DataFrame, words: list[str]) -> str:
         return out
 
     certain = spread(table["p_fdr"] <= _CERTAIN) == 1.0
-    numbers = (spread(table[name]) for name in ("probability", "by_chance"))
-    return figures_sums.matrix(seen, *numbers, certain, spread(table["n"]))
+    probability = spread(table["probability"])
+    by_chance = spread(table["by_chance"])
+    return figures_sums.matrix(seen, probability, by_chance, certain, spread(table["n"]))
 
 
 def _activity(table: pd.DataFrame, words: list[str]) -> str:

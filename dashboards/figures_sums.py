@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from html import escape
 
 import numpy as np
-from liex_lab.dashboards.figures import Array, Scale, svg, time_scale, x_axis, x_ticks, y_axis
+
+from .figures import Array, Scale, svg, time_scale, x_axis, x_ticks, y_axis
 
 _WIDTH = 300.0
 

@@ -10,10 +10,10 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from liex_lab.dashboards.charts import charts, curves, pictures
-from liex_lab.dashboards.report import TEMPLATES
-
 from liex_lab.sessions import Session
+
+from .charts import charts, curves, pictures
+from .report import TEMPLATES
 
 WIDTH, HEIGHT = 860, 690
 _SHOWN = 4  # of the contact sheet

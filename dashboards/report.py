@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from liex_lab.dashboards import figures
-from liex_lab.dashboards.charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
-from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
 
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_whole
+
+from . import figures
+from .charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
+from .quality import flip_rows, frame_account, warnings
 
 TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = {

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from liex_lab.dashboards.blueprint import write_blueprint
-from liex_lab.dashboards.foxglove import write_layout
-from liex_lab.dashboards.report import write_report
-
 from liex_lab.sessions import Session
+
+from .blueprint import write_blueprint
+from .foxglove import write_layout
+from .report import write_report
 
 
 def write_views(folder: str | Path) -> Path:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from liex_lab.pipelines.train import cache_folder
 from numpy.typing import NDArray
 
 from liex_lab import recordings as recordings_package
@@ -33,6 +32,8 @@ from liex_lab.recordings.habits import MouseHabits
 from liex_lab.tracking.curve import Subject, track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.windowed import WindowTracker
+
+from .train import cache_folder
 
 Array = NDArray[np.float64]
 

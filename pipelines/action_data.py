@@ -7,9 +7,10 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from liex_lab.pipelines.acted import Scenario
 
 from liex_lab.recordings import fish_acts, mouse_acts
+
+from .acted import Scenario
 
 Recorded = TypeVar("Recorded")
 

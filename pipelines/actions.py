@@ -31,8 +31,8 @@ def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
-    from liex_lab.pipelines.acted import acted, acted_tracks
-    from liex_lab.pipelines.action_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
+    from .acted import acted, acted_tracks
+    from .action_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
 
     if animal not in WORDS:
         raise LiexError(f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions")
@@ -62,7 +62,7 @@ def train_actions(
         model = learn(tracks, seed=_SEED, progress=progress)
         model = with_card(model, made_by="liex train actions", labels="people's", n_recordings=len(tracks))
         return save_action_model(model, out), report
-    from liex_lab.pipelines.evaluate import estimator_of
+    from .evaluate import estimator_of
 
     estimator = estimator_of(animal, "default", progress, pose_model)
     tracks, cuts = learning_set(animal, estimator, progress)

@@ -17,13 +17,13 @@ from liex_lab.baselines.forest import ForestPlan
 from liex_lab.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.train import Recipe
-
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.baselines.cnn import Cnn
     from liex_lab.baselines.forest import RegressionForest
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.training import Tell
+
+    from .train import Recipe
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
     paper's variant the baselines are told nothing of an animal's size. Their number is no one else's, so that a
     baseline stays what it is when our own model learns from more or fewer.
     """
-    from liex_lab.pipelines.train import recipe_of
+    from .train import recipe_of
 
     n_images = _N_IMAGES.get(skeleton.name, _N_OTHERS)
     recipe = replace(recipe_of("paper", skeleton), n_images=n_images, n_calibration=0, degraded_share=_DEGRADED)
@@ -78,9 +78,9 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
 
 def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:
     """Where the cache keeps it; its card lies beside it, as .json."""
-    from liex_lab.pipelines.train import cache_folder
-
     from liex_lab.sessions.provenance import package_version
+
+    from .train import cache_folder
 
     made_from = json.dumps([package_version("liex_lab"), training.to_dict()], sort_keys=True)
     return cache_folder() / f"{skeleton.name}-{variant}-{hashlib.sha256(made_from.encode()).hexdigest()[:12]}.npz"
@@ -89,9 +89,10 @@ def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Pat
 def train_baseline(variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress) -> None:
     """Train and write a baseline, and its card."""
     import numba
-    from liex_lab.pipelines.train import rendered_set
 
     from liex_lab.estimation.method import method_of
+
+    from .train import rendered_set
 
     recipe = training.recipe
     data = rendered_set(skeleton, method_of("paper", skeleton), recipe, 0, recipe.n_images, progress)

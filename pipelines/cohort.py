@@ -15,14 +15,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.pipelines.crew import Done, Work, n_cores, worker_environment
-from liex_lab.pipelines.slurm import SlurmTable
-from liex_lab.pipelines.study_one import RunSession, measure_one, quarantine
-from liex_lab.pipelines.study_state import Standing
-
 from liex_lab.errors import MissingPackageError, StudyError
 from liex_lab.sessions.failure import describe_failure
 from liex_lab.study import PlannedSession
+
+from .crew import Done, Work, n_cores, worker_environment
+from .slurm import SlurmTable
+from .study_one import RunSession, measure_one, quarantine
+from .study_state import Standing
 
 if TYPE_CHECKING:
     from distributed import Client

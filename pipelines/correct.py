@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.pipelines.session import measure_behaviour
-
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.sessions.corrections import FOLDER, LOG, REPLAY, BoutEdit, Correction, Log, basis, read_log
+
+from .session import measure_behaviour
 
 if TYPE_CHECKING:
 
@@ -128,7 +128,9 @@ def _behaviour(
 
     rules, around = stated_by(raw)
     frames = results.rows.frames_table()
-    bouts, actions, facts = raw.bouts, dict(raw.metadata.get("actions") or {}), {}
+    bouts = raw.bouts
+    actions = dict(raw.metadata.get("actions") or {})
+    facts: dict[str, Any] = {}
     if len(found.turned):
         again, facts = measure_behaviour(results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin)
         bouts, actions = spliced_bouts(bouts, again.bouts, found.turned, frames), {**again.actions, **actions}

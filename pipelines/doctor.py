@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from liex_lab.pipelines.build import build_water, open_planned
-from liex_lab.pipelines.doctor_scene import SceneLook
 from numpy.typing import NDArray
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings.times import DROPPED, Gap
+
+from .build import build_water, open_planned
+from .doctor_scene import SceneLook
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording

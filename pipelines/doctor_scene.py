@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.build import build_zones
 from numpy.typing import NDArray
 
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
+
+from .build import build_zones
 
 if TYPE_CHECKING:
     from liex_lab.recordings.arena import Floor

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from liex_lab.pipelines.build import plan_of
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError
 from liex_lab.evaluation import POSE_PROTOCOL, PoseErrors, angle_between_axes, count_reversals
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
+
+from .build import plan_of
 
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
@@ -31,11 +32,11 @@ def estimator_of(
     animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
 ) -> PoseEstimator:
     """The estimator of a model file, or of a variant: the bundled model, or one trained now and kept in the cache."""
-    from liex_lab.pipelines.train import cached_model
-
     from liex_lab.catalog import bundled_models, find_model
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
+
+    from .train import cached_model
 
     if model is not None or (variant == "default" and animal in bundled_models()):
         return PoseEstimator(Model.load(find_model(model or animal)))
@@ -49,11 +50,11 @@ def subject_of(
 
     model: of another file than the animal's own.
     """
-    from liex_lab.pipelines.baselines import BASELINES, trained_baseline
-
     from liex_lab.baselines.ablations import PlainMean
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.method import METHODS
+
+    from .baselines import BASELINES, trained_baseline
 
     if variant in METHODS:
         return estimator_of(animal, variant, progress, *(() if model is None else (model,)))
@@ -87,7 +88,7 @@ def errors_of(
     progress: Progress,
 ) -> dict[str, PoseErrors]:  # fmt: skip
     """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
-    from liex_lab.pipelines.build import build_scene
+    from .build import build_scene
 
     parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
     for k, recording in enumerate(sessions):

@@ -10,8 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.acted import Acted, acted, acted_tracks
-from liex_lab.pipelines.action_data import (
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.progress import Progress, silent
+
+from .acted import Acted, acted, acted_tracks
+from .action_data import (
     FAST_HZ,
     RATE_HZ,
     by_usual_camera,
@@ -19,13 +24,9 @@ from liex_lab.pipelines.action_data import (
     test_recordings,
     training_recordings,
 )
-from liex_lab.pipelines.actions import train_actions
-from liex_lab.pipelines.evaluate import estimator_of
-from liex_lab.pipelines.train import cache_folder
-from numpy.typing import NDArray
-
-from liex_lab.errors import LiexError
-from liex_lab.progress import Progress, silent
+from .actions import train_actions
+from .evaluate import estimator_of
+from .train import cache_folder
 
 if TYPE_CHECKING:
     from liex_lab.actions.labelled import LabelledTrack

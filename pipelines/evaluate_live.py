@@ -5,14 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from liex_lab.pipelines.build import plan_of
-from liex_lab.pipelines.live import follow_live
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.progress import Progress, silent
 from liex_lab.recordings.arriving import replayed
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.worlds import world_of
+
+from .build import plan_of
+from .live import follow_live
 
 LIVE_PROTOCOL = (
     "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at the camera's pace, "

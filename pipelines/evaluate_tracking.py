@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.build import build_scene, plan_of
-from liex_lab.pipelines.evaluate import estimator_of
 from numpy.typing import NDArray
 
 from liex_lab.evaluation_tracking import TRACKING_PROTOCOL, Followed, figures
 from liex_lab.progress import Progress, silent
+
+from .build import build_scene, plan_of
+from .evaluate import estimator_of
 
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator

@@ -72,9 +72,9 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
 
 def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
     """N animals near home size that come after all that the model was trained and calibrated on."""
-    from liex_lab.pipelines.train import recipe_of, rendered_set
-
     from liex_lab.estimation.training import TrainingSet
+
+    from .train import recipe_of, rendered_set
 
     recipe = recipe_of("default", skeleton)
     first = recipe.n_images + recipe.n_correction + recipe.n_calibration

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from liex_lab.pipelines.compare import find_sessions
-from liex_lab.pipelines.study_state import Standing, standings
-
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.listed import WHO, Entry
 from liex_lab.study import STUDY_FILE, Study
+
+from .compare import find_sessions
+from .study_state import Standing, standings
 
 
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]]:

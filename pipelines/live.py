@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.build import build_recording, build_tracker
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
+
+from .build import build_recording, build_tracker
 
 if TYPE_CHECKING:
     from liex_lab.recordings.arriving import Arrival, Arriving

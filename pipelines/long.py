@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.build import build_provenance, build_tracker
-from liex_lab.pipelines.session import conclude
 
 from liex_lab.memory import give_back, peak_memory_mb
 from liex_lab.plan import Plan
+
+from .build import build_provenance, build_tracker
+from .session import conclude
 
 if TYPE_CHECKING:
     from liex_lab.recordings.frame import DepthFrame

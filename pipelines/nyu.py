@@ -55,12 +55,12 @@ def in_short(result: dict[str, Any]) -> dict[str, str]:
 
 def _ours(folder: Path, truth: np.ndarray, model: str | None, progress: Progress) -> dict[str, Any]:
     """Our errors on the frames in the folder; a word where there are none, or no model."""
-    from liex_lab.pipelines.build import build_estimator, build_recording, build_scene
-
     from liex_lab.errors import ModelError, RecordingError
     from liex_lab.evaluation_nyu import nyu_errors
     from liex_lab.recordings.hand_labels import points_of_joints
     from liex_lab.recordings.nyu import frame_numbers
+
+    from .build import build_estimator, build_recording, build_scene
 
     plan = Plan.load("hand")
     if model is not None:

@@ -7,9 +7,10 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from liex_lab.pipelines.sensitivity import Sweep
 
 from liex_lab.progress import Progress, silent
+
+from .sensitivity import Sweep
 
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
@@ -32,10 +33,10 @@ QUICK_SWEEP = Sweep(
 
 def quick_subject(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator | Baseline:
     """As `evaluate.subject_of`, from next to no training; the default is the bundled model all the same."""
-    from liex_lab.pipelines.evaluate import estimator_of
-
     from liex_lab.baselines.ablations import PlainMean
     from liex_lab.estimation.estimator import PoseEstimator
+
+    from .evaluate import estimator_of
 
     if variant == "default":
         return estimator_of(animal, "default")
@@ -49,11 +50,11 @@ def quick_subject(animal: str, variant: str, progress: Progress = silent) -> Pos
 
 @cache
 def _quick_paper(animal: str) -> PoseEstimator:
-    from liex_lab.pipelines.train import make_model, recipe_of
-
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.method import method_of
+
+    from .train import make_model, recipe_of
 
     skeleton = Skeleton.load(animal)
     recipe = replace(recipe_of("paper", skeleton), n_images=_N_PAPER, n_calibration=0)
@@ -61,11 +62,11 @@ def _quick_paper(animal: str) -> PoseEstimator:
 
 
 def _quick_baseline(animal: str, variant: str) -> Baseline:
-    from liex_lab.pipelines.baselines import training_of
-
     from liex_lab.baselines.cnn import CnnPlan, require_torch, train_cnn
     from liex_lab.baselines.forest import ForestPlan, train_forests
     from liex_lab.body.skeleton import Skeleton
+
+    from .baselines import training_of
 
     skeleton, rng = Skeleton.load(animal), np.random.default_rng(0)
     plan = training_of(variant, skeleton).plan
@@ -80,11 +81,11 @@ def _quick_baseline(animal: str, variant: str) -> Baseline:
 @cache
 def _quick_set(animal: str) -> TrainingSet:
     """Images for the baselines."""
-    from liex_lab.pipelines.baselines import training_of
-    from liex_lab.pipelines.train import rendered_set
-
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.method import method_of
+
+    from .baselines import training_of
+    from .train import rendered_set
 
     skeleton = Skeleton.load(animal)
     recipe = training_of("rf", skeleton).recipe

@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker, kept_estimator
-from liex_lab.pipelines.crew import Crew, Done, Processes, Work
-from liex_lab.pipelines.long import looped
-from liex_lab.pipelines.stretches import CHUNK, Stretch, look_side_by_side
 
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.study import Study
+
+from .build import build_provenance, build_recording, build_tracker, kept_estimator
+from .crew import Crew, Done, Processes, Work
+from .long import looped
+from .stretches import CHUNK, Stretch, look_side_by_side
 
 RunSession = Callable[..., Path]
 _VIRTUAL = "synthetic:walk?seed={seed}&frames=150&sensor=primesense"
@@ -83,9 +84,9 @@ def evaluate_scale(
 
 def _recording(folder: Path, seed: int, n_frames: int) -> Path:
     """A virtual mouse, written as an MCAP file: reading it costs what reading a recording costs."""
-    from liex_lab.pipelines.convert import convert
-
     from liex_lab.recordings import open_recording
+
+    from .convert import convert
 
     path = folder / "rawdata" / f"walk{seed}.mcap"
     path.parent.mkdir(exist_ok=True)
@@ -199,8 +200,8 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
 
 def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str, Any]:
     """The same sessions on one worker and on two, by the wall clock."""
-    from liex_lab.pipelines.cohort import measure_cohort
-    from liex_lab.pipelines.study_state import standings
+    from .cohort import measure_cohort
+    from .study_state import standings
 
     table = {
         "animals": [{"id": path.stem} for path in recordings],

@@ -73,9 +73,9 @@ def with_value(method: Method, number: str, value: int) -> Method:
 
 def sensitivity(skeleton: Skeleton, variant: str, sweep: Sweep, progress: Progress = silent) -> dict[str, Any]:
     """Curves of a variant: for each number its value, and the mean and median error there."""
-    from liex_lab.pipelines.train import recipe_of, rendered_set
-
     from liex_lab.estimation.method import method_of
+
+    from .train import recipe_of, rendered_set
 
     method, recipe = method_of(variant, skeleton), recipe_of("default", skeleton)
     recipe = replace(recipe, sizes=recipe_of("paper", skeleton).sizes)

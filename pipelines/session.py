@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from liex_lab.pipelines.build import (
+
+from liex_lab.memory import Room, give_back
+from liex_lab.plan import Plan
+from liex_lab.progress import Progress, silent
+from liex_lab.threads import ahead, meanwhile
+
+from .build import (
     build_estimator,
     build_provenance,
     build_recogniser,
@@ -19,13 +25,8 @@ from liex_lab.pipelines.build import (
     build_surroundings,
     build_tracker,
 )
-from liex_lab.pipelines.crew import Crew
-from liex_lab.pipelines.stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
-
-from liex_lab.memory import Room, give_back
-from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
-from liex_lab.threads import ahead, meanwhile
+from .crew import Crew
+from .stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel

@@ -57,7 +57,8 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
     The paper's variant is trained where it has not been; baselines are timed where they have been.
     """
     import numba
-    from liex_lab.pipelines.evaluate import estimator_of
+
+    from .evaluate import estimator_of
 
     progress(0, 5, "rendering frames")
     default = estimator_of(animal, "default")
@@ -98,10 +99,10 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
 
 def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
     """Frames of a rendered recording, as many as are timed, and the scene learned from it."""
-    from liex_lab.pipelines.build import build_scene, plan_of
-
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
+
+    from .build import build_scene, plan_of
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
     recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
@@ -114,10 +115,10 @@ def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
 
 def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseline]:
     """The paper's variant, and the baselines that have been trained on this machine."""
-    from liex_lab.pipelines.baselines import BASELINES, cached_baseline, trained_baseline, training_of
-    from liex_lab.pipelines.evaluate import estimator_of
-
     from liex_lab.body.skeleton import Skeleton
+
+    from .baselines import BASELINES, cached_baseline, trained_baseline, training_of
+    from .evaluate import estimator_of
 
     rivals: dict[str, PoseEstimator | Baseline] = {"paper": estimator_of(animal, "paper", progress)}
     skeleton = Skeleton.load(animal)

@@ -12,11 +12,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.pipelines.build import build_estimator, build_recording
-from liex_lab.pipelines.crew import Crew
-
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress
+
+from .build import build_estimator, build_recording
+from .crew import Crew
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording

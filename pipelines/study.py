@@ -7,15 +7,15 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from liex_lab.pipelines.slurm import SlurmTable
-from liex_lab.pipelines.study_one import RunSession
-from liex_lab.pipelines.study_state import Standing, standings
-from liex_lab.pipelines.study_table import write_study_table
-
 from liex_lab.errors import StudyError
 from liex_lab.progress import Board
 from liex_lab.sessions.lock import locked
 from liex_lab.study import Study
+
+from .slurm import SlurmTable
+from .study_one import RunSession
+from .study_state import Standing, standings
+from .study_table import write_study_table
 
 
 def run_study(
@@ -51,7 +51,7 @@ def run_study(
 def _measure(
     todo: list[Standing], run: RunSession, board: Callable[[int], AbstractContextManager[Board]], **where: Any
 ) -> None:
-    from liex_lab.pipelines.cohort import measure_cohort
+    from .cohort import measure_cohort
 
     with board(len(todo)) as shown:
 

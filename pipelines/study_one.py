@@ -7,15 +7,15 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
-from liex_lab.pipelines.crew import Crew
-from liex_lab.pipelines.stretches import MEASURING
-from liex_lab.pipelines.study_state import input_stamp, set_aside
-
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.progress import Progress, silent
 from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
 from liex_lab.study import PlannedSession
+
+from .crew import Crew
+from .stretches import MEASURING
+from .study_state import input_stamp, set_aside
 
 
 class RunSession(Protocol):

@@ -118,7 +118,7 @@ def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
         return "input changed: another virtual recording"
     if not stored.get("sha256"):
         return "input changed: sizes or times of its files"
-    from liex_lab.pipelines.build import open_planned
+    from .build import open_planned
 
     if not session.recording_exists:
         return ""  # its results are all there is left of it; they are kept

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from liex_lab.pipelines.study_state import Standing
-
 from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.tables import columns, dictionary, harmless, write_table
 from liex_lab.study import Study
+
+from .study_state import Standing
 
 STUDY_SESSIONS = columns(
     "study",

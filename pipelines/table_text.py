@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.evaluation import POSE_PROTOCOL, plain
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.tables import Results
+    from .tables import Results
 
 TITLES = {
     "default": "liex_lab (default)",

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from liex_lab.pipelines.build import plan_of
 
 from liex_lab.catalog import MODELS
 from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation import PoseErrors, plain
 from liex_lab.progress import Progress, silent
+
+from .build import plan_of
 
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
@@ -76,8 +77,8 @@ def make_tables(
     quick: few frames, every row trained on next to nothing; its numbers say only that everything runs. fresh: nothing
     kept is used. draw: makes the figures from what `results` holds.
     """
-    from liex_lab.pipelines.kept import keep_results
-    from liex_lab.pipelines.table_text import write_tables
+    from .kept import keep_results
+    from .table_text import write_tables
 
     budget = Budget(n_frames, kept=not fresh)
     if quick:
@@ -109,11 +110,11 @@ def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 def results_of(animal: str, budget: Budget, command: str, progress: Progress) -> Results:
     """Every row, curve and illustration of one animal."""
-    from liex_lab.pipelines.illustrations import illustrate
-    from liex_lab.pipelines.kept import fits, kept_results
-
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.worlds import world_of
+
+    from .illustrations import illustrate
+    from .kept import fits, kept_results
 
     skeleton = Skeleton.load(animal)
     world = world_of(skeleton)
@@ -142,8 +143,8 @@ def _subjects(
     animal: str, names: Sequence[str], budget: Budget, results: Results, progress: Progress
 ) -> dict[str, PoseEstimator | Baseline]:
     """What has to be measured; why a row cannot be goes into `results.missing`."""
-    from liex_lab.pipelines.evaluate import subject_of
-    from liex_lab.pipelines.quick import quick_subject
+    from .evaluate import subject_of
+    from .quick import quick_subject
 
     subjects = {}
     for name in names:
@@ -156,10 +157,10 @@ def _subjects(
 
 def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
     """What decides a row's numbers: how its model is trained, and what is done with it."""
-    from liex_lab.pipelines.baselines import BASELINES, training_of
-    from liex_lab.pipelines.train import recipe_of
-
     from liex_lab.estimation.method import method_of
+
+    from .baselines import BASELINES, training_of
+    from .train import recipe_of
 
     if variant in BASELINES:
         return training_of(variant, skeleton).to_dict()
@@ -183,8 +184,8 @@ def measured_rows(
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """The numbers of each subject: `splits` and `rate`."""
-    from liex_lab.pipelines.evaluate import errors_of
-    from liex_lab.pipelines.kept import first_joints
+    from .evaluate import errors_of
+    from .kept import first_joints
 
     rows: dict[str, dict[str, Any]] = {name: {"splits": {}} for name in subjects}
     for split, sessions in tests.items():
@@ -213,8 +214,9 @@ def rates_of(
 ) -> dict[str, dict[str, Any]]:
     """Frames per second of each subject on at most two cores, foreground included, all on the same frames in memory."""
     import numba
-    from liex_lab.pipelines.build import build_scene
-    from liex_lab.pipelines.speed import best_seconds
+
+    from .build import build_scene
+    from .speed import best_seconds
 
     recording, plan = max(sessions[:2], key=lambda session: session.width), plan_of(animal)
     scene, sample = build_scene(recording, plan, next(iter(subjects.values())).skeleton, 96)
@@ -237,8 +239,8 @@ def _sensitivities(
     skeleton: Skeleton, kept: Mapping[str, Any], budget: Budget, command: str, progress: Progress
 ) -> dict[str, Any]:
     """Fig. 7 of the paper's variant and of ours, kept or measured now."""
-    from liex_lab.pipelines.quick import QUICK_SWEEP
-    from liex_lab.pipelines.sensitivity import Sweep, sensitivity
+    from .quick import QUICK_SWEEP
+    from .sensitivity import Sweep, sensitivity
 
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:

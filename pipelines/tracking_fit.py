@@ -15,8 +15,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from liex_lab.pipelines.build import build_scene, plan_of
-from liex_lab.pipelines.evaluate import estimator_of
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
@@ -32,6 +30,9 @@ from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Track
 from liex_lab.tracking.tracker import FrameTracker
 from liex_lab.tracking.tuning import Tuning, tunings_with
+
+from .build import build_scene, plan_of
+from .evaluate import estimator_of
 
 Array = NDArray[np.float64]
 Knots = tuple[tuple[float, float], ...]
