@@ -12,8 +12,8 @@ from pathlib import Path
 
 from liex_lab.sessions import Session
 
-from .charts import charts, curves, pictures
-from .report import TEMPLATES
+from .report.charts import charts, curves, pictures
+from .report.report import TEMPLATES
 
 WIDTH, HEIGHT = 860, 690
 _SHOWN = 4  # of the contact sheet

@@ -11,10 +11,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.moved import keep_old_paths
+
 __version__ = "0.1.0"
 
+keep_old_paths()
+
 _HOMES = {
-    "Camera": "liex_lab.camera",
+    "Camera": "liex_lab.optics.camera",
     "LiexError": "liex_lab.errors",
     "Plan": "liex_lab.plan",
     "PoseEstimator": "liex_lab.estimation.estimator",
@@ -41,10 +45,10 @@ __all__ = [
 if TYPE_CHECKING:
     from liex_lab.api import run_session
     from liex_lab.body import Skeleton
-    from liex_lab.camera import Camera
     from liex_lab.errors import LiexError
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.geometry import SE3
+    from liex_lab.optics.camera import Camera
     from liex_lab.plan import Plan
     from liex_lab.recordings import open_recording
     from liex_lab.sessions import Session

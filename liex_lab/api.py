@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError
 from liex_lab.plan import Plan
-from liex_lab.progress import Board, Progress, progress_board, silent, telling_of_compiling
-from liex_lab.study import Study
+from liex_lab.plan.study import Study
+from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.crew import Crew
-    from liex_lab.pipelines.study_state import Standing
+    from liex_lab.pipelines.study.status import Standing
     from liex_lab.pipelines.verify import Finding
+    from liex_lab.pipelines.workers import Crew
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions.corrections import Correction
 
@@ -44,10 +44,10 @@ def run_session(
     at stretches of a long recording side by side, or a crew of others; the tables are the same. Raises a LiexError that
     says what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
-    from liex_lab.dashboards.blueprint import replay_blueprint
-    from liex_lab.dashboards.views import write_views
-    from liex_lab.pipelines.crew import Processes
+    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+    from liex_lab.dashboards.report.views import write_views
     from liex_lab.pipelines.session import measure_session
+    from liex_lab.pipelines.workers import Processes
 
     plan = plan or Plan.load("mouse")
     if workers > 1 and crew is None:
@@ -72,8 +72,8 @@ def correct_session(
     what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`, everything is made
     again. author: "" takes who is logged in. What was measured stays as it is; see `liex_lab.sessions.corrections`.
     """
-    from liex_lab.dashboards.blueprint import replay_blueprint
-    from liex_lab.dashboards.views import write_views
+    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+    from liex_lab.dashboards.report.views import write_views
     from liex_lab.pipelines.correct import correct_session as job
 
     return job(session, what, undo=undo, author=author, blueprint=replay_blueprint, report=write_views,
@@ -124,7 +124,7 @@ def run_study(
     file that says how to ask Slurm; retry: try failed sessions again; again: all sessions; only: ids of sessions;
     dry_run: only look. A session that fails leaves failed.json and stops no other.
     """
-    from liex_lab.pipelines.study import run_study as job
+    from liex_lab.pipelines.study.run import run_study as job
 
     return job(Study.load(study), run_session, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry,
                again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
@@ -145,15 +145,15 @@ def serve_dashboard(
     """
     import secrets
 
-    from liex_lab.pipelines.listing import list_sessions
+    from liex_lab.pipelines.study.listing import list_sessions
 
     try:
-        from liex_lab.dashboards.app import LOOPBACK, address, make_app, serve
+        from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
     except ModuleNotFoundError as error:
         raise MissingPackageError(
             f"the dashboard needs {error.name}, which is not installed; pip install 'liex_lab[dashboard]'"
         ) from None
-    from liex_lab.dashboards.app_data import StudyData
+    from liex_lab.dashboards.app.data import StudyData
     from liex_lab.sessions.viewer import show_replay
 
     name, look = list_sessions(study)
@@ -180,8 +180,8 @@ def verify_session(
 
 def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
     """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it cost in memory."""
-    from liex_lab.dashboards.report import write_report
-    from liex_lab.pipelines.long import write_long as job
+    from liex_lab.dashboards.report.report import write_report
+    from liex_lab.pipelines.evaluation.long_sessions import write_long as job
 
     return job(minutes, out, write_report)
 
@@ -190,7 +190,7 @@ def run_scale(
     n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
     """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
-    from liex_lab.pipelines.scale import evaluate_scale
+    from liex_lab.pipelines.evaluation.scale import evaluate_scale
 
     return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
 
@@ -207,8 +207,8 @@ def evaluate_tracking(
     """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error over time."""
     from functools import partial
 
-    from liex_lab.dashboards.tracking_figure import draw_tracking
-    from liex_lab.pipelines.evaluate_tracking import evaluate_tracking as measure
+    from liex_lab.dashboards.paper.tracking import draw_tracking
+    from liex_lab.pipelines.evaluation.tracking import evaluate_tracking as measure
 
     draw = None if figure is None else partial(draw_tracking, path=figure)
     return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
@@ -226,8 +226,8 @@ def evaluate_actions(
     """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion matrices."""
     from functools import partial
 
-    from liex_lab.dashboards.confusion_figure import draw_confusions
-    from liex_lab.pipelines.evaluate_actions import evaluate_actions as measure
+    from liex_lab.dashboards.paper.confusion import draw_confusions
+    from liex_lab.pipelines.evaluation.actions import evaluate_actions as measure
 
     draw = None if figure is None else partial(draw_confusions, path=figure)
     return measure(animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress)
@@ -248,8 +248,8 @@ def run_tables(
     numbers say only that everything runs. fresh: nothing kept is used, which takes hours.
     """
     from liex_lab.catalog import bundled_models
-    from liex_lab.dashboards.plates import draw_figures
-    from liex_lab.pipelines.tables import make_tables
+    from liex_lab.dashboards.paper.plates import draw_figures
+    from liex_lab.pipelines.evaluation.paper.run import make_tables
 
     return make_tables(out, animals or list(bundled_models()), n_frames=n_frames, quick=quick, fresh=fresh,
                        draw=draw_figures, progress=progress)  # fmt: skip

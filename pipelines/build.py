@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import PlanError
 from liex_lab.plan import Plan, known_plans
-from liex_lab.progress import Progress, silent
+from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from liex_lab.actions.timeline import TimelineModel
+    from liex_lab.arena.outline import Arena
+    from liex_lab.arena.zones import DrawnZone, Zone
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.behaviour.places import Surroundings
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.camera import Camera, Distortion, Lens
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.crops import Foreground
+    from liex_lab.foreground.height_maps import Foreground
+    from liex_lab.optics.camera import Camera, Distortion, Lens
+    from liex_lab.optics.refraction import Water
     from liex_lab.recordings.recording import Recording
-    from liex_lab.recordings.walls import Arena
-    from liex_lab.recordings.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
-    from liex_lab.water import Water
 
 
 _SPANS = (0.6, 1.8)  # of the home length: how small and how large an animal of the user's own may be
@@ -64,7 +64,7 @@ def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progre
 
 def build_water(plan: Plan) -> Water | None:
     """The water surface of the plan, if there is one."""
-    from liex_lab.water import Water
+    from liex_lab.optics.refraction import Water
 
     stated = plan.water.model_dump()
     return Water(**stated) if stated["height_mm"] is not None else None
@@ -72,14 +72,14 @@ def build_water(plan: Plan) -> Water | None:
 
 def _stated_lens(plan: Plan) -> Lens | None:
     """The plan's camera where it states all of it."""
-    from liex_lab.camera import Lens
+    from liex_lab.optics.camera import Lens
 
     stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
     return None if None in stated.values() else Lens(**stated, distortion=_stated_distortion(plan))
 
 
 def _stated_distortion(plan: Plan) -> Distortion | None:
-    from liex_lab.camera import Distortion
+    from liex_lab.optics.camera import Distortion
 
     return Distortion.of(plan.camera.distortion_model or "plumb_bob", plan.camera.distortion or [])
 
@@ -156,8 +156,8 @@ def build_scene(
 ) -> tuple[Foreground, NDArray[np.float32]]:
     """What tells the animal from the rest of the pictures, and the sample (n, H, W) mm that it was learned from."""
     from liex_lab.body.skeleton import FOREGROUNDS
-    from liex_lab.recordings.foreground import Scene
-    from liex_lab.recordings.nearest import NearestScene
+    from liex_lab.foreground.background_segmenter import Scene
+    from liex_lab.foreground.hand_segmenter import NearestScene
 
     animal, foreground = plan.animal, plan.foreground
     if skeleton.view.foreground == FOREGROUNDS[1]:
@@ -190,9 +190,9 @@ def build_provenance(
 
 def build_arena(scene: Foreground, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
     """The shape of the arena, where there is one, and the plan's zones in it."""
-    from liex_lab.recordings.arena import Floor
-    from liex_lab.recordings.foreground import Scene
-    from liex_lab.recordings.walls import UNKNOWN, find_arena
+    from liex_lab.arena.floor import Floor
+    from liex_lab.arena.outline import UNKNOWN, find_arena
+    from liex_lab.foreground.background_segmenter import Scene
 
     arena = UNKNOWN
     if isinstance(scene, Scene):
@@ -203,7 +203,7 @@ def build_arena(scene: Foreground, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]
 
 def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
     """The zones of the plan, as they were drawn."""
-    from liex_lab.recordings.zones import read_zones
+    from liex_lab.arena.zones import read_zones
 
     return read_zones(plan.arena.zones) if plan.arena.zones else ()
 

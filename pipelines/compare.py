@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import SessionError
-from liex_lab.progress import Progress, silent
+from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +34,7 @@ def compare_sessions(
     """
     from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods, usual_measures
     from liex_lab.sessions import Session
-    from liex_lab.sessions.tables import dictionary, from_pandas, write_table
+    from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
     if engine not in ENGINES:
         raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")

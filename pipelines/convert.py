@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from liex_lab.camera import Lens
 from liex_lab.errors import RecordingError
-from liex_lab.progress import Progress, silent
+from liex_lab.optics.camera import Lens
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.camera_file import CAMERA_FILE
-from liex_lab.recordings.steps import whole_steps
-from liex_lab.recordings.writing import STAMPS, OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.depth_units import whole_steps
+from liex_lab.recordings.writer import STAMPS, OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.runtime.progress import Progress, silent
 
 _STEPS_MM = {".oni": (1.0, 0.1), "": (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)}  # what each format can state
 _N_PROBED = 8
@@ -83,7 +83,7 @@ def _writer(recording: Recording, target: Path, part: Path, step_mm: float | Non
     if ros and kind != ".mcap":
         raise RecordingError(f"ROS's messages are written into an .mcap file, not into {target.name}; leave out --ros")
     if kind == ".mcap":
-        from liex_lab.recordings.mcap_writer import McapDepthWriter
+        from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 
         if step_mm is not None:
             raise RecordingError("an .mcap file keeps depth as it is, so that --step-mm says nothing; leave it out")

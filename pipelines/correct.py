@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
+from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.corrections import FOLDER, LOG, REPLAY, BoutEdit, Correction, Log, basis, read_log
 
 from .session import measure_behaviour
@@ -82,9 +82,9 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     from liex_lab.sessions.evidence import provenance_of
     from liex_lab.sessions.place import file_facts
     from liex_lab.sessions.results import Results
-    from liex_lab.sessions.rows import Rows
     from liex_lab.sessions.rrd import ReplayWriter
     from liex_lab.sessions.tracks import skeleton_of
+    from liex_lab.tables.rows import Rows
 
     skeleton = skeleton_of(raw)
     origin, found = provenance_of(raw, skeleton), corrected_track(raw, log, skeleton)

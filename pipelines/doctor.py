@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
-from liex_lab.recordings.times import DROPPED, Gap
+from liex_lab.recordings.timestamps import DROPPED, Gap
+from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_water, open_planned
 from .doctor_scene import SceneLook
@@ -69,7 +69,7 @@ def examine(
     fps, topic: come before the plan's. A recording that is cut short is looked at as far as it goes; one that cannot be
     opened at all raises a RecordingError.
     """
-    from liex_lab.recordings.background import sample_frames, stride_for
+    from liex_lab.foreground.background import sample_frames, stride_for
     from liex_lab.recordings.rectify import rectified
 
     plan = _asked(plan or Plan(), fps, topic)
@@ -224,7 +224,7 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
     arena, water, bent, tilt = f["arena"], f["water"], f["distortion"], f["floor_tilt_rad"]
     shape = None
     if arena is not None:
-        from liex_lab.recordings.walls import Arena
+        from liex_lab.arena.outline import Arena
 
         edge = {"wall": ", with walls", "drop": ", ends in the air"}.get(arena.get("edge", ""), "")
         shape = f"{Arena.from_dict(arena)}{edge}"

@@ -15,10 +15,10 @@ from liex_lab.plan import Plan
 from .build import build_zones
 
 if TYPE_CHECKING:
-    from liex_lab.recordings.arena import Floor
-    from liex_lab.recordings.foreground import Scene
+    from liex_lab.arena.floor import Floor
+    from liex_lab.foreground.background_segmenter import Scene
+    from liex_lab.optics.refraction import Water
     from liex_lab.recordings.recording import Recording
-    from liex_lab.water import Water
 
 _PLAUSIBLE_FLOOR_MM = (150.0, 3000.0)
 _MUCH_TILT_RAD = math.radians(15.0)
@@ -48,9 +48,9 @@ class SceneLook:
 
     def at_scene(self) -> None:
         """Floor, noise, arena, water; and then the animal."""
-        from liex_lab.recordings.arena import Floor, find_floor
-        from liex_lab.recordings.background import floor_patch, floor_region, learn_background
-        from liex_lab.recordings.walls import find_arena
+        from liex_lab.arena.floor import Floor, find_floor, floor_patch, floor_region
+        from liex_lab.arena.outline import find_arena
+        from liex_lab.foreground.background import learn_background
 
         background, *_ = learn_background(self.sample)
         grid = self.seen.camera.every(self.stride)
@@ -127,7 +127,7 @@ class SceneLook:
     def _at_animal(self, background: NDArray[np.float32]) -> None:
         """Find the animal as a run would; where none of the plan's size is, look for one of another size."""
         from liex_lab.body.skeleton import Skeleton
-        from liex_lab.recordings.foreground import Scene
+        from liex_lab.foreground.background_segmenter import Scene
         from liex_lab.recordings.recording import Recording
 
         animal, foreground = self.plan.animal, self.plan.foreground

@@ -11,13 +11,13 @@ import numpy as np
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
+from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording, build_tracker
 
 if TYPE_CHECKING:
-    from liex_lab.recordings.arriving import Arrival, Arriving
     from liex_lab.recordings.recording import Recording
+    from liex_lab.recordings.streaming import Arrival, Arriving
     from liex_lab.tracking.track import Track, Tracked
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -30,7 +30,7 @@ def open_live(source: str, plan: Plan, *, replay: bool = False, patience_s: floa
     """What arrives at a source: a file or folder that is being written, HOST:PORT, or (replay) a recording sent at its
     own pace.
     """
-    from liex_lab.recordings.arriving import growing, received, replayed
+    from liex_lab.recordings.streaming import growing, received, replayed
 
     partial = plan.with_settings(["recording.accept_truncated=true"])
     if replay:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liex_lab.progress import Progress, silent
+from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from liex_lab.recordings.synthetic import SyntheticSession
+    from liex_lab.simulation.recording import SyntheticSession
 
 SEED = 341  # of a walk in which the animal turns, crosses its arena and rears once
 SPINE_MM = 65.0
@@ -51,8 +51,8 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
 
 def virtual_mouse() -> SyntheticSession:
     """The animal of the sample, its arena and its camera, with the exact truth of every frame."""
-    from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR
-    from liex_lab.recordings.walking import walking_session
+    from liex_lab.simulation.locomotion import walking_session
+    from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
 
     return walking_session(SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk")
 
@@ -65,7 +65,7 @@ def _card(path: Path, mouse: SyntheticSession) -> str:
         "what": "a virtual mouse that walks, turns and rears in a round arena, seen from above by an imitated "
         "PrimeSense camera of 320 x 240 pixels; 16-bit depth in mm, the camera's calibration and its place above the "
         "floor as Foxglove protobuf messages",
-        "origin": "rendered from a seed by liex_lab/recordings/walking.py; no recording of an animal was used",
+        "origin": "rendered from a seed by liex_lab/simulation/locomotion.py; no recording of an animal was used",
         "licence": "BSD-3-Clause, as the rest of liex_lab",
         "made_by": "liex_lab.pipelines.sample.write_sample",
         "made_with": f"foxglove-sdk {package_version('foxglove-sdk')}",

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.memory import Room, give_back
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
-from liex_lab.threads import ahead, meanwhile
+from liex_lab.runtime.memory import Room, give_back
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.threads import ahead, meanwhile
 
 from .build import (
     build_estimator,
@@ -25,8 +25,8 @@ from .build import (
     build_surroundings,
     build_tracker,
 )
-from .crew import Crew
-from .stretches import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
+from .shards import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
+from .workers import Crew
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance, Session
-    from liex_lab.sessions.rows import Rows
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
+    from liex_lab.tables.rows import Rows
     from liex_lab.tracking.tracker import FrameTracker
 
 # of the table `frames`, what names of actions go by
@@ -58,10 +58,9 @@ def measure_session(
     """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
 
     notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
-    lie in the folder, see `Session.create`. crew: looks at stretches of a long recording side by side, where the
+    lie in the folder, see `SessionWriter`. crew: looks at stretches of a long recording side by side, where the
     recording is given by its path; the tables are the same.
     """
-    from liex_lab.sessions import Session
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.place import check_place, part_folder
 
@@ -79,7 +78,7 @@ def measure_session(
         if crew is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
             whole = Stretch(str(recording), plan, tracker, provenance, folder, 0, len(opened))
             look_side_by_side(crew, whole, folder, progress)
-        with Session.create(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
+        with SessionWriter(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
             writer.go_on(lambda row: opened.frame(row).depth)
             with closing(_read_ahead(opened, writer.n_frames)) as chunks:
                 for frames in chunks:
@@ -143,7 +142,7 @@ def name_actions(
     """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which recogniser it was,
     and what the frame rate cannot tell.
     """
-    from liex_lab.actions.tables import bout_rows
+    from liex_lab.tables.rows import bout_rows
 
     frames = rows.frames_table(_NAMED_BY)
     found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), room)

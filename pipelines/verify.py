@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress, silent
+from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liex_lab.sessions import Session

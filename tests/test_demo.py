@@ -13,11 +13,11 @@ import liex_lab
 from liex_lab import catalog
 from liex_lab.api import run_session
 from liex_lab.errors import LiexError
-from liex_lab.recordings.mouse_acts import ACTIONS
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import FILES
+from liex_lab.simulation.agents.mouse import ACTIONS
+from tests.cli.test_cli import liex
 from tests.recordings.writers import depth_frames, write_mcap
-from tests.test_cli import liex
 
 pytestmark = pytest.mark.skipif("mouse" not in catalog.bundled_models(), reason="the mouse's model is not bundled yet")
 KEPT = np.delete(np.arange(N_FRAMES), LEFT_OUT)

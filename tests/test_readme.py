@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import cli
+from liex_lab.arena.zones import read_zones
 from liex_lab.behaviour.listing import FIRST, all_columns, first_columns
 from liex_lab.body import Skeleton
 from liex_lab.plan import Plan
-from liex_lab.recordings.zones import read_zones
 from liex_lab.sessions.session import FILES
 from tests.conftest import REPOSITORY
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import VIEWS, Skeleton
-from liex_lab.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Room, blocks, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]

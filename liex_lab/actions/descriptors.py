@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.labelled import some_rows
+from liex_lab.actions.labels import some_rows
 from liex_lab.geometry import SE3, so3
 from liex_lab.tracking.track import Track
 

@@ -1,8 +1,11 @@
-"""Labels that people made: tables of bouts, ours or anybody's, and their place on a track."""
+"""Labels that people made: tables of bouts, ours or anybody's, and their place on a track; a track with them is what
+recognisers learn from and are judged by.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,9 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.errors import LiexError, one_line
+from liex_lab.tracking.track import Track
+
+Array = NDArray[np.float64]
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
@@ -70,3 +76,36 @@ def words_of(table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str =
 def vocabulary(table: pd.DataFrame) -> Mapping[str, str]:
     """The words of a table, without definitions."""
     return dict.fromkeys(sorted(set(table["action"])), "")
+
+
+@dataclass(frozen=True)
+class LabelledTrack:
+    """A track and the word (n,) of each of its frames, '' where it has none; animal: whose it is; wall_mm (n,): how far
+    its middle is from the nearest wall, NaN where nobody knows; truth (n, J, 3) mm: true joints, of rendered animals.
+    """
+
+    track: Track
+    words: NDArray[np.str_]
+    animal: str
+    wall_mm: Array | None = None
+    truth: Array | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.wall_mm is None:
+            object.__setattr__(self, "wall_mm", np.full(len(self.words), np.nan))
+
+    def __len__(self) -> int:
+        """Frames."""
+        return len(self.words)
+
+    def __getitem__(self, rows: slice | NDArray[np.int64]) -> LabelledTrack:
+        """Some of its frames."""
+        assert self.wall_mm is not None
+        truth = None if self.truth is None else self.truth[rows]
+        return LabelledTrack(some_rows(self.track, rows), self.words[rows], self.animal, self.wall_mm[rows], truth)
+
+
+def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:
+    """Some frames of a track."""
+    columns = [getattr(track, f.name)[rows] for f in fields(Track) if f.name != "skeleton"]
+    return Track(track.skeleton, *columns)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.ethogram import UNLABELLED, runs_of
-from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.scores import timeline_scores
+from liex_lab.actions.semi_markov import ActionChain
 from liex_lab.actions.timeline import Examples, TimelineModel, clock_of, gather
 from liex_lab.errors import LiexError
-from liex_lab.network import LIMIT, Network, descend
-from liex_lab.progress import Progress, silent
+from liex_lab.mlp import LIMIT, Network, descend
+from liex_lab.runtime.progress import Progress, silent
 
 Array = NDArray[np.float64]
 

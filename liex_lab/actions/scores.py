@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED
-from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.labels import LabelledTrack
 
 Array = NDArray[np.float64]
 Words = NDArray[np.str_]

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions._plain_skops import read_plain, write_plain
-from liex_lab.actions.chain import ActionChain
+from liex_lab.actions.semi_markov import ActionChain
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.catalog import MODELS, sha256
 from liex_lab.errors import ModelError
-from liex_lab.network import Network
+from liex_lab.mlp import Network
 
 SUFFIX = ".skops"
 _FORMAT, _WITHOUT_PEAKS = 2, 1

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.chain import ActionChain
 from liex_lab.actions.channels import Stretch, channel_names, stretches_of
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
-from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.labels import LabelledTrack
+from liex_lab.actions.semi_markov import ActionChain
 from liex_lab.actions.vocabulary import FASTEST
-from liex_lab.actions.windows import window_features
+from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.memory import Room, blocks, let_go
-from liex_lab.network import Network
+from liex_lab.mlp import Network
+from liex_lab.runtime.memory import Room, blocks, let_go
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.estimation._estimate import mode_of_votes
-from liex_lab.estimation._kernels import correct_base, correct_joint, fill_view, place_joint
+from liex_lab.estimation._cascade_kernels import mode_of_votes
+from liex_lab.estimation._feature_kernels import correct_base, correct_joint, fill_view, place_joint
 from liex_lab.forests._kernels import VIEW, descend
 
 _BINS = 72  # of the circle in which headings are counted: 5 degrees each

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from liex_lab.baselines.baseline import Guesses, in_camera_frame, see
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.recordings.crops import Foreground
+from liex_lab.foreground.height_maps import Foreground
 
 
 @dataclass(frozen=True)

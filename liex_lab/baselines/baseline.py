@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.recordings.crops import Crops, Foreground
+from liex_lab.foreground.height_maps import Crops, Foreground
 
 Array = NDArray[np.float64]
 

@@ -28,8 +28,8 @@ from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
-from liex_lab.recordings.crops import Foreground
-from liex_lab.threads import threads
+from liex_lab.foreground.height_maps import Foreground
+from liex_lab.runtime.threads import threads
 
 if TYPE_CHECKING:
     import torch

@@ -32,12 +32,12 @@ from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
+from liex_lab.foreground.height_maps import Foreground
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
-from liex_lab.recordings.crops import Foreground
-from liex_lab.threads import threads
+from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
 

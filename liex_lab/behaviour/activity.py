@@ -9,8 +9,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.summary_columns import activity_columns
-from liex_lab.sessions.rows import stop_times
-from liex_lab.sessions.tables import to_pandas
+from liex_lab.tables.rows import stop_times
+from liex_lab.tables.schema import to_pandas
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.measures import measure_bouts
-from liex_lab.sessions.rows import frame_count, stop_times, stretches
-from liex_lab.sessions.tables import BOUTS, to_pandas
+from liex_lab.tables.rows import frame_count, stop_times, stretches
+from liex_lab.tables.schema import BOUTS, to_pandas
 
 ACTIONS = ("rear", "run", "walk", "pause")  # where two claim a frame, the first has it
 

@@ -25,10 +25,10 @@ from liex_lab.behaviour.statistics import (
     smallest_p,
     spread_of_animals,
 )
-from liex_lab.sessions.tables import Column, columns, to_pandas
+from liex_lab.tables.schema import Column, columns, to_pandas
 
 if TYPE_CHECKING:
-    from liex_lab.sessions import Session
+    from liex_lab.tables.session_tables import SessionTables
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
@@ -66,7 +66,7 @@ STATS: tuple[Column, ...] = columns(
 )  # fmt: skip
 
 
-def collect(sessions: Iterable[Session]) -> pd.DataFrame:
+def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
     """One row per session and animal: who it is (the table `sessions`), its summary, its number of bouts."""
     rows = []
     for session in sessions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from liex_lab.sessions.tables import FRAMES, Column, columns
+from liex_lab.tables.schema import FRAMES, Column, columns
 
 OWN = "this library's choice"
 LMT = "Live Mouse Tracker's rule"

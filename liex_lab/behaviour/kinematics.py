@@ -19,9 +19,9 @@ from liex_lab.behaviour.body import Body
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
-from liex_lab.memory import Room, blocks, let_go
-from liex_lab.sessions.rows import gap_follows, median_step, stop_times
-from liex_lab.sessions.tables import to_pandas
+from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.tables.rows import gap_follows, median_step, stop_times
+from liex_lab.tables.schema import to_pandas
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from liex_lab.behaviour.bouts import ACTIONS
 from liex_lab.behaviour.summary_columns import Vocabulary
-from liex_lab.sessions.tables import TABLES, Column
+from liex_lab.tables.schema import TABLES, Column
 
 FIRST = (
     "frames.frame_index", "frames.time_s", "frames.gap_before", "frames.predicted_error_mm", "frames.residual_mm",

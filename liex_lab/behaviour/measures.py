@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.columns import bout_columns, trusted
 from liex_lab.behaviour.kinematics import segments, smallest_turn
-from liex_lab.sessions.rows import median_step, stop_times
-from liex_lab.sessions.tables import BOUTS, to_pandas
+from liex_lab.tables.rows import median_step, stop_times
+from liex_lab.tables.schema import BOUTS, to_pandas
 
 Array = NDArray[np.float64]
 _MOST_LAG_S = 0.25  # a wave that takes longer for a third of the body is none

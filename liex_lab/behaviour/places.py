@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from liex_lab.arena.outline import UNKNOWN, Arena
+from liex_lab.arena.zones import SEPARATOR
 from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.summary_columns import ZONES
-from liex_lab.recordings.walls import UNKNOWN, Arena
-from liex_lab.recordings.zones import SEPARATOR
-from liex_lab.sessions.rows import stop_times
-from liex_lab.sessions.tables import to_pandas
+from liex_lab.tables.rows import stop_times
+from liex_lab.tables.schema import to_pandas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

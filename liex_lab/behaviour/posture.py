@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import Body
-from liex_lab.memory import Room, let_go
+from liex_lab.runtime.memory import Room, let_go
 
 Array = NDArray[np.float64]
 

@@ -27,13 +27,13 @@ from liex_lab.behaviour.places import (
 )
 from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
 from liex_lab.behaviour.transitions import transitions
-from liex_lab.memory import Room
-from liex_lab.sessions.rows import stop_times
-from liex_lab.sessions.tables import GAPS, empty_table, let_table_go, to_pandas
+from liex_lab.runtime.memory import Room
+from liex_lab.tables.rows import stop_times
+from liex_lab.tables.schema import GAPS, empty_table, let_table_go, to_pandas
 
 if TYPE_CHECKING:
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.rows import Rows
+    from liex_lab.tables.rows import Rows
+    from liex_lab.tables.session_tables import SessionTables
 
 Array = NDArray[np.float64]
 
@@ -112,7 +112,7 @@ def measure_rows(
     return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **how)
 
 
-def stated_by(session: Session) -> tuple[MouseRules, Surroundings]:
+def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
     """The thresholds and the surroundings that a session states."""
     about = session.metadata
     known = about.get("rules") or {}
@@ -121,7 +121,7 @@ def stated_by(session: Session) -> tuple[MouseRules, Surroundings]:
     return MouseRules(**stated), Surroundings(session.arena, [zone.name for zone in session.zones], surface)
 
 
-def measure_session(session: Session, rules: MouseRules | None = None) -> Behaviour:
+def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:
     """The behaviour tables of a session made anew from its folder alone, with its own ethogram and thresholds."""
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])

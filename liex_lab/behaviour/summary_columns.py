@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from liex_lab.behaviour.columns import OWN, bout_columns, kinematics_columns
-from liex_lab.sessions.tables import Column, columns
+from liex_lab.tables.schema import Column, columns
 
 _WHO = (
     ("session_id", "string", "", "name of the session: one recording's results"),

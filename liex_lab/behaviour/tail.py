@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.posture import Shape
-from liex_lab.sessions.rows import stretches
+from liex_lab.tables.rows import stretches
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.multiplicity import false_discovery
 from liex_lab.behaviour.summary_columns import TRANSITIONS
-from liex_lab.sessions.tables import to_pandas
+from liex_lab.tables.schema import to_pandas
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]

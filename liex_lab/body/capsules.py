@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body import _skin
+from liex_lab.body import _skinning_kernels as _skin
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 

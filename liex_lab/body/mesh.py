@@ -1,14 +1,8 @@
-"""A body made of a user's own triangle mesh: bound to the bones at home, it follows them in every pose.
-
-Open3D reads the file and thins it out when a skeleton's TOML is loaded; from then on the mesh is part of the skeleton's
-table, so that a trained model carries its body with it and needs neither the file nor Open3D.
-"""
+"""A body made of a user's own triangle mesh: bound to the bones at home, it follows them in every pose."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -22,7 +16,6 @@ Array = NDArray[np.float64]
 
 _BONES = 2  # that a vertex follows
 _SHARPNESS = 4  # a bone's pull falls off with the distance to this power
-_MOST_FACES, _FEWEST_FACES = 4000, 4
 
 
 @dataclass(frozen=True)
@@ -118,32 +111,3 @@ def _skin_mesh(rotations, positions, scale, girth, carrier, bones, weight, along
                     for k in range(3):
                         total += rotations[i, j, axis, k] * (scale[i] * along[v, b, k] + thick * across[v, b, k])
                     out[i, v, axis] += weight[v, b] * total
-
-
-def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
-    """The entries of a [surface] table for the mesh of a file (.stl, .obj, .ply, .glb ...), thinned out to what a depth
-    picture shows. unit_mm: how many mm one unit of the file is; origin names the TOML in errors. Raises LiexError.
-    """
-    if not path.is_file():
-        raise LiexError(f"{origin}: [surface] mesh should be a file beside the TOML, but there is no {path}")
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise LiexError(
-            f"{origin}: reading {path.name} needs Open3D ({error}); install it with: pip install 'liex_lab[mesh]'"
-        ) from None
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        mesh = open3d.io.read_triangle_mesh(path)
-        mesh.merge_close_vertices(1e-9)
-        mesh.remove_degenerate_triangles()
-        if len(mesh.triangles) > _MOST_FACES:
-            mesh = mesh.simplify_quadric_decimation(_MOST_FACES)
-        mesh.remove_unreferenced_vertices()
-    vertices, faces = np.asarray(mesh.vertices) * unit_mm, np.asarray(mesh.triangles)
-    if len(faces) < _FEWEST_FACES or not np.isfinite(vertices).all():
-        raise LiexError(
-            f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} holds {len(faces)} of "
-            "them; export it as STL, OBJ or PLY"
-        )
-    return {"vertices_mm": np.round(vertices, 3).tolist(), "faces": faces.tolist()}
-

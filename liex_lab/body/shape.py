@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body._skin import TAIL_RINGS
+from liex_lab.body._skinning_kernels import TAIL_RINGS
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 

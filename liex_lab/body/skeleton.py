@@ -215,7 +215,7 @@ def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
     surface = table.get("surface")
     if not isinstance(surface, dict) or "mesh" not in surface:
         return table
-    from liex_lab.body.mesh import read_mesh
+    from liex_lab.body.mesh_file import read_mesh
 
     name, unit_mm = surface["mesh"], surface.get("mesh_unit_mm", 1.0)
     if not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0):

@@ -12,16 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body import _render, _skin
+from liex_lab.body import _rasterizer_kernels as _render
+from liex_lab.body import _skinning_kernels as _skin
 from liex_lab.body.capsules import Capsules
 from liex_lab.body.mesh import MeshBody
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import Camera
 from liex_lab.errors import LiexError, one_line
 from liex_lab.geometry import SE3
-from liex_lab.threads import threads
+from liex_lab.optics.camera import Camera
+from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
 Body = BodyShape | Capsules | MeshBody

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import ImageSet
-from liex_lab.estimation.correction import moves_to, pose_samples
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.facing import Facing, both_ways, laid_along
+from liex_lab.estimation.forest_correction import moves_to, pose_samples
+from liex_lab.estimation.head_tail import Facing, both_ways, laid_along
 from liex_lab.estimation.model import Calibration, Model
+from liex_lab.estimation.ridge_correction import Settler
 from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
-from liex_lab.estimation.settle import Settler
 from liex_lab.estimation.training import TrainingSet, quantised
+from liex_lab.foreground.background_segmenter import Crops
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
-from liex_lab.recordings.foreground import Crops
 
 Array = NDArray[np.float64]
 

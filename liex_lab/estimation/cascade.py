@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.balls import Balls
 from liex_lab.body.kinematics import aim
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation import _explain as explaining
-from liex_lab.estimation import _kernels as kernels
+from liex_lab.body.spheres import Balls
+from liex_lab.estimation import _feature_kernels as kernels
+from liex_lab.estimation import _residual_kernels as explaining
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict

@@ -14,22 +14,22 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
-from liex_lab.estimation import _estimate as kernels
-from liex_lab.estimation._explain import Body
+from liex_lab.estimation import _cascade_kernels as kernels
+from liex_lab.estimation._residual_kernels import Body
 from liex_lab.estimation.cascade import ImageSet, body_of
-from liex_lab.estimation.correction import corrected
-from liex_lab.estimation.facing import Facing, both_ways
+from liex_lab.estimation.forest_correction import corrected
+from liex_lab.estimation.head_tail import Facing, both_ways
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.refine import Refiner
+from liex_lab.estimation.ridge_correction import SURE_SHARE, Settler
 from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
-from liex_lab.estimation.settle import SURE_SHARE, Settler
 from liex_lab.estimation.training import base_at_front
+from liex_lab.foreground.height_maps import Crops, Foreground, view_of
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
-from liex_lab.recordings.crops import Crops, Foreground, view_of
-from liex_lab.threads import threads
+from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
 

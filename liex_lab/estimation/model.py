@@ -20,7 +20,7 @@ from liex_lab.estimation.cascade import Cascade
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest
-from liex_lab.network import Network
+from liex_lab.mlp import Network
 
 SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that does not
 # that follow the regressors, as far as a model has them

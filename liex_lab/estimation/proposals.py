@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.estimation import _kernels as kernels
+from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW

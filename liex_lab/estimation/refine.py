@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.balls import Balls
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation import _explain as explaining
-from liex_lab.estimation import _refine as kernels
+from liex_lab.body.spheres import Balls
+from liex_lab.estimation import _refine_kernels as kernels
+from liex_lab.estimation import _residual_kernels as explaining
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.geometry import SE3
 

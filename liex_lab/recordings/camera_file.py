@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from liex_lab.camera import Camera, Distortion, Lens
 from liex_lab.errors import LiexError, RecordingError
-from liex_lab.recordings.encodings import ENCODINGS, Stored, decode, own_unit_mm
+from liex_lab.optics.camera import Camera, Distortion, Lens
+from liex_lab.recordings.depth_units import ENCODINGS, Stored, decode, own_unit_mm
 from liex_lab.recordings.frame import Depth
-from liex_lab.recordings.stamp_files import UNITS
-from liex_lab.recordings.times import start_of_day
+from liex_lab.recordings.timestamp_files import UNITS
+from liex_lab.recordings.timestamps import start_of_day
 
 CAMERA_FILE = "camera.toml"
 WHAT_TO_WRITE = (

@@ -13,11 +13,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
 from liex_lab.errors import RecordingError
-from liex_lab.progress import Progress, silent
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.times import FAULTS, JUMPED, Gap, find_faults, find_gaps, median_step
+from liex_lab.recordings.timestamps import FAULTS, JUMPED, Gap, find_faults, find_gaps, median_step
+from liex_lab.runtime.progress import Progress, silent
 
 Times = NDArray[np.int64]
 

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
-from liex_lab.recordings import _rectify as kernels
+from liex_lab.optics.camera import Camera
+from liex_lab.optics.refraction import Water
+from liex_lab.recordings import _rectify_kernels as kernels
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
-from liex_lab.water import Water
 
 _MUCH_LOST = 0.05  # share of a picture's pixels that leave it
 _MAX_GROWTH = 0.15  # of a picture's width or height, at each side

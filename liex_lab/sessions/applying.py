@@ -17,15 +17,15 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.sessions.corrections import BoutEdit, FlipSpan, JointMove, Log
 from liex_lab.sessions.evidence import read_evidence, read_flips
-from liex_lab.sessions.rows import frame_count
-from liex_lab.sessions.tables import BOUTS
 from liex_lab.sessions.tracks import track_of
-from liex_lab.tracking.curve import MARGIN, track_whole
+from liex_lab.tables.rows import frame_count
+from liex_lab.tables.schema import BOUTS
+from liex_lab.tracking.offline import MARGIN, track_whole
 from liex_lab.tracking.track import CORRECTED, Flip, Track
 
 if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.camera import Camera
+    from liex_lab.optics.camera import Camera
     from liex_lab.sessions.session import Session
 
 Array = NDArray[np.float64]

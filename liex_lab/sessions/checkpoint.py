@@ -30,8 +30,8 @@ _MOST = 1 << 20  # values of one column that a frame may have
 OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES)  # what is no part of the finished session
 
 if TYPE_CHECKING:
-    from liex_lab.progress import Progress
     from liex_lab.recordings.recording import Recording
+    from liex_lab.runtime.progress import Progress
 
 LOGS = ("session.rrd", "session.mcap")
 Clock = Callable[[], float]

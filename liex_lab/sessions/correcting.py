@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions.corrections import BoutEdit, FlipSpan, JointMove
-from liex_lab.sessions.rows import frame_count, stop_times
+from liex_lab.tables.rows import frame_count, stop_times
 
 if TYPE_CHECKING:
     from liex_lab.sessions.session import Session

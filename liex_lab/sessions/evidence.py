@@ -11,13 +11,13 @@ import numpy as np
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
-from liex_lab.memory import blocks, let_go
-from liex_lab.recordings.times import Gap
+from liex_lab.recordings.timestamps import Gap
+from liex_lab.runtime.memory import blocks, let_go
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.reading import reading_from
-from liex_lab.sessions.rows import LOST
-from liex_lab.tracking.curve import Subject
+from liex_lab.tables.rows import LOST
 from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking.offline import Subject
 from liex_lab.tracking.track import Flip
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy as np
 import rerun as rr
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import Camera
 from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.sessions.rrd import DEPTH, IMAGE, MM_PER_UNIT, SKELETON
 from liex_lab.tracking.track import Track

@@ -18,9 +18,9 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from numpy.typing import NDArray
 
 from liex_lab.geometry import SE3, so3
-from liex_lab.memory import blocks
+from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.rows import Rows
+from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
 
 if TYPE_CHECKING:

@@ -12,18 +12,18 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import Camera
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
-from liex_lab.recordings.walls import UNKNOWN, Arena
+from liex_lab.optics.camera import Camera
 
 if TYPE_CHECKING:
+    from liex_lab.arena.floor import Floor
+    from liex_lab.arena.zones import Zone
     from liex_lab.plan import Plan
-    from liex_lab.recordings.arena import Floor
     from liex_lab.recordings.recording import Recording
-    from liex_lab.recordings.times import Gap
-    from liex_lab.recordings.zones import Zone
+    from liex_lab.recordings.timestamps import Gap
 
 SCHEMA_VERSION = 4
 _PACKAGES = (

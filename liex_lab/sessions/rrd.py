@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
-from liex_lab.memory import blocks, let_go
 from liex_lab.recordings.rvl import rvl_message
+from liex_lab.runtime.memory import blocks, let_go
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.rows import Rows, frame_count, stop_times, stretches
 from liex_lab.sessions.rrd_body import log_body, send_body
+from liex_lab.tables.rows import Rows, frame_count, stop_times, stretches
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.camera import Camera
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
-from liex_lab.memory import give_back
-from liex_lab.recordings.walls import Arena
-from liex_lab.recordings.zones import Zone
+from liex_lab.optics.camera import Camera
+from liex_lab.runtime.memory import give_back
 from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
-from liex_lab.sessions.provenance import SCHEMA_VERSION, Provenance
+from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.reading import reading_from
-from liex_lab.sessions.tables import as_it_was
 from liex_lab.sessions.thumbnails import FOLDER
-from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
+from liex_lab.tables.schema import as_it_was
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,21 +44,6 @@ class Session:
         self.path = path
         self.log = log or Log("")  # of corrections; none where they do not apply, or are not wanted
         self.metadata = {**metadata, **self.log.facts}
-
-    @staticmethod
-    def create(
-        path: str | Path,
-        origin: Provenance,
-        *,
-        overwrite: bool = False,
-        blueprint: BlueprintMaker | None = None,
-        report: ReportMaker | None = None,
-    ) -> SessionWriter:
-        """Begin a session at `path`; use the writer in a `with` block and call its `close` at the end.
-
-        blueprint: makes the replay's layout from session.json's content; report: writes report.html into the folder.
-        """
-        return SessionWriter(Path(path), origin, overwrite=overwrite, blueprint=blueprint, report=report)
 
     @staticmethod
     def open(path: str | Path, *, raw: bool = False) -> Session:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
-from liex_lab.sessions.rows import Rows
+from liex_lab.optics.camera import Camera
+from liex_lab.tables.rows import Rows
 
 FOLDER = "thumbnails"
 _KEPT = 32  # at most this many whole frames are held while a recording of unknown length goes by

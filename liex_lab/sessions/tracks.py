@@ -11,7 +11,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.sessions.evidence import read_skeleton
-from liex_lab.sessions.tables import ROOT_COVARIANCES
+from liex_lab.tables.schema import ROOT_COVARIANCES
 from liex_lab.tracking.track import Track
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.memory import Room, give_back, on_disk, peak_memory_mb
-from liex_lab.sessions import tables
+from liex_lab.runtime.memory import Room, give_back, on_disk, peak_memory_mb
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER, corrected_folder
@@ -28,9 +27,10 @@ from liex_lab.sessions.evidence import write_evidence
 from liex_lab.sessions.place import check_place, file_facts, part_folder
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.results import Results
-from liex_lab.sessions.rows import Rows, rows_only
-from liex_lab.sessions.tables import Column
 from liex_lab.sessions.thumbnails import Keepsakes
+from liex_lab.tables import schema as tables
+from liex_lab.tables.rows import Rows, rows_only
+from liex_lab.tables.schema import Column
 from liex_lab.tracking.track import Flip, Track, Tracked
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
-    from liex_lab.tracking.curve import Subject
     from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.offline import Subject
 
 INDEX, TIMES = "frame_index", "frame_time_ns"
 _BEHIND = 4  # batches of 16 frames that the logs may be behind, both together
@@ -50,22 +50,25 @@ ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in
 
 
 class SessionWriter:
-    """Takes depth and track part by part; `close` writes the tables and puts the session in its place.
+    """Begins a session; takes depth and track part by part; `close` writes the tables and puts it in its place.
 
     Depth goes straight to session.rrd and session.mcap, so memory does not grow with it. Use it in a `with` block: an
     exception goes on, and leaves nothing behind but a folder NAME.part where there is a checkpoint in it. A writer of
     the same session then begins with `n_frames` frames that need not be given again.
+
+    blueprint: makes the replay's layout from session.json's content; report: writes report.html into the folder.
     """
 
     def __init__(
         self,
-        path: Path,
+        path: str | Path,
         origin: Provenance,
         *,
         overwrite: bool = False,
         blueprint: BlueprintMaker | None = None,
         report: ReportMaker | None = None,
     ) -> None:
+        path = Path(path)
         check_place(path, overwrite)
         self.path, self.origin = path, origin
         self._overwrite, self._report = overwrite, report

@@ -8,11 +8,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body._kernels import place_joints
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.memory import Room, let_go
-from liex_lab.tracking._joints import place_joints
+from liex_lab.runtime.memory import Room, let_go
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.tracking.chain import NONE, Chain
-from liex_lab.tracking.curve import Subject, to_track
+from liex_lab.tracking.association import NONE, Chain
+from liex_lab.tracking.motion_model import Tuning
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.offline import Subject, to_track
 from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.track import Track
-from liex_lab.tracking.tuning import Tuning
 
 # frames that have a say in which hypothesis is the animal, and before the one that is told in where exactly it is
 _WINDOW, _BEFORE = 48, 20

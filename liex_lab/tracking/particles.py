@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.foreground.height_maps import Foreground, view_of
 from liex_lab.forests.forest import predict
 from liex_lab.geometry import SE3, brownian_path, brownian_steps, so3
-from liex_lab.recordings.crops import Foreground, view_of
 from liex_lab.recordings.frame import DepthFrame
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
+from liex_lab.foreground.height_maps import CROP, Crops, Foreground
 from liex_lab.geometry import SE3
-from liex_lab.recordings.crops import CROP, Crops, Foreground
 
 Array = NDArray[np.float64]
 

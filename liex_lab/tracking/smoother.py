@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.tracking import _smooth as kernels
+from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]

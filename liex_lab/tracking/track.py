@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Room, blocks, let_go
 
 Array = NDArray[np.float64]
 

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.memory import Room
-from liex_lab.recordings.crops import Foreground
+from liex_lab.foreground.height_maps import Foreground
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.threads import threads
-from liex_lab.tracking.curve import Subject, single_frames, track_whole
-from liex_lab.tracking.hidden import FreeEnds
+from liex_lab.runtime.memory import Room
+from liex_lab.runtime.threads import threads
+from liex_lab.tracking.motion_model import Tuning
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.occlusion import FreeEnds
+from liex_lab.tracking.offline import Subject, single_frames, track_whole
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Flip, Track, Tracked
-from liex_lab.tracking.tuning import Tuning
 
 BRIDGE_S = 0.5
 

@@ -9,11 +9,11 @@ import pytest
 
 from liex_lab.actions.channels import channel_names, stretches_of
 from liex_lab.actions.descriptors import position_descriptor, tangent_descriptor
-from liex_lab.actions.labelled import some_rows
-from liex_lab.actions.windows import window_features
+from liex_lab.actions.labels import some_rows
+from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.memory import on_disk
+from liex_lab.runtime.memory import on_disk
 from liex_lab.tracking.track import Track
 from tests.actions.toy import straight_track
 

@@ -15,16 +15,15 @@ from skops import io
 from threadpoolctl import threadpool_limits
 
 from liex_lab.actions import storage
-from liex_lab.actions.labelled import LabelledTrack, some_rows
-from liex_lab.actions.labels import read_labels, words_of
+from liex_lab.actions.labels import LabelledTrack, read_labels, some_rows, words_of
 from liex_lab.actions.learning import learn, leave_one_animal_out
 from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.storage import load_action_model, save_action_model
 from liex_lab.actions.suggestions import doubtful_stretches
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.errors import LiexError, ModelError
-from liex_lab.memory import on_disk
-from liex_lab.network import Network
+from liex_lab.mlp import Network
+from liex_lab.runtime.memory import on_disk
 from tests.actions.toy import GO, STAY, going_and_staying
 
 

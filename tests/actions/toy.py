@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.actions.labelled import LabelledTrack
+from liex_lab.actions.labels import LabelledTrack
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3

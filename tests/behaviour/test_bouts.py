@@ -10,7 +10,7 @@ from liex_lab.behaviour import MouseRules, find_bouts
 from liex_lab.behaviour.bouts import hysteresis, tidy
 from liex_lab.behaviour.kinematics import kinematics
 from liex_lab.plan import Plan
-from liex_lab.sessions.rows import stop_times
+from liex_lab.tables.rows import stop_times
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import WalkingMouse, steady
 

@@ -11,10 +11,10 @@ import pytest
 from liex_lab.behaviour.body import Body
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
-from liex_lab.memory import on_disk
-from liex_lab.recordings.times import find_gaps, median_step
-from liex_lab.sessions import tables
-from liex_lab.sessions.rows import Rows
+from liex_lab.recordings.timestamps import find_gaps, median_step
+from liex_lab.runtime.memory import on_disk
+from liex_lab.tables import schema as tables
+from liex_lab.tables.rows import Rows
 from tests.behaviour.swimming_fish import SwimmingFish
 from tests.sessions.walking_mouse import WalkingMouse, steady
 

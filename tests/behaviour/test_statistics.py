@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.pipelines.evaluate_statistics import PLANS, StudyPlan, error_rates, power
+from liex_lab.pipelines.evaluation.statistics import PLANS, StudyPlan, error_rates, power
 
 from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.cohort import STATS, collect, compare, methods

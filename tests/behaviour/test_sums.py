@@ -10,15 +10,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
 from liex_lab.behaviour.activity import activity, intervals, time_within
 from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.multiplicity import false_discovery
 from liex_lab.behaviour.places import outer_margin_mm, visits
 from liex_lab.behaviour.transitions import by_chance, count_transitions, transitions
-from liex_lab.recordings.walls import Arena
-from liex_lab.recordings.zones import Zone, zone_names
-from liex_lab.sessions.tables import BOUTS, GAPS, empty_table, to_pandas
+from liex_lab.tables.schema import BOUTS, GAPS, empty_table, to_pandas
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

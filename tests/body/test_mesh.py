@@ -15,7 +15,7 @@ from liex_lab.body.variation import vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
-from liex_lab.recordings.worlds import world_of
+from liex_lab.simulation.simulator import world_of
 
 SNAKE = Skeleton.load(find_sample("snake.toml"))
 FLESH = Surface.of(SNAKE)

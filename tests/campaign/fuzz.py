@@ -21,7 +21,8 @@ from hypothesis.errors import FailedHealthCheck
 
 import tests.exchange.test_label_fuzz as labels
 import tests.sessions.test_damaged_sessions as sessions
-from tests import test_file_fuzz, test_plan_fuzz, test_study
+from tests import test_file_fuzz
+from tests.plan import test_plan_fuzz, test_study
 
 Law = Callable[[int], int]  # a seed -> examples tried; raises what breaks it
 

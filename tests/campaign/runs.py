@@ -18,14 +18,14 @@ from liex_lab.recordings.recording import Recording
 
 SAMPLE = find_sample("mouse_walk.mcap")
 _PRELOADED = ["pandas", "rerun", "foxglove", "cv2", "pyarrow.parquet", "scipy.spatial", "liex_lab.pipelines.session",
-              "liex_lab.dashboards.report", "liex_lab.behaviour", "liex_lab.sessions.mcap", "liex_lab.tracking.tracker",
-              "liex_lab.pipelines.long"]  # fmt: skip
+              "liex_lab.dashboards.report.report", "liex_lab.behaviour", "liex_lab.sessions.mcap",
+              "liex_lab.tracking.tracker", "liex_lab.pipelines.evaluation.long_sessions"]  # fmt: skip
 _KINDS = {".parquet", ".csv", ".toml"}
 
 
 def long_sample(n_frames: int, broken_at: int = -1) -> Recording:
     """The bundled sample over and over, so that measuring it takes a while."""
-    from liex_lab.pipelines.long import looped
+    from liex_lab.pipelines.evaluation.long_sessions import looped
 
     with open_recording(SAMPLE) as short:
         recording = looped(short, n_frames)

@@ -14,9 +14,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from liex_lab.pipelines.study_state import Standing, standings
+from liex_lab.pipelines.study.status import Standing, standings
 
-from liex_lab.study import Study
+from liex_lab.plan.study import Study
 from tests.campaign.runs import SAMPLE, tables_of
 
 _N_SESSIONS = 4  # of a study whose workers are killed

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from liex_lab.dashboards.report import write_report
+from liex_lab.dashboards.report.report import write_report
 
-from liex_lab.recordings.walls import Arena
+from liex_lab.arena.outline import Arena
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_failure
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -65,7 +65,7 @@ def _copy(first: Session, place: Path, name: str, animal: str, summary: pd.DataF
 
 def _as_planned(path: Path) -> None:
     """Let every session say that it was measured with the study's plan."""
-    from liex_lab.study import Study
+    from liex_lab.plan.study import Study
 
     for planned in Study.load(path).sessions:
         document = planned.folder / "session.json"

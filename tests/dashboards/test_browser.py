@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.report import render
+from liex_lab.dashboards.report.report import render
 
-from liex_lab.recordings.walls import Arena
-from liex_lab.recordings.zones import Zone
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
 from tests.dashboards.conftest import Watched
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

@@ -13,12 +13,13 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from liex_lab.dashboards import app_plots, app_tables
-from liex_lab.dashboards.app import address, make_app
-from liex_lab.dashboards.app_data import GREY, Ethogram, StudyData, colours_of, raster
-from liex_lab.dashboards.app_session import moved_to
-from liex_lab.dashboards.figures import ACTION_COLOURS, action_colour
-from liex_lab.pipelines.listing import list_sessions
+from liex_lab.dashboards.app import plots as app_plots
+from liex_lab.dashboards.app import tables as app_tables
+from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app.page_session import moved_to
+from liex_lab.dashboards.app.server import address, make_app
+from liex_lab.dashboards.report.svg import ACTION_COLOURS, action_colour
+from liex_lab.pipelines.study.listing import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
@@ -206,8 +207,8 @@ def test_the_token_is_new_each_time_and_only_where_others_can_ask(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[dict[str, object]] = []
-    monkeypatch.setattr("liex_lab.dashboards.app.make_app", lambda data, **how: made.append(how))
-    monkeypatch.setattr("liex_lab.dashboards.app.serve", lambda app, host, port, told: told(port))
+    monkeypatch.setattr("liex_lab.dashboards.app.server.make_app", lambda data, **how: made.append(how))
+    monkeypatch.setattr("liex_lab.dashboards.app.server.serve", lambda app, host, port, told: told(port))
     monkeypatch.setattr(StudyData, "warm", lambda self, progress: None)
     said: list[str] = []
     for host in ("127.0.0.1", "0.0.0.0", "0.0.0.0"):
@@ -222,7 +223,7 @@ def test_the_token_is_new_each_time_and_only_where_others_can_ask(
 
 def test_without_dash_a_sentence_says_what_to_install(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "dash", None)
-    for name in [name for name in sys.modules if name.startswith("liex_lab.dashboards.app")]:
+    for name in [name for name in sys.modules if name.startswith("liex_lab.dashboards.app.server")]:
         monkeypatch.delitem(sys.modules, name)
     ran = CliRunner().invoke(cli.app, ["dashboard", str(study)])
     assert isinstance(ran.exception, LiexError)

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from liex_lab.dashboards.app import make_app, serve
-from liex_lab.dashboards.app_data import StudyData
-from liex_lab.pipelines.listing import list_sessions
+from liex_lab.dashboards.app.data import StudyData
+from liex_lab.dashboards.app.server import make_app, serve
+from liex_lab.pipelines.study.listing import list_sessions
 from playwright.sync_api import Page, expect
 
 from liex_lab.api import correct_session

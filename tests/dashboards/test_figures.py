@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from liex_lab.dashboards import figures
-from liex_lab.dashboards.figures import Scale
+from liex_lab.dashboards.report import svg as figures
+from liex_lab.dashboards.report.svg import Scale
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.0, 217.3), (-3.0, 0.002), (5.0, 5.01)])

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from liex_lab.dashboards.blueprint import replay_blueprint
+from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
 
 from liex_lab.api import correct_session
 from liex_lab.sessions import Session

@@ -11,20 +11,21 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards import figures
-from liex_lab.dashboards.quality import flip_rows, frame_account, warnings
-from liex_lab.dashboards.report import methods, render, write_report
+from liex_lab.dashboards.report import svg as figures
+from liex_lab.dashboards.report.quality import flip_rows, frame_account, warnings
+from liex_lab.dashboards.report.report import methods, render, write_report
 
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
 from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.around import around_onsets
 from liex_lab.body import Skeleton
 from liex_lab.exchange import export
-from liex_lab.recordings.times import find_gaps, median_step
-from liex_lab.recordings.walls import Arena
-from liex_lab.recordings.zones import Zone
-from liex_lab.sessions import Session, tables
+from liex_lab.optics.refraction import Water
+from liex_lab.recordings.timestamps import find_gaps, median_step
+from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.rrd import PALETTE
-from liex_lab.water import Water
+from liex_lab.tables import schema as tables
 from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -190,7 +191,7 @@ def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp
 
 
 def test_a_session_without_behaviour_has_a_report_too(tmp_path):
-    with Session.create(tmp_path / "bare.liex", MOUSE.provenance(), report=write_report) as writer:
+    with SessionWriter(tmp_path / "bare.liex", MOUSE.provenance(), report=write_report) as writer:
         for frames, track in MOUSE.chunks(20):
             writer.add(frames, track)
         session = writer.close()

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation._estimate import choose_survivors, mode_of_votes
+from liex_lab.estimation._cascade_kernels import choose_survivors, mode_of_votes
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.estimation.model import Calibration

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.recordings.hand_world import HandWorld
-from liex_lab.recordings.nearest import NearestScene
+from liex_lab.foreground.hand_segmenter import NearestScene
+from liex_lab.simulation.hand.simulator import HandWorld
 
 
 def test_gestures_are_measured_from_the_pictures_alone() -> None:

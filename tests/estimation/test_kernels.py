@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from liex_lab.arena.floor import Floor
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import KINECT_V2, PRIMESENSE, Camera
-from liex_lab.estimation import _kernels as kernels
+from liex_lab.estimation import _feature_kernels as kernels
+from liex_lab.foreground.background_segmenter import Crops, Scene
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
-from liex_lab.recordings.arena import Floor
-from liex_lab.recordings.foreground import Crops, Scene
+from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
 
 REACH = 50.0
 

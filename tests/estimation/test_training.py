@@ -20,7 +20,7 @@ from liex_lab.estimation.training import (
     train_cascade,
     train_metric,
 )
-from liex_lab.evaluation import rank_correlation
+from liex_lab.evaluation.pose import rank_correlation
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, tiny, toy_mice, trained, training_set, unseen, with_box
 
 VARIANTS = ["default", "paper"]

@@ -12,18 +12,18 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.body.surface import Surface, render_meshes
-from liex_lab.camera import Camera
 from liex_lab.estimation.cascade import Candidates, ImageSet, Truth
 from liex_lab.estimation.method import METHODS, Method
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.training import TrainingSet, train_cascade, train_metric
+from liex_lab.foreground.background_segmenter import Scene
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
-from liex_lab.recordings.arena import Floor
-from liex_lab.recordings.foreground import Scene
+from liex_lab.optics.camera import Camera
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 FLOOR = Floor.from_plane(np.array([0.06, -0.04, 1.0]), 600.0, CAMERA)

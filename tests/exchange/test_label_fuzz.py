@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from liex_lab.pipelines.actions import read_any_labels
+from liex_lab.pipelines.training.action_model import read_any_labels
 
 from liex_lab.actions.labels import words_of
 from liex_lab.errors import LiexError

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from liex_lab.camera import Camera
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
+from liex_lab.optics.camera import Camera
+from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
-from liex_lab.recordings.times import find_gaps, median_step
-from liex_lab.recordings.walls import Arena
-from liex_lab.recordings.zones import Zone
+from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.sessions import Session
-from liex_lab.water import Water
 from tests.sessions.walking_mouse import WalkingMouse, write
 
 HERE = Path(__file__).parent

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.balls import Balls
+from liex_lab.body.spheres import Balls
 from liex_lab.estimation.model import Model
 from liex_lab.forests.forest import Forest
 from tests.oracles import motion

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.recordings._segment import BLOCK
+from liex_lab.foreground._blob_kernels import BLOCK
 
 
 def ends_by_hand(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.body.balls import Balls
+from liex_lab.body.spheres import Balls
 
 STRIDE = 6  # every so many crop pixels a reading is looked at
 

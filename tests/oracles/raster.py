@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
+from liex_lab.optics.camera import Camera
 
 
 def ray_cast_depth(

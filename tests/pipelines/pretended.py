@@ -12,7 +12,7 @@ from typing import Any
 
 from liex_lab.errors import EstimationError, RecordingError
 from liex_lab.plan import Plan
-from liex_lab.progress import Progress
+from liex_lab.runtime.progress import Progress
 from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
 
 N_FRAMES = 40
@@ -62,7 +62,7 @@ def pretended_run(
 
 def shared_task(n: int) -> list[tuple[int, int]]:
     """A session's task that shares its stretches: each one's number, and the process that did it."""
-    from liex_lab.pipelines.cohort import Workers
+    from liex_lab.pipelines.study.dask_cluster import Workers
 
     return list(Workers().each(stretch, range(n)))
 

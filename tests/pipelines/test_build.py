@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from liex_lab.pipelines.build import build_estimator, build_recording
 
-from liex_lab.camera import Distortion
 from liex_lab.catalog import MODELS
 from liex_lab.errors import LiexError
+from liex_lab.optics.camera import Distortion
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from tests.recordings.writers import (

@@ -16,8 +16,8 @@ from liex_lab.pipelines.convert import convert
 from typer.testing import CliRunner
 
 from liex_lab import cli
-from liex_lab.camera import PRIMESENSE_QVGA
 from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import PRIMESENSE_QVGA
 from liex_lab.recordings import open_recording
 from tests.recordings.ros_writers import write_bag
 from tests.recordings.writers import (

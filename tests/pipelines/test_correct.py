@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.pipelines.actions import labelled_sessions
 from liex_lab.pipelines.correct import correct_session
+from liex_lab.pipelines.training.action_model import labelled_sessions
 from liex_lab.pipelines.verify import verify_session
 from typer.testing import CliRunner
 

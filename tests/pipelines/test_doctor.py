@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.doctor import FINDINGS, examine, lines, print_report
 
-from liex_lab.camera import Camera, Distortion
+from liex_lab.arena.floor import Floor
 from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Camera, Distortion
+from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
-from liex_lab.recordings.arena import Floor
-from liex_lab.water import Water
 from tests.oracles.plate import Plate, bent_down
 from tests.oracles.refraction import seen
 from tests.recordings.oni_files import depth_builder

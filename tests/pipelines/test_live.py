@@ -8,15 +8,15 @@ import time
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.evaluate_live import _to_and_fro
+from liex_lab.pipelines.evaluation.live import _to_and_fro
 from liex_lab.pipelines.live import follow_live, open_live
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.arriving import Arrival, _stamped, growing, received, replayed
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.streaming import Arrival, _stamped, growing, received, replayed
 
 ADDRESS = "synthetic:walk?seed=3&frames=24&sensor=primesense-qvga&spine_mm=70"
 PLAN = Plan.load("mouse").with_settings(["animal.spine_mm=70"])
@@ -101,7 +101,7 @@ def test_what_does_not_greet_as_a_sender_does_is_told_apart():
 
 
 def test_a_first_frame_that_is_long_in_the_making_ends_nothing(monkeypatch):
-    monkeypatch.setattr("liex_lab.recordings.arriving._GREETING_S", 0.2)
+    monkeypatch.setattr("liex_lab.recordings.streaming._GREETING_S", 0.2)
     whole = open_recording(ADDRESS)
 
     def read(index: int) -> np.ndarray:

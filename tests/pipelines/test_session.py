@@ -14,10 +14,10 @@ from liex_lab.errors import EstimationError, PlanError, SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.sensors import PRIMESENSE_QVGA_SENSOR
-from liex_lab.recordings.synthetic import FRAME_NS, SyntheticSession
-from liex_lab.recordings.walking import walking_session
 from liex_lab.sessions import Session
+from liex_lab.simulation.locomotion import walking_session
+from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.tracker import FrameTracker
 from tests.recordings.writers import START_NS, write_png_folder
@@ -217,7 +217,8 @@ def test_zones_are_drawn_in_a_file_that_the_plan_names(folder, session, tmp_path
 
 
 def test_a_slip_in_the_zones_is_told_before_any_work(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("liex_lab.recordings.foreground.Scene.learn", lambda *_: pytest.fail("work was begun"))
+    learn = "liex_lab.foreground.background_segmenter.Scene.learn"
+    monkeypatch.setattr(learn, lambda *_: pytest.fail("work was begun"))
     plan = Plan.load("mouse").with_settings([f"arena.zones={tmp_path / 'none.toml'}"])
     with pytest.raises(PlanError, match=r"there is no file .*none\.toml"):
         run_session(folder, plan, tmp_path / "out")

@@ -20,11 +20,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from liex_lab.progress import silent
-from liex_lab.recordings._message_file import MessageFile
-from liex_lab.recordings.mcap import McapFile
-from liex_lab.recordings.primesense_writer import Codec
-from liex_lab.recordings.rosbag import BagFile
+from liex_lab.recordings.formats.messages.mcap import McapFile
+from liex_lab.recordings.formats.messages.message_file import MessageFile
+from liex_lab.recordings.formats.messages.rosbag import BagFile
+from liex_lab.recordings.formats.oni.writer import Codec
+from liex_lab.runtime.progress import silent
 from tests.recordings.oni_files import depth_builder, plain_payload
 from tests.recordings.picture_writers import (
     write_folder,

@@ -12,7 +12,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
+from liex_lab.optics.camera import Camera
 from tests.recordings.writers import SMALL, Frames, even_times, write_camera, write_times
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from liex_lab.camera import Camera
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings.rvl import pack_rvl
 from tests.recordings.writers import SMALL, even_times
 

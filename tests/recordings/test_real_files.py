@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liex_lab.camera import Camera
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.raytrix import read_ray_calibration
+from liex_lab.recordings.formats.images.raytrix import read_ray_calibration
 from tests.recordings.asking import refusal
 from tests.recordings.picture_writers import write_raytrix, write_tiff
 from tests.recordings.writers import cut, write_camera, write_mcap

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.camera import Camera, Distortion
+from liex_lab.optics.camera import Camera, Distortion
+from liex_lab.optics.refraction import RANGINGS, Water
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.rectify import ideal_camera, lookup_table, rectified, rectifier, share_lost, straight_camera
-from liex_lab.water import RANGINGS, Water
 from tests.oracles.plate import Plate
 
 CAMERA = Camera(150.0, 152.0, 79.5, 61.0, 160, 120)

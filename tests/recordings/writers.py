@@ -18,9 +18,9 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CameraCalibration, CompressedImage, RawImage, Timestamp
 from numpy.typing import NDArray
 
-from liex_lab.camera import Camera
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings import Recording
-from liex_lab.recordings.primesense_writer import Codec, write_oni
+from liex_lab.recordings.formats.oni.writer import Codec, write_oni
 
 Frames = NDArray[np.uint16]
 

@@ -28,10 +28,10 @@ def write_session(place: str, pause_s: float = 0.0, every_s: float = 0.0) -> Non
 
 def _write(place: str, pause_s: float) -> None:
     from liex_lab import behaviour
-    from liex_lab.sessions import Session
+    from liex_lab.sessions import SessionWriter
     from liex_lab.tracking.track import Track
 
-    with Session.create(place, MOUSE.provenance(), overwrite=True) as writer:
+    with SessionWriter(place, MOUSE.provenance(), overwrite=True) as writer:
         writer.go_on(lambda row: MOUSE.frame(row).depth)
         for frames, track in MOUSE.chunks(CHUNK):
             if frames[0].index >= writer.n_frames:

@@ -8,12 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.sessions import evidence, tables
-from liex_lab.sessions import rows as rows_module
+from liex_lab.sessions import evidence
 from liex_lab.sessions.evidence import FILE, write_evidence
-from liex_lab.sessions.rows import Rows
-from liex_lab.tracking.curve import Subject
+from liex_lab.tables import rows as rows_module
+from liex_lab.tables import schema as tables
+from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking.offline import Subject
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))

@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 from liex_lab.errors import SessionError
-from liex_lab.sessions import Session, checkpoint, rrd
+from liex_lab.sessions import Session, SessionWriter, checkpoint, rrd
 from liex_lab.sessions.checkpoint import Checkpoint, Columns
 from liex_lab.sessions.joining import rrd_messages
 from tests.sessions.interrupted import CHUNK, MOUSE, start, write_session
@@ -109,9 +109,9 @@ def test_its_replay_holds_the_rows_of_an_undisturbed_one(disturbed: tuple[Path, 
 
 def test_two_processes_do_not_write_one_session(tmp_path: Path) -> None:
     place = tmp_path / "circle.liex"
-    with Session.create(place, MOUSE.provenance()) as writer:
+    with SessionWriter(place, MOUSE.provenance()) as writer:
         with pytest.raises(SessionError, match="another process is writing the session"):
-            Session.create(place, MOUSE.provenance())
+            SessionWriter(place, MOUSE.provenance())
         writer.add(*next(MOUSE.chunks(10)))
         writer.close()
     assert len(Session.open(place).frames) == 10
@@ -180,7 +180,7 @@ def test_what_cannot_be_gone_on_with_is_begun_anew(
 
 def test_an_accident_before_the_first_checkpoint_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):  # noqa: SIM117
-        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+        with SessionWriter(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
             writer.add([MOUSE.frame(1 // 0)])
     assert list(tmp_path.iterdir()) == []
 

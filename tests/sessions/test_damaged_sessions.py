@@ -20,8 +20,8 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.evidence import read_evidence, read_flips, write_evidence
 from liex_lab.sessions.failure import read_failure
-from liex_lab.tracking.curve import Subject
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.offline import Subject
 from tests.damage import ANYTHING, check, damage
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

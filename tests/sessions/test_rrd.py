@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 import liex_lab.sessions.rrd as replay
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
-from liex_lab.camera import Camera
 from liex_lab.geometry import SE3, so3
-from liex_lab.recordings.times import find_gaps, median_step
-from liex_lab.recordings.walls import Arena
-from liex_lab.recordings.zones import Zone
-from liex_lab.sessions import Session
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.timestamps import find_gaps, median_step
+from liex_lab.sessions import SessionWriter
 from liex_lab.sessions.rrd_body import BODY, body_parts
-from liex_lab.tracking.curve import Subject
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.offline import Subject
 from liex_lab.tracking.track import Tracked
 from tests.oracles.rvl import unpack_rvl
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -131,7 +131,7 @@ def test_a_noisy_frame_takes_less_than_180_kilobytes_and_without_depth_next_to_n
     sizes = {}
     for depth in (True, False):
         place = tmp_path / f"{depth}.liex"
-        with Session.create(place, mouse.provenance(replay_depth=depth)) as writer:
+        with SessionWriter(place, mouse.provenance(replay_depth=depth)) as writer:
             for frames, track in mouse.chunks(12):
                 writer.add([noisy(frame) for frame in frames], track)
             writer.close()
@@ -179,7 +179,7 @@ def test_every_candidate_is_there_when_it_is_asked_for(tmp_path, strict):
         seen.put_pose(h, Pose(SE3(track.root_rotation, track.root_mm + 10.0 * h), track.angles_rad, track.scale))
         seen.score[:, h] = 1.0
     subject = Subject(mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 9.0, 0.5, (1.0,) * 5)
-    with Session.create(tmp_path / "c.liex", mouse.provenance(replay_candidates=True)) as writer:
+    with SessionWriter(tmp_path / "c.liex", mouse.provenance(replay_candidates=True)) as writer:
         for frames, _ in mouse.chunks(15):
             writer.add(frames)
         writer.take(Tracked(track, ()), seen, subject)
@@ -227,8 +227,8 @@ def test_the_colours_spread_over_the_floor_and_an_animal_on_it():
 
 
 def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict):
-    from liex_lab.dashboards.blueprint import replay_blueprint
-    from liex_lab.dashboards.views import write_views
+    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+    from liex_lab.dashboards.report.views import write_views
     from mcap.reader import make_reader
     from rerun.chunk import RrdReader
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from liex_lab.arena.floor import Floor
+from liex_lab.arena.outline import UNKNOWN, Arena
+from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
-from liex_lab.recordings.arena import Floor
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.walls import UNKNOWN, Arena
-from liex_lab.recordings.zones import Zone
-from liex_lab.sessions import Provenance, Session
+from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.tracking.track import Track
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, part, steady, write
@@ -134,7 +134,7 @@ def test_the_session_row_names_the_animal(session):
 
 def test_an_exception_leaves_nothing_behind_and_goes_on(tmp_path):
     with pytest.raises(RuntimeError, match="the tracker broke"):  # noqa: PT012, SIM117
-        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+        with SessionWriter(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
             frames, track = next(MOUSE.chunks(10))
             writer.add(frames, track)
             assert [path.name for path in tmp_path.iterdir()] == ["circle.liex.part"]
@@ -147,7 +147,7 @@ def test_an_exception_while_closing_leaves_nothing_behind_either(tmp_path):
         raise OSError("no space left")
 
     with pytest.raises(OSError, match="no space left"):  # noqa: PT012, SIM117
-        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+        with SessionWriter(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
             writer.add(*next(MOUSE.chunks(10)))
             writer._replay.finish = broken  # type: ignore[method-assign]
             writer.close()
@@ -156,20 +156,20 @@ def test_an_exception_while_closing_leaves_nothing_behind_either(tmp_path):
 
 def test_a_blueprint_that_cannot_be_made_leaves_nothing_behind(tmp_path):
     with pytest.raises(ZeroDivisionError):
-        Session.create(tmp_path / "circle.liex", MOUSE.provenance(), blueprint=lambda _: 1 / 0)
+        SessionWriter(tmp_path / "circle.liex", MOUSE.provenance(), blueprint=lambda _: 1 / 0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_session_that_is_not_closed_is_not_kept(tmp_path):
     with pytest.raises(SessionError, match="close"):  # noqa: SIM117
-        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+        with SessionWriter(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
             writer.add(*next(MOUSE.chunks(10)))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_without_frames_makes_no_session(tmp_path):
     with pytest.raises(SessionError, match="no frame"):  # noqa: SIM117
-        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+        with SessionWriter(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
             writer.close()
     assert list(tmp_path.iterdir()) == []
 
@@ -180,7 +180,7 @@ def test_a_session_is_replaced_only_when_asked_and_only_by_a_whole_one(tmp_path)
     with pytest.raises(SessionError, match="exists already"):
         write(place, MOUSE)
     with pytest.raises(KeyboardInterrupt):  # noqa: SIM117
-        with Session.create(place, MOUSE.provenance(), overwrite=True):
+        with SessionWriter(place, MOUSE.provenance(), overwrite=True):
             raise KeyboardInterrupt
     assert Session.open(place).name == "first"
     assert write(place, MOUSE, name="second", overwrite=True).name == "second"
@@ -192,7 +192,7 @@ def test_a_folder_that_is_not_a_session_is_never_touched(tmp_path):
     place.mkdir()
     (place / "chapter1.txt").write_text("years of work")
     with pytest.raises(SessionError, match="not a session"):
-        Session.create(place, MOUSE.provenance(), overwrite=True)
+        SessionWriter(place, MOUSE.provenance(), overwrite=True)
     assert (place / "chapter1.txt").read_text() == "years of work"
     assert list(tmp_path.iterdir()) == [place]
 
@@ -211,13 +211,13 @@ def test_a_broken_report_does_not_take_the_session_with_it(tmp_path):
 def test_a_track_of_other_frames_is_refused(tmp_path):
     frames, track = next(MOUSE.chunks(10))
     with pytest.raises(SessionError, match="one row for every frame"):  # noqa: SIM117
-        with Session.create(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
+        with SessionWriter(tmp_path / "circle.liex", MOUSE.provenance()) as writer:
             writer.add(frames, part(track, 1, 10))
 
 
 def test_a_track_may_come_at_the_end_as_a_whole(tmp_path):
     whole = MOUSE.track()
-    with Session.create(tmp_path / "late.liex", MOUSE.provenance()) as writer:
+    with SessionWriter(tmp_path / "late.liex", MOUSE.provenance()) as writer:
         for frames, _ in MOUSE.chunks(10):
             writer.add(frames)
         writer.track = whole
@@ -226,7 +226,7 @@ def test_a_track_may_come_at_the_end_as_a_whole(tmp_path):
 
 
 def test_a_recording_in_which_nothing_is_found_is_a_session_all_the_same(tmp_path):
-    with Session.create(tmp_path / "empty.liex", MOUSE.provenance()) as writer:
+    with SessionWriter(tmp_path / "empty.liex", MOUSE.provenance()) as writer:
         for frames, _ in MOUSE.chunks(10):
             writer.add(frames, Track.empty(MOUSE.skeleton, np.array([f.time_ns for f in frames]), "no_depth"))
         session = writer.close()
@@ -282,7 +282,7 @@ from tests.sessions.walking_mouse import WalkingMouse, part, steady
 n = int(sys.argv[2])
 mouse = WalkingMouse(steady(n / 30), camera=PRIMESENSE)
 track, base = mouse.track(), mouse.frame(0).depth
-with Session.create(sys.argv[1], mouse.provenance()) as writer:
+with SessionWriter(sys.argv[1], mouse.provenance()) as writer:
     for start in range(0, n, 30):
         frames = [DepthFrame(i, int(track.times_ns[i]), np.roll(base, 7 * i)) for i in range(start, start + 30)]
         writer.add(frames, part(track, start, start + 30))

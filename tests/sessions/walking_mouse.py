@@ -11,10 +11,10 @@ import numpy as np
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.camera import Camera
 from liex_lab.geometry import SE3, so3
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.sessions import Provenance, Session
+from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.tracking.track import Track
 
 FLOOR_MM = 700.0
@@ -153,7 +153,7 @@ def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Se
     from liex_lab import behaviour
 
     own = {name: more.pop(name) for name in ("overwrite", "blueprint", "report") if name in more}
-    with Session.create(folder, mouse.provenance(**more), **own) as writer:
+    with SessionWriter(folder, mouse.provenance(**more), **own) as writer:
         for frames, track in mouse.chunks(chunk):
             writer.add(frames, track)
         origin = writer.origin

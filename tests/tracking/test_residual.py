@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
-from liex_lab.camera import Camera
+from liex_lab.foreground.background_segmenter import Scene
 from liex_lab.geometry import SE3
-from liex_lab.recordings.arena import Floor
-from liex_lab.recordings.foreground import Scene
+from liex_lab.optics.camera import Camera
 from liex_lab.tracking.residual import BodyResidual, render_crops
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from liex_lab.body._kernels import exp_so3
 from liex_lab.geometry import so3
-from liex_lab.tracking import _filter as kernels
-from liex_lab.tracking._joints import exp_so3
+from liex_lab.tracking import _kalman_kernels as kernels
 
 TIMES = np.cumsum([0.0, 0.03, 0.03, 0.1, 0.03, 0.03, 0.2, 0.03, 0.03])
 Q, FADE = 40.0, 0.3

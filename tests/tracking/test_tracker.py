@@ -9,8 +9,8 @@ import pytest
 
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.foreground.background_segmenter import Scene
 from liex_lab.geometry import so3
-from liex_lab.recordings.foreground import Scene
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.tracking.track import Track
 from liex_lab.tracking.tracker import FrameTracker

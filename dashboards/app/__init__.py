@@ -1,0 +1,1 @@
+"""`liex dashboard`: a study's pages in the browser."""

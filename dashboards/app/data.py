@@ -1,0 +1,263 @@
+"""What the dashboard shows of a study: looked up in the session folders when asked for, and kept until those change."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.behaviour import cohort
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session
+from liex_lab.sessions.corrections import LOG, corrected_folder
+from liex_lab.sessions.listed import WHO, Entry
+
+from ..report.svg import ACTION_COLOURS, action_colour
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DONE = ("done", "changed")  # states in which there is a session to look at
+NO_POSE, OTHER = "no pose", "other actions"
+GREY, VOID = "#dcdcd7", "#ffffff"
+_READERS = 4  # threads; most of the time goes into opening files
+_HELD = 6  # sessions whose tables stay in memory
+
+
+@dataclass(frozen=True)
+class Ethogram:
+    """A session's bouts as spans (n, 2) s with their words, the spans without a pose (m, 2) s, and how long it is.
+
+    vocabulary: all words that its ethogram could have, in the order of which report and replay colour them.
+    """
+
+    spans_s: np.ndarray
+    words: list[str]
+    lost_s: np.ndarray
+    duration_s: float
+    vocabulary: tuple[str, ...] = ()
+
+
+class StudyData:
+    """The study that `look` lists, read lazily. Every public method may be called from several threads at once."""
+
+    def __init__(self, name: str, look: Callable[[], Sequence[Entry]]) -> None:
+        self.name, self._look = name, look
+        self._lock = threading.RLock()
+        self._kept: dict[tuple[str, str], tuple[Any, Any]] = {}
+        self._stats: dict[Any, pd.DataFrame] = {}
+        self._open: dict[str, tuple[Any, Session]] = {}
+        self.entries: dict[str, Entry] = {}
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Look again which sessions there are and where each stands."""
+        found = self._look()
+        with self._lock:
+            self.entries = {entry.key: entry for entry in found}
+            self._stats.clear()
+
+    def warm(self, progress: Progress = silent) -> None:
+        """Read what the first page shows; what the others show is read meanwhile, by a thread of its own."""
+        entries = self.done
+        for k, entry in enumerate(entries):
+            progress(k, len(entries), "reading sessions")
+            self._of_one("quality", _quality, entry)
+        threading.Thread(target=self._read_ahead, daemon=True).start()
+
+    def _read_ahead(self) -> None:
+        self.ethograms([entry.key for entry in self.done])
+        self.collected()
+
+    @property
+    def done(self) -> list[Entry]:
+        """The sessions that were measured."""
+        return [entry for entry in self.entries.values() if entry.state in DONE and entry.folder is not None]
+
+    def session(self, key: str) -> Session:
+        """An opened session; the same object until its folder changes. Raises SessionError where there is none."""
+        entry = self.entries.get(key)
+        if entry is None or entry.folder is None or entry.state not in DONE:
+            raise SessionError(f"the study has no measured session '{key}'; see the list of its sessions")
+        stamp = _stamp(entry.folder)
+        with self._lock:
+            known = self._open.pop(key, None)
+            if known is None or known[0] != stamp:
+                known = (stamp, Session.open(entry.folder))
+            self._open[key] = known  # at the end: the first ones go first
+            while len(self._open) > _HELD:
+                self._open.pop(next(iter(self._open)))
+            return known[1]
+
+    def overview(self) -> pd.DataFrame:
+        """One row per session: who, state, and how good it is."""
+        import pandas as pd
+
+        measured = dict(zip((entry.key for entry in self.done), self._of_all("quality", _quality), strict=True))
+        rows = [
+            {"session": entry.key, **{name: entry.who.get(name, "") for name in WHO}, "state": entry.state,
+             "reason": entry.reason, "remedy": entry.remedy, **measured.get(entry.key, {})}
+            for entry in self.entries.values()
+        ]  # fmt: skip
+        return pd.DataFrame(rows, columns=["session", *WHO, "state", "reason", "remedy", *QUALITY])
+
+    def ethograms(self, keys: Iterable[str]) -> dict[str, Ethogram]:
+        """The ethograms of some sessions, those that cannot be read left out."""
+        entries = [self.entries[key] for key in keys if key in self.entries]
+        found = self._of_all("ethogram", _ethogram, [entry for entry in entries if entry in self.done])
+        return {entry.key: one for entry, one in zip(entries, found, strict=False) if isinstance(one, Ethogram)}
+
+    def collected(self) -> pd.DataFrame:
+        """One row per measured session, as the comparison of groups takes it; the study's groups overrule theirs."""
+        import pandas as pd
+
+        done = self.done
+        tables = []
+        for entry, table in zip(done, self._of_all("summary", _summary), strict=True):
+            if isinstance(table, pd.DataFrame):
+                stated = {name: value for name, value in entry.who.items() if value}
+                tables.append(table.assign(key=entry.key, **stated))
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=["key", "session_id", *WHO])
+
+    def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
+        """The comparison of the groups: the usual measures and this one, with p corrected for all of them."""
+        table = self.collected()
+        measures = cohort.usual_measures(table)
+        wanted = measures if measure in measures else [*measures, measure]
+        asked = (tuple(wanted), reference)
+        with self._lock:
+            if asked not in self._stats:
+                self._stats[asked] = cohort.compare(table, wanted, reference)
+            return self._stats[asked]
+
+    def described(self, measure: str) -> tuple[str, str]:
+        """The unit of a measure and what it means, from the column dictionary of the first session that has it."""
+        for entry in self.done:
+            columns = self._of_one("columns", lambda session: session.columns, entry)
+            if not isinstance(columns, dict):
+                own = columns[(columns["table"] == "summary") & (columns["name"] == measure)]
+                if len(own):
+                    return str(own["unit"].iloc[0] or ""), str(own["meaning"].iloc[0])
+        return "", ""
+
+    def _of_all(
+        self, what: str, read: Callable[[Session], Any], entries: Sequence[Entry] | None = None
+    ) -> list[Any]:
+        """`read` of every measured session, from memory where its folder has not changed since."""
+        chosen = self.done if entries is None else entries
+        with ThreadPoolExecutor(_READERS) as pool:
+            return list(pool.map(lambda entry: self._of_one(what, read, entry), chosen))
+
+    def _of_one(self, what: str, read: Callable[[Session], Any], entry: Entry) -> Any:
+        assert entry.folder is not None
+        stamp, known = _stamp(entry.folder), self._kept.get((what, entry.key))
+        if known is not None and known[0] == stamp:
+            return known[1]
+        try:
+            value = read(Session.open(entry.folder))
+        except LiexError as error:
+            value = {"damage": str(error)}
+        self._kept[what, entry.key] = (stamp, value)
+        return value
+
+
+QUALITY = (
+    "duration_min", "n_frames", "posed_share", "doubtful_share", "n_gaps", "n_missing", "predicted_error_mm",
+    "n_flips", "flips_s", "warnings", "damage",
+)  # fmt: skip
+
+
+def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
+    """The actions of some ethograms, those with the most time first."""
+    seconds: dict[str, float] = {}
+    for one in ethograms:
+        for word, (start, stop) in zip(one.words, one.spans_s, strict=True):
+            seconds[word] = seconds.get(word, 0.0) + float(stop - start)
+    return sorted(seconds, key=lambda word: (-seconds[word], word))
+
+
+def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str, str]:
+    """A colour for each word, where it is free its own of report and replay; words beyond the last share a grey."""
+    own = {word: action_colour(k) for k, word in reversed(list(enumerate(vocabulary)))}
+    chosen: dict[str, str] = {}
+    for word in words:
+        if word in own and own[word] not in chosen.values():
+            chosen[word] = own[word]
+    free = iter([colour for colour in ACTION_COLOURS if colour not in chosen.values()])
+    return {word: chosen.get(word) or next(free, GREY) for word in words}
+
+
+def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
+    """The words of several vocabularies, in the order of the first that has them."""
+    return list(dict.fromkeys(word for one in ethograms for word in one.vocabulary))
+
+
+def raster(one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int) -> np.ndarray:
+    """(n,) for each of n equal parts of a span: the place of the word with the most time in it, -1 for none, -2 where
+    there is mostly no pose.
+    """  # fmt: skip
+    place = {word: k for k, word in enumerate(words)}
+    seconds = np.zeros((len(words) + 1, n))
+    step = (stop_s - start_s) / n
+    kinds = [place.get(word, -1) for word in one.words] + [len(words)] * len(one.lost_s)
+    for kind, (a, b) in zip(kinds, np.concatenate([one.spans_s, one.lost_s]), strict=True):
+        low, high = (float(np.clip((at - start_s) / step, 0, n)) for at in (a, b))
+        if kind < 0 or high <= low:
+            continue
+        first, last = int(low), min(int(np.ceil(high)), n) - 1
+        seconds[kind, first : last + 1] += 1.0
+        seconds[kind, first] -= low - first
+        seconds[kind, last] -= last + 1 - high
+    best = seconds.argmax(axis=0)
+    best[best == len(words)] = -2
+    best[seconds.max(axis=0) <= 0.0] = -1
+    return best
+
+
+def _stamp(folder: Path) -> Any:
+    """Changes whenever the session is written again or corrected."""
+    stamps: list[tuple[int, int, int] | None] = []
+    for path in (folder / "session.json", corrected_folder(folder) / LOG):
+        try:
+            found = path.stat()
+            stamps.append((found.st_mtime_ns, found.st_size, found.st_ino))
+        except OSError:
+            stamps.append(None)
+    return tuple(stamps)
+
+
+def _quality(session: Session) -> dict[str, Any]:
+    frames = session.metadata["frames"]
+    n = max(int(frames["n_frames"]), 1)
+    error = session.table("frames", ["predicted_error_mm"])["predicted_error_mm"]
+    flips = session.table("flips", ["start_s", "stop_s"])
+    return {
+        "duration_min": frames["duration_s"] / 60.0, "n_frames": frames["n_frames"],
+        "posed_share": frames["n_observed"] / n, "doubtful_share": frames["flags"].get("doubtful", 0) / n,
+        "n_gaps": frames["n_gaps"], "n_missing": frames["n_missing"], "predicted_error_mm": float(error.median()),
+        "n_flips": len(flips), "flips_s": float((flips["stop_s"] - flips["start_s"]).sum()),
+        "warnings": len(session.metadata["problems"]), "damage": "",
+    }  # fmt: skip
+
+
+def _ethogram(session: Session) -> Ethogram:
+    bouts = session.table("bouts", ["action", "start_s", "stop_s"])
+    gaps = session.table("gaps", ["start_s", "stop_s", "n_frames_missing"])
+    lost = gaps[gaps["n_frames_missing"] > 0]
+    return Ethogram(
+        bouts[["start_s", "stop_s"]].to_numpy(float), [str(word) for word in bouts["action"]],
+        lost[["start_s", "stop_s"]].to_numpy(float), float(session.metadata["frames"]["duration_s"]),
+        tuple(session.metadata.get("actions") or {}),
+    )  # fmt: skip
+
+
+def _summary(session: Session) -> pd.DataFrame | None:
+    if not session.has("summary.csv"):
+        return None
+    return cohort.collect([session])

@@ -1,0 +1,91 @@
+"""Who may ask the dashboard for anything, and what its pages may load: this machine alone, unless told otherwise."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from flask import Flask, Response, abort, redirect, request, stream_with_context
+
+from liex_lab.errors import LiexError
+
+from . import tables
+from .data import StudyData
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_COOKIE = "liex_dashboard"
+_REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # a report needs no script, so it has none
+
+
+def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
+    """Refuse requests of others: with a token those that do not know it, without one those of any other name.
+
+    A name that is not this machine's would be another site's whose address was bent to us (DNS rebinding); an origin
+    that is not ours another site's page that sends forms here.
+    """
+
+    @server.before_request
+    def allowed() -> Any:
+        name = urlsplit(f"//{request.host}").hostname or ""
+        if not token and name not in LOOPBACK:
+            abort(Response("This dashboard answers on 127.0.0.1 only.", 403, mimetype="text/plain"))
+        origin = request.headers.get("Origin")
+        if origin and urlsplit(origin).netloc != request.host:
+            abort(Response("This dashboard takes no requests from other sites.", 403, mimetype="text/plain"))
+        if not token:
+            return None
+        told = request.args.get("token", "")
+        if told and hmac.compare_digest(told.encode(), token.encode()):
+            answer = redirect(request.path)
+            answer.set_cookie(_COOKIE, token, httponly=True, samesite="Strict")
+            return answer
+        if not hmac.compare_digest(request.cookies.get(_COOKIE, "").encode(), token.encode()):
+            said = "Open the address that `liex dashboard` printed, with its token."
+            abort(Response(said, 401, mimetype="text/plain"))
+        return None
+
+    @server.after_request
+    def policies(response: Response) -> Response:
+        response.headers.setdefault("Content-Security-Policy", page_policy())
+        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers["Referrer-Policy"] = "no-referrer"
+        return response
+
+
+def add_downloads(server: Flask, data: StudyData) -> None:
+    """Addresses of tables as CSV, and of sessions' reports."""
+
+    @server.get("/csv/<path:name>.csv")
+    def table_csv(name: str) -> Response:
+        return _csv(lambda: tables.find(data, name).rows, name.replace("/", "_").strip("_"))
+
+    @server.get("/session-csv/<path:key>/<name>.csv")
+    def session_csv(key: str, name: str) -> Response:
+        return _csv(lambda: tables.session_table(data, key, name), f"{key}_{name}")
+
+    @server.get("/report/<path:key>")
+    def report(key: str) -> Response:
+        try:
+            page = (data.session(key).path / "report.html").read_text(encoding="utf-8")
+        except (LiexError, OSError):
+            return Response("This session has no report.", 404, mimetype="text/plain")
+        answer = Response(page, mimetype="text/html")
+        answer.headers["Content-Security-Policy"] = _REPORT
+        return answer
+
+
+def _csv(find: Callable[[], pd.DataFrame], name: str) -> Response:
+    try:
+        rows = find()
+    except LiexError as error:
+        return Response(str(error), 404, mimetype="text/plain")
+    pieces: Iterator[str] = tables.as_csv(rows)
+    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in name) or "table"
+    answer = Response(stream_with_context(pieces), mimetype="text/csv")
+    answer.headers["Content-Disposition"] = f'attachment; filename="{safe}.csv"'
+    return answer

@@ -1,0 +1,112 @@
+"""The page that compares groups of animals: one measure drawn, every comparison in a table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dash import Dash, Input, Output, dcc, html, no_update
+
+from liex_lab.behaviour import cohort
+from liex_lab.errors import LiexError
+
+from . import plots
+from .data import StudyData
+from .parts import graph
+from .tables import block, columns_of, number, records, session_address
+
+ALL = "every pair"
+
+
+def groups_page(data: StudyData) -> list[Any]:
+    """Choose a measure; see the animals, the differences, and the test that the design allows."""
+    table = data.collected()
+    measures = list(columns_of(data))
+    usual = [name for name in cohort.usual_measures(table) if name in measures]
+    ordered = [*usual, *(name for name in measures if name not in usual)]
+    names = sorted({str(name) for name in table["group"].fillna("")} - {""})
+    if not ordered or len(names) < 2:
+        said = f"{len(table)} measured sessions have {', '.join(names) or 'no group'}"
+        return [
+            html.P("Study", className="kind"), html.H1("Groups"),
+            html.P(f"A comparison needs two groups of animals, and these {said}. State `group` for the animals in the "
+                   "study file, or session.group in the plan."),
+        ]  # fmt: skip
+    return [
+        html.P("Study", className="kind"),
+        html.H1("Groups"),
+        html.Div(className="tools", children=[
+            html.Label([html.Span("Measure"), dcc.Dropdown(
+                id="measure", options=[{"label": name.replace("_", " "), "value": name} for name in ordered],
+                value=ordered[0], clearable=False,
+            )]),
+            html.Label([html.Span("Compare"), dcc.Dropdown(
+                id="reference", clearable=False, value=ALL,
+                options=[{"label": ALL, "value": ALL}, *({"label": f"with {one}", "value": one} for one in names)],
+            )]),
+        ]),
+        html.P(id="measure-meaning", className="muted"),
+        html.Div(className="pair", children=[
+            html.Div([html.H2("Animals"), graph("group-points", plots.empty("Comparing ..."),
+                                                "each animal's mean and its sessions, by group"),
+                      html.P("Large marks are animals, small ones their sessions, the line is the mean of the animals. "
+                             "A click opens the session.", className="muted")]),
+            html.Div([html.H2("Differences"), graph("group-differences", plots.empty("Comparing ..."),
+                                                    "differences of the groups with their intervals"),
+                      html.Div(id="verdicts")]),
+        ]),
+        html.H2("Every comparison"),
+        html.P("All that was compared stands here, tested or not; p is corrected for the whole table.",
+               className="muted"),
+        html.Div(id="stats-table"),
+        html.H2("For the methods section"),
+        html.P(id="stats-methods", className="paste"),
+    ]  # fmt: skip
+
+
+def verdict(row: dict[str, Any], unit: str) -> html.Div:
+    """One contrast in words: what was found, how sure, of how many."""
+    sized = f"{number(row['estimate'])}{f' {unit}' if unit else ''}, 95 % interval {number(row['ci_low'])} to "
+    sized += f"{number(row['ci_high'])}; Hedges' g {number(row['effect_size'])} ({number(row['effect_low'])} to "
+    sized += f"{number(row['effect_high'])})"
+    if row["test"]:
+        tested = f"p = {number(row['p'])}, corrected for {row['n_family']} tests {number(row['p_fdr'])}; {row['test']}."
+    else:
+        tested = f"No test: {row['refused']}."
+    cages = f"{row['n_cages']} cages, " if row["n_cages"] else ""
+    counts = (
+        f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'}); {row['n_animals']} "
+        f"animals, {cages}{row['n_sessions']} sessions, {row['n_bouts']:,} bouts, {number(row['observed_min'])} min; "
+        f"{row['n_without_value']} sessions without a value."
+    )
+    kind = "verdict" if row["test"] else "verdict is-refused"
+    return html.Div([html.H3(row["contrast"]), html.P(sized), html.P(tested, className="tested"),
+                     html.P(counts, className="muted")], className=kind)  # fmt: skip
+
+
+def register(app: Dash, data: StudyData) -> None:
+    """What happens when a measure is chosen or an animal clicked."""
+
+    @app.callback(
+        Output("group-points", "figure"), Output("group-differences", "figure"), Output("verdicts", "children"),
+        Output("stats-table", "children"), Output("stats-methods", "children"), Output("measure-meaning", "children"),
+        Input("measure", "value"), Input("reference", "value"),
+    )  # fmt: skip
+    def compare(measure: str, reference: str) -> tuple[Any, ...]:
+        against = None if reference == ALL else reference
+        unit, meaning = data.described(measure)
+        try:
+            stats = data.stats(measure, against)
+        except LiexError as error:
+            return plots.empty(str(error)), plots.empty(""), [], [], "", meaning
+        own = stats[stats["measure"] == measure]
+        return (
+            plots.groups(data.collected(), measure, unit), plots.differences(own, unit),
+            [verdict(row, unit) for row in records(own)],
+            block(f"stats/{measure}/{against or ''}", "Every comparison"), cohort.methods(stats), meaning,
+        )  # fmt: skip
+
+    @app.callback(
+        Output("url", "href", allow_duplicate=True), Input("group-points", "clickData"), prevent_initial_call=True
+    )
+    def open_session(click: dict[str, Any] | None) -> Any:
+        return session_address(str(click["points"][0]["customdata"])) if click else no_update

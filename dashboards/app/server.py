@@ -1,0 +1,175 @@
+"""`liex dashboard`: a study in the browser, served from this machine, with nothing loaded from anywhere else."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, unquote
+
+from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc, html
+
+from liex_lab.errors import LiexError
+
+from . import (
+    page_corrections as app_correct,
+)
+from . import (
+    page_groups as app_groups,
+)
+from . import (
+    page_session as app_session,
+)
+from . import (
+    page_study as app_study,
+)
+from . import (
+    tables as app_tables,
+)
+from .data import StudyData
+from .frames import Frames
+from .guard import LOOPBACK, add_downloads, guard
+from .page_corrections import Correct
+from .page_session import ShowReplay
+from .parts import aria
+
+_ASSETS = Path(__file__).parent / "assets"
+_PAGES = (("/", "Sessions"), ("/ethograms", "Ethograms"), ("/groups", "Groups"))
+_INDEX = """<!doctype html>
+<html lang="en">
+<head>{%metas%}<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{%title%}</title>{%css%}</head>
+<body>{%app_entry%}<footer hidden>{%config%}{%scripts%}{%renderer%}</footer></body>
+</html>"""
+_POLICY = (
+    "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+)
+
+
+def make_app(
+    data: StudyData, *, token: str = "", show_replay: ShowReplay | None = None, correct: Correct | None = None
+) -> Dash:
+    """The dashboard of a study, not yet served. token: what every visitor has to know; empty on this machine alone.
+
+    show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the command is shown.
+    correct: adds corrections to the session in a folder, or takes some back; None: the pages only show.
+    """
+    app = Dash(
+        "liex_lab_dashboard", assets_folder=str(_ASSETS), serve_locally=True, suppress_callback_exceptions=True,
+        title=f"{data.name} · liex_lab", update_title="", index_string=_INDEX, add_log_handler=False,
+        compress=False,
+    )  # fmt: skip
+    app.layout = _shell(data)
+    _register(app, data, may_show=show_replay is not None, may_correct=correct is not None)
+    app_study.register(app, data)
+    app_groups.register(app, data)
+    app_session.register(app, data, Frames(), show_replay)
+    if correct is not None:
+        app_correct.register(app, data, correct)
+    hashes: list[str] = []
+
+    def policy() -> str:
+        if not hashes:
+            hashes.extend(f"'{one.strip(chr(39))}'" for one in app.csp_hashes())
+        return _POLICY.format(hashes=" ".join(hashes))
+
+    guard(app.server, token, policy)
+    add_downloads(app.server, data)
+    return app
+
+
+def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
+    """Serve until interrupted; `told` hears the port once it listens. Raises LiexError where it cannot."""
+    from werkzeug.serving import make_server
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    try:
+        server = make_server(host, port, app.server, threaded=True)
+    except (OSError, SystemExit) as error:
+        why = getattr(error, "strerror", None) or "in use"
+        raise LiexError(
+            f"the dashboard cannot listen on {host}, port {port} ({why}); name another with --port, or 0 for any that "
+            "is free"
+        ) from None
+    told(int(server.server_port))
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.server_close()
+
+
+def address(host: str, port: int, token: str) -> str:
+    """What to type into a browser."""
+    shown = "127.0.0.1" if host in (*LOOPBACK, "") else host
+    return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (f"?token={token}" if token else "")
+
+
+def _shell(data: StudyData) -> html.Div:
+    links = [dcc.Link(title, href=href, id={"part": "tab", "href": href}) for href, title in _PAGES]
+    return html.Div([
+        dcc.Location(id="url", refresh="callback-nav"),
+        html.A("Skip to the content", href="#page", className="skip"),
+        html.Header(html.Div([html.Span("liex_lab", className="brand"), html.Nav(links, **aria(label="pages"))],
+                             className="bar")),
+        html.Main(id="page", tabIndex=-1),
+    ])  # fmt: skip
+
+
+def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
+    try:
+        if path in ("", "/"):
+            return app_study.sessions_page(data)
+        if path == "/ethograms":
+            return app_study.ethograms_page(data)
+        if path == "/groups":
+            return app_groups.groups_page(data)
+        if path.startswith("/session/"):
+            key = unquote(path.removeprefix("/session/"))
+            if key not in {entry.key for entry in data.done}:
+                return app_session.failed_page(data, key)
+            return app_session.session_page(data, key, _moment(search), correcting="corrections=" in search, **may)
+    except LiexError as error:
+        return [html.H1("This cannot be shown"), html.P(str(error))]
+    return [html.H1("No such page"), html.P(dcc.Link("Sessions", href="/"))]
+
+
+def _moment(search: str) -> float:
+    try:
+        at_s = float(parse_qs(search.removeprefix("?")).get("t", ["0"])[0])
+    except ValueError:
+        return 0.0
+    return at_s if 0.0 <= at_s < 1e9 else 0.0
+
+
+def _register(app: Dash, data: StudyData, **may: bool) -> None:
+    """The pages themselves, and the sorting and filtering of every table."""
+
+    @app.callback(
+        Output("page", "children"), Output({"part": "tab", "href": ALL}, "className"),
+        Input("url", "pathname"), Input("url", "search"), State({"part": "tab", "href": ALL}, "id"),
+    )  # fmt: skip
+    def route(path: str | None, search: str | None, tabs: list[dict[str, str]]) -> tuple[Any, list[str]]:
+        here = "/" if (path or "/").startswith("/session") else path or "/"
+        marks = ["here" if tab["href"] == here else "" for tab in tabs]
+        return _page(data, path or "/", search or "", **may), marks
+
+    @app.callback(
+        Output({"part": "cells", "table": MATCH}, "data"),
+        Input({"part": "filter", "table": MATCH}, "value"), Input({"part": "order", "table": MATCH}, "data"),
+        State({"part": "filter", "table": MATCH}, "id"),
+    )  # fmt: skip
+    def fill(words: str | None, order: dict[str, Any], asked: dict[str, str]) -> Any:
+        name = asked["table"]
+        try:
+            return app_tables.fill(name, app_tables.find(data, name), words or "", order)
+        except LiexError as error:
+            return app_tables.sentence(name, str(error))
+
+    app.clientside_callback(
+        ClientsideFunction("liex", "draw"), Output({"part": "rows", "table": MATCH}, "className"),
+        Input({"part": "cells", "table": MATCH}, "data"),
+    )  # fmt: skip

@@ -1,0 +1,234 @@
+"""The dashboard's tables: found by name, sorted, filtered, shown as HTML and handed out as CSV."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+from dash import dcc, html
+
+from liex_lab.errors import SessionError
+from liex_lab.tables.schema import harmless
+
+from .data import DONE, StudyData
+from .parts import aria, download
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_ROWS = 400  # on a page; the file has them all
+_BATCH = 20_000  # rows of a long table that are in memory at once
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as it is asked for: rows, the columns to show with their headings, and the column that links onwards."""
+
+    rows: pd.DataFrame
+    shown: dict[str, str]
+    link: str = ""
+
+
+SESSIONS = {
+    "session": "session", "group": "group", "state": "state", "duration_min": "min", "posed_share": "with a pose",
+    "doubtful_share": "doubtful", "n_gaps": "gaps", "n_missing": "not delivered", "predicted_error_mm": "error, mm",
+    "n_flips": "flips", "flips_s": "flips, s", "warnings": "warnings", "reason": "what is to be said",
+}  # fmt: skip
+STATS = {
+    "measure": "measure", "contrast": "contrast", "estimate": "difference", "ci_low": "from", "ci_high": "to",
+    "effect_size": "Hedges' g", "effect_low": "from", "effect_high": "to", "p": "p", "p_fdr": "p, corrected",
+    "test": "test", "refused": "not tested, because", "unit": "unit", "n_units_first": "units, first",
+    "n_units_second": "units, second", "n_animals": "animals", "n_cages": "cages", "n_sessions": "sessions",
+    "n_bouts": "bouts", "observed_min": "observed, min", "n_without_value": "without value",
+}  # fmt: skip
+BOUTS = {"action": "action", "start_s": "from, s", "stop_s": "to, s", "duration_s": "lasts, s", "score": "score",
+         "source": "by", "peak_speed_mm_s": "peak, mm/s", "path_mm": "way, mm"}  # fmt: skip
+GAPS = {"start_s": "from, s", "stop_s": "to, s", "n_frames_missing": "frames", "reason": "reason"}
+FLIPS = {"start_s": "from, s", "stop_s": "to, s", "p_flip": "probability", "applied": "put right", "source": "by"}
+_LONG = ("test", "refused")
+STATES = {"done": "done", "changed": "changed since", "failed": "failed", "new": "waiting", "begun": "interrupted",
+          "excluded": "left out"}  # fmt: skip
+_OF_SESSION = {"bouts": BOUTS, "gaps": GAPS, "flips": FLIPS}
+
+
+def find(data: StudyData, name: str) -> Table:
+    """A table by its name: sessions, summaries, stats?MEASURE?REFERENCE, or bouts, gaps, flips of a session
+    (bouts/KEY). Raises SessionError where there is none.
+    """  # fmt: skip
+    what, _, rest = name.partition("/")
+    if name == "sessions":
+        return Table(data.overview(), SESSIONS, "session")
+    if name == "summaries":
+        rows = data.collected()
+        return Table(rows, {str(column): str(column) for column in rows}, "key")
+    if what == "stats":
+        measure, _, reference = rest.partition("/")
+        return Table(data.stats(measure, reference or None), STATS)
+    if what in _OF_SESSION and rest:
+        rows = data.session(rest).table(what)
+        shown = {column: title for column, title in _OF_SESSION[what].items() if column in rows}
+        return Table(rows, shown, "start_s")
+    raise SessionError(f"there is no table '{name}'")
+
+
+def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
+    """The rows in which every one of the words occurs, in order of a column; empty ones last."""
+    rows = table.rows
+    wanted = words.lower().split()
+    if wanted and len(rows):
+        texts = [rows[name].map(_searched) for name in table.shown if name in rows]
+        lines = texts[0]
+        for more in texts[1:]:
+            lines = lines + "\n" + more
+        rows = rows[np.logical_and.reduce([lines.str.contains(word, regex=False) for word in wanted])]
+    if column in rows:
+        rows = rows.sort_values(column, ascending=not down, kind="stable", na_position="last")
+    return rows
+
+
+def _searched(value: Any) -> str:
+    """What a cell is found by: its value, and of a state the word that is shown."""
+    return f"{value} {STATES.get(str(value), '')}".lower()
+
+
+def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
+    """A table with its filter and its download; `fill` is what comes into it."""
+    tools: list[Any] = []
+    if searched:
+        tools.append(html.Label([
+            html.Span("Show rows with "),
+            dcc.Input(id={"part": "filter", "table": name}, type="text", value="", debounce=0.25,
+                      placeholder="any word", className="filter"),
+        ]))  # fmt: skip
+    else:
+        tools.append(dcc.Input(id={"part": "filter", "table": name}, type="hidden", value=""))
+    tools.append(download("Download CSV", csv_address(name)))
+    return html.Div(className="table-block", children=[
+        html.Div(tools, className="tools"),
+        dcc.Store(id={"part": "order", "table": name}, data={"column": "", "down": False}),
+        dcc.Store(id={"part": "cells", "table": name}),
+        html.Div(id={"part": "rows", "table": name}, className="scroll", role="region", tabIndex="0",
+                 **aria(label=caption)),
+    ])  # fmt: skip
+
+
+def csv_address(name: str) -> str:
+    """Where a table is had as CSV."""
+    return f"/csv/{quote(name, safe='')}.csv"
+
+
+def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str, Any]:
+    """What the page's script draws: headings that sort, cells as texts with what they are, and how many rows."""
+    rows = arranged(table, words, order["column"], order["down"])
+    heads = [
+        {"column": column, "title": title, "sort": _sorted(column, order), "numeric": _numeric(table.rows, column)}
+        for column, title in table.shown.items()
+    ]
+    n, total = len(rows), len(table.rows)
+    said = f"{n:,} rows" if n == total else f"{n:,} of {total:,} rows"
+    said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
+    return {
+        "name": name, "place": _place(name), "heads": heads, "said": said,
+        "rows": [[_cell(table, row, column) for column in table.shown] for row in records(rows.head(MOST_ROWS))],
+    }  # fmt: skip
+
+
+def sentence(name: str, text: str) -> dict[str, Any]:
+    """In place of a table, why there is none."""
+    return {"name": name, "place": _place(name), "heads": [], "rows": [], "said": text}
+
+
+def _place(name: str) -> str:
+    """The id of a table's element on the page, as Dash writes it."""
+    return json.dumps({"part": "rows", "table": name}, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+
+
+def as_csv(table: pd.DataFrame) -> Iterator[str]:
+    """A table as CSV, piece by piece; no cell is taken for a formula by a spreadsheet."""
+    for start in range(0, max(len(table), 1), _BATCH):
+        part = table.iloc[start : start + _BATCH]
+        texts = part.select_dtypes(include=["object", "string"]).columns
+        part = part.assign(**{name: part[name].map(harmless) for name in texts})
+        part.columns = [harmless(str(name)) for name in part.columns]
+        yield part.to_csv(index=False, header=start == 0, lineterminator="\n")
+
+
+def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
+    """A whole table of a session, every column."""
+    session = data.session(key)
+    if name not in session_tables(data, key):
+        raise SessionError(f"the session '{key}' has no table '{name}'")
+    return session.summary if name == "summary" else session.table(name)
+
+
+def session_tables(data: StudyData, key: str) -> list[str]:
+    """The names of a session's tables."""
+    session = data.session(key)
+    names = sorted(path.stem for path in session.path.glob("*.parquet"))
+    return [*(["summary"] if session.has("summary.csv") else []), *names]
+
+
+def session_address(key: str, at_s: float | None = None) -> str:
+    """The page of a session, at a moment."""
+    return f"/session/{quote(key, safe='')}" + ("" if at_s is None else f"?t={at_s:.3f}")
+
+
+def number(value: Any) -> str:
+    """A number as a person would write it."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{value:,}"
+    if isinstance(value, float | np.floating):
+        if not np.isfinite(value):
+            return "–"
+        shown = 0.0 if abs(float(value)) < 1e-12 else float(value)  # what is left of a sum that is none
+        return f"{shown:,.0f}" if abs(shown) >= 1000 or shown == int(shown) else f"{shown:.3g}"
+    return str(value)
+
+
+def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows as dicts."""
+    return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
+
+
+def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
+    """A cell: its text and, where it is more than that, its kind and where it leads."""
+    value = row.get(column, "")
+    if column == "state":
+        return {"kind": "state", "text": STATES.get(str(value), str(value)), "to": str(value)}
+    if column == "reason" and "remedy" in row:
+        texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
+        return {"kind": "said", "text": "; ".join(one for one in texts if one not in ("", "nan", "new"))}
+    if column in _LONG:
+        return {"kind": "said", "text": str(value)}
+    known = f"{100 * value:.3g} %" if column.endswith("_share") and _finite(value) else number(value)
+    if column == table.link and column == "start_s":
+        return {"kind": "moment", "text": known, "to": round(float(value), 4)}
+    if column == table.link and row.get("state", "done") in DONE:
+        return {"kind": "link", "text": known, "to": session_address(str(value))}
+    return {"text": known}
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(float(value)))
+
+
+def _numeric(rows: pd.DataFrame, column: str) -> bool:
+    return column in rows and rows[column].dtype.kind in "iuf"
+
+
+def _sorted(column: str, order: dict[str, Any]) -> str:
+    return "none" if order["column"] != column else "descending" if order["down"] else "ascending"
+
+
+def columns_of(data: StudyData) -> Sequence[str]:
+    """The measures that groups can be compared by: the numbers of the summaries."""
+    rows = data.collected()
+    left_out = {"n_frames", "n_frames_observed", "fps_median", "n_bouts", "n_frames_summary"}
+    return [str(name) for name in rows if rows[name].dtype.kind in "iuf" and str(name) not in left_out
+            and rows[name].notna().any() and not str(name).endswith("_summary")]  # fmt: skip

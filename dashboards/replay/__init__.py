@@ -1,0 +1,1 @@
+"""Layouts of the replays: Rerun's blueprint and Foxglove's layout."""

@@ -1,0 +1,191 @@
+"""The report's figures from a session's tables: what is drawn, and from which columns."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.behaviour.around import around_onsets
+from liex_lab.sessions import Session
+
+from . import svg as figures
+from . import svg_matrices as figures_sums
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+_BLUE, _GREEN, _RED, _PURPLE = "#4477AA", "#228833", "#EE6677", "#AA3377"
+_CURVES = (  # column of the kinematics, title, what it is, unit, colour, whether the axis begins at zero
+    ("speed_mm_s", "Speed", "of the body centre, mm/s", "mm/s", _BLUE, True),
+    ("nose_height_mm", "Nose height", "above the floor, mm; rearing shaded", "mm", _GREEN, True),
+    ("z_mm", "Height", "of the body centre above the floor, mm", "mm", _GREEN, True),
+    ("tail_beat_hz", "Tail beat", "frequency, Hz", "Hz", _PURPLE, True),
+    ("bend_rad", "Bend", "of the whole body, rad; positive to the left", "rad", _PURPLE, False),
+)
+_WALKING, _SWIMMING = ("speed_mm_s", "nose_height_mm"), ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
+_AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz")
+# columns that are drawn
+FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
+KINEMATICS = ("time_s", "x_mm", "y_mm", *(curve[0] for curve in _CURVES))
+_CERTAIN = 0.05  # of p, corrected
+
+
+def charts(session: Session, words: list[str]) -> dict[str, str]:
+    """All single figures, by name; empty where the session has no numbers for one."""
+    frames, bouts = session.frames, session.bouts
+    time_s, time = frames["time_s"].to_numpy(float), figures.time_scale(session.metadata["frames"]["duration_s"])
+    spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
+    empty = session.gaps[session.gaps["n_frames_missing"] > 0]  # the others are stamps that were moved
+    lost = list(zip(empty["start_s"], empty["stop_s"], strict=True))
+    error = frames["predicted_error_mm"]
+    drawn = dict.fromkeys(("lanes", "way", "error", "errors", "budget", "matrix", "activity"), "")
+    if words or lost:
+        drawn["lanes"] = figures.lanes(spans, words, lost, time)
+    drawn["error"] = figures.curve(time_s, _across_gaps(error, frames), time, "mm", _RED, last=True)
+    drawn["errors"] = figures.histogram(error.to_numpy(float), "mm", _RED)
+    if session.has("kinematics.parquet"):
+        x_mm = _across_gaps(session.kinematics["x_mm"], frames)
+        y_mm = _across_gaps(session.kinematics["y_mm"], frames)
+        drawn["way"] = figures.trajectory(x_mm, y_mm, time_s, outlines(session))
+    if session.has("summary.csv"):
+        row = session.summary.iloc[0]
+        shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
+                  if f"{word}_share" in row]  # fmt: skip
+        drawn["budget"] = figures.budget(shares)
+    if session.has("transitions.parquet"):
+        drawn["matrix"] = _matrix(session.table("transitions"), words)
+    if session.has("activity.parquet"):
+        drawn["activity"] = _activity(session.table("activity"), words)
+    return drawn
+
+
+def curves(session: Session) -> list[tuple[str, str, str]]:
+    """What the body did over time: (title, what it is, SVG)."""
+    if not session.has("kinematics.parquet"):
+        return []
+    frames, moved, bouts = session.frames, session.kinematics, session.bouts
+    time_s, time = frames["time_s"].to_numpy(float), figures.time_scale(session.metadata["frames"]["duration_s"])
+    rears = bouts.loc[bouts["action"] == "rear", ["start_s", "stop_s"]].to_numpy(float)
+    shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+    made = []
+    for name, title, what, unit, colour, from_zero in _CURVES:
+        if name in shown and name in moved:
+            shaded = [(float(a), float(b)) for a, b in rears] if name == "nose_height_mm" else []
+            values = _across_gaps(moved[name], frames)
+            made.append((title, what, figures.curve(time_s, values, time, unit, colour, shaded, from_zero)))
+    return made
+
+
+def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
+    """What can be looked at over time: (name with its unit, time s (n,), values (n,), colour), broken at gaps."""
+    frames = session.frames
+    time_s = frames["time_s"].to_numpy(float)
+    made = []
+    if session.has("kinematics.parquet"):
+        moved = session.kinematics
+        shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+        made = [(f"{title}, {unit}", time_s, _across_gaps(moved[name], frames), colour)
+                for name, title, _, unit, colour, _ in _CURVES if name in shown and name in moved]  # fmt: skip
+    return [*made, ("Predicted error, mm", time_s, _across_gaps(frames["predicted_error_mm"], frames), _RED)]
+
+
+def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
+    """A measure around the onsets of the actions: (title, SVG), all of a measure on the same scale."""
+    if not session.has("kinematics.parquet"):
+        return []
+    moved, made = session.kinematics, []
+    for name, title, _, unit, colour, _ in _CURVES:
+        if name not in _AROUND or name not in moved:
+            continue
+        found = {word: around_onsets(moved, session.bouts, word, name) for word in words}
+        if name == "nose_height_mm":  # on four feet there is nothing to see
+            found = {word: one for word, one in found.items() if word.startswith("rear")}
+        known = {word: one for word, one in found.items() if one is not None}
+        if not known:
+            continue
+        top = max(float(np.nanmax(one.high)) for one in known.values())
+        for word, one in known.items():
+            drawn = figures_sums.around(
+                one.time_s, one.low, one.median, one.high, unit, colour, (0.0, 1.05 * top or 1.0)
+            )
+            made.append((f"{title} around {word.replace('_', ' ')}, {one.n} bouts", drawn))
+    return made
+
+
+def pictures(session: Session) -> list[tuple[str, str, str, str]]:
+    """The contact sheet: the kept depth pictures with the skeleton over them, in order of time.
+
+    (SVG, when, the action that the ethogram names there or an empty text, its colour).
+    """
+    import cv2
+
+    made = []
+    kept = session.metadata.get("thumbnails", [])
+    frames = session.frames.set_index("frame_index")
+    poses = session.table("poses", ["frame_index", "u_px", "v_px"], [entry["frame_index"] for entry in kept])
+    bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
+    words = list(session.metadata.get("actions", {}))
+    for entry in kept:
+        depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
+        if depth is None:
+            continue
+        index = entry["frame_index"]
+        uv = poses.loc[poses["frame_index"] == index, ["u_px", "v_px"]].to_numpy(float)
+        reach_mm = 0.9 * float(frames["spine_mm"].median())  # an animal on its feet is about half its length high
+        drawn = figures.picture(np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm)
+        time_s = float(frames.loc[index, "time_s"])
+        word = _word_at(session.bouts, time_s)
+        colour = figures.action_colour(words.index(word)) if word in words else ""
+        made.append((drawn, f"{time_s:.2f} s", word, colour))
+    return made
+
+
+def _word_at(bouts: pd.DataFrame, time_s: float) -> str:
+    """The action at a moment, empty where none is named."""
+    here = bouts.loc[(bouts["start_s"] <= time_s + 1e-6) & (bouts["stop_s"] > time_s + 1e-6), "action"]
+    return str(here.iloc[0]) if len(here) else ""
+
+
+def outlines(session: Session) -> list[tuple[str, Array]]:
+    """The arena's walls and the zones, by name: corners (n, 2) mm."""
+    walls = session.arena.outline_mm()
+    known = [(figures.ARENA, walls)] if len(walls) else []
+    return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
+
+
+def _matrix(table: pd.DataFrame, words: list[str]) -> str:
+    """The transitions as a matrix of the words that occur."""
+    seen = [word for word in words if (table.loc[table["from_action"] == word, "n_from"] > 0).any()
+            or (table.loc[table["to_action"] == word, "n"] > 0).any()]  # fmt: skip
+    if len(seen) < 2:
+        return ""
+    place = {word: k for k, word in enumerate(seen)}
+    table = table[table["from_action"].isin(seen) & table["to_action"].isin(seen)]
+    at = table["from_action"].map(place).to_numpy(int), table["to_action"].map(place).to_numpy(int)
+
+    def spread(values: Any) -> Array:
+        out = np.full((len(seen), len(seen)), np.nan)
+        out[at] = np.asarray(values, float)
+        return out
+
+    certain = spread(table["p_fdr"] <= _CERTAIN) == 1.0
+    probability = spread(table["probability"])
+    by_chance = spread(table["by_chance"])
+    return figures_sums.matrix(seen, probability, by_chance, certain, spread(table["n"]))
+
+
+def _activity(table: pd.DataFrame, words: list[str]) -> str:
+    parts = [(word, table[f"{word}_s"].to_numpy(float), figures.action_colour(k)) for k, word in enumerate(words)
+             if f"{word}_s" in table]  # fmt: skip
+    numbers = (table[name].to_numpy(float) for name in ("start_s", "stop_s", "observed_s"))
+    start_s, stop_s, observed_s = numbers
+    return figures_sums.activity(start_s, stop_s, parts, observed_s)
+
+
+def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:
+    """Values (n,) with the first one after a gap of the camera taken out, so that no line is drawn across it."""
+    return np.asarray(values.where(frames["gap_before"] == 0), float)

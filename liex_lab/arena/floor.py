@@ -1,0 +1,174 @@
+"""The arena: the floor plane a camera looks at, and the frame that stands on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import EstimationError
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
+
+Array = NDArray[np.float64]
+
+_N_VOTERS, _N_TRIALS = 6000, 600  # pixels that vote for a plane, and planes tried
+_N_FITTED = 60_000  # pixels that the plane is fitted to
+_INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
+_MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
+_MAX_TILT_DEG = 60.0
+_FLAT_MM = 15.0  # background this near to the plane is floor: flatness, noise and lens errors together
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The floor plane `normal . p = distance_mm` in the camera frame, its unit normal (3,) pointing away from the lens.
+
+    In a pinhole picture 1 / z of a plane is linear in the pixel: `inverse_depth` (3,) gives 1 / z = a u + b v + c.
+    """
+
+    normal: Array
+    distance_mm: float
+    inverse_depth: Array
+
+    @staticmethod
+    def from_inverse_depth(coefficients: Array, camera: Camera) -> Floor:
+        """The plane with 1 / z = a u + b v + c, per mm and pixel."""
+        a, b, c = coefficients
+        toward = np.array([a * camera.fx, b * camera.fy, c + a * camera.cx + b * camera.cy])
+        length = float(np.linalg.norm(toward))
+        return Floor(toward / length, 1.0 / length, np.asarray(coefficients, float))
+
+    @staticmethod
+    def from_plane(normal: Array, distance_mm: float, camera: Camera) -> Floor:
+        """The plane normal . p = distance_mm in the camera frame."""
+        n = np.asarray(normal, float) / np.linalg.norm(normal)
+        a, b = n[0] / camera.fx / distance_mm, n[1] / camera.fy / distance_mm
+        return Floor(n, float(distance_mm), np.array([a, b, n[2] / distance_mm - a * camera.cx - b * camera.cy]))
+
+    @cached_property
+    def T_arena_camera(self) -> SE3:
+        """Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along the camera's."""
+        up = -self.normal
+        x = np.array([1.0, 0.0, 0.0]) - up[0] * up
+        x = x / np.linalg.norm(x)
+        return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, self.distance_mm]))
+
+    def depth(self, width: int, height: int) -> NDArray[np.float32]:
+        """Depth (H, W) mm of the bare floor under every pixel; 0 above the horizon."""
+        a, b, c = self.inverse_depth
+        inverse = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
+        return np.where(inverse > 1e-6, 1.0 / np.maximum(inverse, 1e-6), 0.0).astype(np.float32)
+
+
+def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -> Floor:
+    """The largest plane of an empty scene (H, W) mm, by RANSAC on inverse depth and least squares on its inliers.
+
+    Raises EstimationError where less than a fifth of the readable pixels lie on one plane that faces the camera.
+    """
+    if camera.distortion is not None:
+        raise EstimationError(
+            "a floor is found in pictures of a straight lens, but this camera's distortion was not undone; pass the "
+            "recording through liex_lab.recordings.rectify.rectified"
+        )
+    rows, columns = np.nonzero(background > 0)
+    if len(rows) < 500:
+        raise EstimationError(
+            f"a floor needs at least 500 readable background pixels, got {len(rows)}; check the depth unit and range"
+        )
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(rows), min(_N_FITTED, len(rows)), replace=False)
+    rows, columns = rows[chosen], columns[chosen]
+    depth = background[rows, columns].astype(float)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    # pixels counted from the picture's middle, in units of its size: so the sums below lose no digits
+    points = np.stack([(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))], axis=1)
+    plane = _largest_plane(points[:_N_VOTERS], depth[:_N_VOTERS], camera.fx / middle[0], rng)
+    share = 0.0
+    for _ in range(3):  # least squares on many pixels, not only on the voters
+        plane, share = _refit(points, depth, plane)
+    floor = _in_pixels(plane, middle, camera)
+    tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
+    if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
+        raise EstimationError(
+            f"no floor was found: the largest plane holds {share:.0%} of the readable pixels and is tilted by "
+            f"{tilt:.0f} degrees; the camera should look down on a floor"
+        )
+    return floor
+
+
+def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Generator) -> Array:
+    """The plane (3,), 1 / depth = points . plane, that the most points (n, 3) are on, out of many through three each.
+
+    Planes that do not face the camera (a wall) do not stand. All are tried on some points, the best few on more.
+    focal: in the units of the points.
+    """
+    three = rng.integers(0, len(depth), (_N_TRIALS, 3))
+    p, w = points[three], 1.0 / depth[three]
+    ends = np.stack([p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]], axis=1)
+    rise = np.stack([w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]], axis=1)
+    area = ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]
+    area = np.where(np.abs(area) > 1e-4, area, np.nan)  # three points in a line
+    a = (rise[:, 0] * ends[:, 1, 1] - rise[:, 1] * ends[:, 0, 1]) / area
+    b = (ends[:, 0, 0] * rise[:, 1] - ends[:, 1, 0] * rise[:, 0]) / area
+    planes = np.stack([a, b, w[:, 0] - a * p[:, 0, 0] - b * p[:, 0, 1]], axis=1)
+    steepness = np.hypot(a, b) * focal / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)  # tangent of the tilt
+    planes = planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))]
+    for n_kept, n_voters in ((20, _N_VOTERS // 6), (1, _N_VOTERS)):
+        votes = _is_near(points[:n_voters] @ planes.T, depth[:n_voters, None]).sum(axis=0)
+        planes = planes[np.argsort(-votes, kind="stable")[:n_kept]]
+    return planes[0] if len(planes) else np.array([0.0, 0.0, 1.0 / float(np.median(depth))])
+
+
+def _is_near(inverse: Array, depth: Array) -> NDArray[np.bool_]:
+    """Whether points at `depth` lie within `_INLIER_MM` of a plane that has 1 / z = inverse there."""
+    return np.asarray(np.abs(depth * inverse - 1.0) < _INLIER_MM * inverse)
+
+
+def _in_pixels(plane: Array, middle: Array, camera: Camera) -> Floor:
+    a, b, c = plane / [middle[0], middle[0], 1.0]
+    return Floor.from_inverse_depth(np.array([a, b, c - a * middle[0] - b * middle[1]]), camera)
+
+
+def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
+    """The plane again from every point near it, and the share of points that are."""
+    near = _is_near(points @ plane, depth)
+    if near.sum() < 3:
+        return plane, 0.0
+    some = points[near]
+    fitted = np.linalg.lstsq(some.T @ some, some.T @ (1.0 / depth[near]), rcond=None)[0]
+    return np.asarray(fitted, float), float(near.mean())
+
+
+def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H, W) the floor lies: the convex hull of the largest connected part of the background on the plane.
+
+    Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the hull closes.
+    """
+    import cv2
+
+    patch = floor_patch(background, bare)
+    if not patch.any():
+        return near_plane(background, bare)
+    region = np.zeros(patch.shape, np.uint8)
+    cv2.fillConvexPoly(region, cv2.convexHull(cv2.findNonZero(patch.astype(np.uint8))), 1)
+    return region.astype(bool)
+
+
+def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The largest connected part (H, W) of the background (H, W) mm that lies on the bare floor (H, W) mm."""
+    import cv2
+
+    flat = near_plane(background, bare).astype(np.uint8)
+    opened = cv2.morphologyEx(flat, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    if n < 2:
+        return np.zeros(flat.shape, np.bool_)
+    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
+
+
+def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where (H, W) the background lies on the bare floor, or nearly."""
+    return (background > 0) & (np.abs(background - bare) < _FLAT_MM)

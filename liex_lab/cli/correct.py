@@ -1,0 +1,172 @@
+"""The verbs of `liex correct`: what people correct in a session, and what they take back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from liex_lab.errors import SessionError
+from liex_lab.runtime.progress import progress_bar
+
+if TYPE_CHECKING:
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.corrections import Correction
+
+correct = typer.Typer(
+    help="Correct a session: kept beside it, applied whenever it is read; tables and report follow.",
+    no_args_is_help=True,
+)
+
+SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
+Author = Annotated[str, typer.Option("--by", metavar="NAME", help="Who says so; else who is logged in.")]
+NewWord = Annotated[bool, typer.Option("--new-word", help="The action need not be one of the ethogram's words.")]
+
+
+@correct.command()
+def flip(
+    session: SessionPath,
+    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
+    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
+    by: Author = "",
+) -> None:
+    """Head and tail are exchanged in a span."""
+    from liex_lab.sessions.correcting import flip_span
+
+    _do(session, [flip_span(_opened(session), start_s, stop_s)], by)
+
+
+@correct.command()
+def joint(
+    session: SessionPath,
+    frame: Annotated[int, typer.Option("--frame", help="The frame's index, as in frames.parquet.")],
+    name: Annotated[str, typer.Option("--joint", help="The joint's name.")],
+    to_mm: Annotated[
+        tuple[float, float, float] | None, typer.Option("--to-mm", metavar="X Y Z", help="Its place in the arena.")
+    ] = None,
+    to_px: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--to-px", metavar="U V", help="The pixel of the depth picture that it lies under."),
+    ] = None,
+    by: Author = "",
+) -> None:
+    """A joint lies elsewhere in one frame; the others follow as bones and limits allow."""
+    from liex_lab.sessions.correcting import joint_move, joint_move_at_pixel
+
+    if (to_mm is None) == (to_px is None):
+        raise SessionError("a joint's place is given in one way: --to-mm X Y Z in the arena, or --to-px U V")
+    opened = _opened(session)
+    if to_px is not None:
+        _do(session, [joint_move_at_pixel(opened, frame, name, *to_px)], by)
+    else:
+        _do(session, [joint_move(opened, frame, name, to_mm)], by)
+
+
+@correct.command()
+def bout(
+    session: SessionPath,
+    at_s: Annotated[float | None, typer.Option("--at", metavar="S", help="A time within the bout to edit.")] = None,
+    action: Annotated[str | None, typer.Option("--action", help="What the animal does there.")] = None,
+    start_s: Annotated[float | None, typer.Option("--from", metavar="S", help="Seconds since the first frame.")] = None,
+    stop_s: Annotated[float | None, typer.Option("--to", metavar="S", help="Seconds, exclusive.")] = None,
+    delete: Annotated[bool, typer.Option("--delete", help="There is no such bout.")] = False,
+    labels: Annotated[
+        Path | None, typer.Option("--labels", metavar="FILE", help="A whole ethogram: .csv, .parquet or .boris.")
+    ] = None,
+    new_word: NewWord = False,
+    by: Author = "",
+) -> None:
+    """Rename a bout (--at, --action), cut it anew (--at, --from, --to), delete it (--at, --delete), add one (--action,
+    --from, --to), or take the whole ethogram from a file (--labels). The name that it has confirms it.
+    """
+    from liex_lab.sessions import correcting as ask
+
+    opened, span = _opened(session), (start_s, stop_s)
+    match (at_s, action, span, delete, labels):
+        case (None, None, (None, None), False, Path()):
+            from liex_lab.pipelines.training.action_model import read_any_labels
+
+            wanted: Sequence[Correction] = ask.labelled_bouts(opened, read_any_labels(labels))
+        case (None, str(), (float(), float()), False, None):
+            wanted = [ask.add_bout(opened, action, *span, new_word=new_word)]
+        case (float(), str(), (None, None), False, None):
+            wanted = [ask.rename_bout(opened, at_s, action, new_word=new_word)]
+        case (float(), None, (float(), float()), False, None):
+            wanted = [ask.recut_bout(opened, at_s, *span)]
+        case (float(), None, (None, None), True, None):
+            wanted = [ask.delete_bout(opened, at_s)]
+        case _:
+            raise SessionError(
+                "one edit at a time: --at S with --action, with --from and --to, or with --delete; --action with "
+                "--from and --to; or --labels FILE"
+            )
+    _do(session, wanted, by)
+
+
+@correct.command("list")
+def list_corrections(session: SessionPath) -> None:
+    """Every correction: who made it and when, and which were taken back."""
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.corrections import FOLDER, applies, read_log
+
+    opened = Session.open(session, raw=True)
+    log = read_log(opened.path)
+    standing = {entry.number for entry in log.standing}
+    table = Table("", "what", "by", "at", "")
+    for entry in log.entries:
+        what = str(entry.what) if entry.what is not None else f"{entry.undoes} taken back"
+        gone = entry.what is not None and entry.number not in standing
+        table.add_row(str(entry.number), what, entry.author, entry.made_at, "taken back" if gone else "")
+    if not log.entries:
+        typer.echo(f"{opened.path} has no corrections")
+        return
+    Console().print(table)
+    if log.standing and not applies(log, opened.path, opened.metadata):
+        typer.echo(
+            "note: they were made on another measurement of this recording and are not applied; `liex correct redo` "
+            f"applies them, and without the folder {FOLDER} they are gone"
+        )
+
+
+@correct.command()
+def undo(
+    session: SessionPath,
+    numbers: Annotated[list[int] | None, typer.Argument(metavar="[NUMBER]...", help="The last one if none.")] = None,
+    by: Author = "",
+) -> None:
+    """Take corrections back, by their numbers in `liex correct list`."""
+    from liex_lab.sessions.corrections import read_log
+
+    standing = read_log(_opened(session).path).standing
+    if not standing and not numbers:
+        raise SessionError(f"{session} has no correction to take back")
+    _do(session, [], by, numbers or [standing[-1].number])
+
+
+@correct.command()
+def redo(session: SessionPath) -> None:
+    """Make the corrected tables and the report again, from what was measured and all corrections that stand."""
+    _do(session, [], "")
+
+
+def _opened(session: Path) -> Session:
+    from liex_lab.sessions import Session
+
+    return Session.open(session)
+
+
+def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] = ()) -> None:
+    from liex_lab.api import correct_session
+
+    with progress_bar() as progress:
+        correct_session(session, what, undo=undo, author=by, progress=progress)
+    for one in what[:5]:
+        typer.echo(f"corrected: {one}")
+    if len(what) > 5:
+        typer.echo(f"corrected: {len(what) - 5} further bouts")
+    typer.echo(f"tables:    {session / 'corrected'}")
+    typer.echo(f"report:    {session / 'report.html'}")

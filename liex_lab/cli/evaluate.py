@@ -1,0 +1,235 @@
+"""`liex evaluate`: every figure of the product, measured again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from liex_lab.cli.options import AnimalName, JsonFile, RowName, SessionPath, keep_numbers, tell_numbers
+from liex_lab.runtime.progress import progress_bar
+
+evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
+
+
+@evaluate.command("pose")
+def evaluate_pose(
+    animal: AnimalName = "mouse",
+    split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
+    variant: RowName = "default",
+    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
+    n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
+    spine_mm: Annotated[
+        float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors on a fixed split of rendered test frames."""
+    from liex_lab.pipelines.evaluation.pose import evaluate_pose as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("speed")
+def evaluate_speed(
+    animal: AnimalName = "mouse",
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Measure how fast recordings of each format are read instead.")
+    ] = False,
+    json_file: JsonFile = None,
+) -> None:
+    """Frames per second on one and two cores, stage by stage, and the ratio to the paper's variant."""
+    with progress_bar() as progress:
+        if recordings:
+            from liex_lab.pipelines.evaluation.decoding import evaluate_recordings
+
+            result = evaluate_recordings(progress=progress)
+        else:
+            from liex_lab.pipelines.evaluation.speed import evaluate_speed as measure
+
+            result = measure(animal, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("sizes")
+def evaluate_sizes(
+    animal: AnimalName = "mouse",
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="Only this many frames for each size.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors of animals between 45 and 100 mm long, their size estimated and not given."""
+    from liex_lab.pipelines.evaluation.pose import evaluate_sizes as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, n_frames=n_frames, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("tables")
+def evaluate_tables(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")],
+    animals: Annotated[
+        list[str] | None, typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model.")
+    ] = None,
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="Only this many frames of each split.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="See within minutes that everything runs; the numbers mean nothing.")
+    ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Train and measure every row anew, which takes hours; use no kept result.")
+    ] = False,
+) -> None:
+    """Every row of the paper's Tables 1 to 3 and its figures, measured now or kept from earlier."""
+    from liex_lab.api import run_tables
+
+    with progress_bar() as progress:
+        written = run_tables(out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress)
+    for path in written:
+        typer.echo(path)
+
+
+@evaluate.command("actions")
+def evaluate_actions(
+    animal: AnimalName = "fish",
+    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
+    pose_model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
+    ] = None,
+    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
+
+    The recordings are rendered and measured first, which takes about half an hour for all 30 minutes on two cores. What
+    has been measured is kept in the cache folder (LIEX_CACHE), so that a job that was stopped goes on where it was.
+    """
+    from liex_lab.api import evaluate_actions as measure
+
+    figure = None if out is None else out / f"{animal}_confusion.png"
+    with progress_bar() as progress:
+        result = measure(
+            animal, model=model, pose_model=pose_model, minutes=minutes, figure=figure, progress=progress
+        )
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("tracking")
+def evaluate_tracking(
+    animal: AnimalName = "mouse",
+    sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
+    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
+    n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
+    from liex_lab.api import evaluate_tracking as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("live")
+def evaluate_live(
+    animal: AnimalName = "fish",
+    n_frames: Annotated[int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")] = 1500,
+    json_file: JsonFile = None,
+) -> None:
+    """How late skeletons are while a virtual animal is filmed."""
+    from liex_lab.pipelines.evaluation.live import evaluate_live as measure
+
+    with progress_bar() as progress:
+        result = measure(animal, n_frames=n_frames, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("statistics")
+def evaluate_statistics(
+    n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
+    effect: Annotated[
+        float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
+    ] = 1.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How often the comparison of groups is wrong on studies without an effect, and how often it finds one."""
+    from liex_lab.pipelines.evaluation.statistics import evaluate_statistics as measure
+
+    with progress_bar() as progress:
+        result = measure(n_studies, effect, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("report")
+def evaluate_report(
+    session: SessionPath,
+    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of the long session.")] = 60.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How long the report of a long session takes, and its memory: SESSION repeated until it is so long."""
+    from liex_lab.pipelines.evaluation.report import evaluate_report as measure
+
+    with progress_bar() as progress:
+        result = measure(session, minutes, progress=progress)
+    tell_numbers(result, json_file)
+
+
+@evaluate.command("nyu")
+def evaluate_nyu(
+    reference: Annotated[
+        Path, typer.Option("--reference", metavar="DIR", help="Labels, published answers and frames of the NYU data.")
+    ],
+    model: Annotated[str | None, typer.Option("--model", help="A hand model of your own, .npz.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and ours."""
+    from liex_lab.pipelines.evaluation.nyu import evaluate_nyu as measure
+    from liex_lab.pipelines.evaluation.nyu import in_short
+
+    with progress_bar() as progress:
+        result = measure(reference, model=model, progress=progress)
+    tell_numbers(in_short(result), None)
+    if json_file is not None:
+        keep_numbers(result, json_file)
+
+
+@evaluate.command("reference")
+def evaluate_reference(
+    session: SessionPath,
+    reference: Annotated[
+        Path, typer.Option("--reference", metavar="CSV", help="The reference's table, one row a frame.")
+    ],
+    json_file: JsonFile = None,
+) -> None:
+    """Compare a session with what another program measured in the same recording."""
+    from liex_lab.pipelines.evaluation.pose import evaluate_reference as measure
+
+    tell_numbers(measure(session, reference), json_file)
+
+
+@evaluate.command("scale")
+def evaluate_scale(
+    n_frames: Annotated[int, typer.Option("--frames", min=2000, help="Of each virtual recording.")] = 3000,
+    minutes: Annotated[
+        list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes.
+
+    Takes about eleven minutes on two cores, and wants a machine without other work; with --minutes 10 alone, half
+    of that.
+    """
+    from liex_lab.api import run_scale
+
+    with progress_bar() as progress:
+        numbers = run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)
+    tell_numbers(numbers, json_file)

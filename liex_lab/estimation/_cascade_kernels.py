@@ -1,0 +1,302 @@
+"""Numba kernels of Algorithm 1: all candidates of a few frames through the cascade, the pruner and the metric.
+
+A thread takes `FRAMES` frames at once. Their candidates walk down each tree together, LANES at a time, so that a tree
+stays in the cache and no vector register idles.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.estimation._feature_kernels import (
+    N_SCALARS,
+    correct_base,
+    correct_joint,
+    fill_scalars,
+    fill_view,
+    place_joint,
+    place_rest,
+)
+from liex_lab.estimation._residual_kernels import N_FIT, explain_pose
+from liex_lab.forests._kernels import VIEW
+from liex_lab.forests._walk import LANES, walk_one_view, walk_views
+
+FRAMES = 8
+_SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these
+
+
+class Chain(NamedTuple):
+    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3), axes (J, 3) bool, solved joints in order."""
+
+    parents: Any
+    offsets: Any
+    rest: Any
+    axes: Any
+    solved: Any
+
+
+class Trees(NamedTuple):
+    """Forests in one node array: nodes (N, 4), roots (F, T), leaves flat, and of each forest where its leaves begin
+    bases (F,) and how many values a leaf has widths (F,).
+    """
+
+    nodes: Any
+    roots: Any
+    leaves: Any
+    bases: Any
+    widths: Any
+
+
+class Tuning(NamedTuple):
+    """Rounds C, of the base and of the other joints; reach (J,) mm of the offsets from each joint; levers (3,) of base,
+    joints and scale; bandwidth mm of the mean shift, 0 for the mean; how many candidates outlive the base joint.
+    """
+
+    base_rounds: int
+    rounds: int
+    reach: Any
+    levers: Any
+    bandwidth: float
+    keep: int
+
+
+class _Lanes(NamedTuple):
+    """What n candidates, one to a lane, see: see `forests._walk`. frame (n,) and pose (n,) say whose they are."""
+
+    pixels: Any
+    base: Any
+    scalar_base: Any
+    inverse: Any
+    views: Any
+    leaf: Any
+    frame: Any
+    pose: Any
+
+
+@njit(cache=True)
+def mode_of_votes(votes, bandwidth, out):
+    """Mean-shift mode of votes (T, D) from their mean, with a Gaussian kernel, into out (D,)."""
+    n, d = votes.shape
+    for _ in range(_SHIFTS):
+        total = 0.0
+        shifted = np.zeros(d)
+        for t in range(n):
+            distance = 0.0
+            for k in range(d):
+                distance += (votes[t, k] - out[k]) ** 2
+            weight = np.exp(-0.5 * distance / (bandwidth * bandwidth))
+            total += weight
+            for k in range(d):
+                shifted[k] += weight * votes[t, k]
+        if total < 1e-12:
+            return
+        for k in range(d):
+            out[k] = shifted[k] / total
+
+
+@njit(cache=True)
+def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
+    """A forest's prediction for n lanes into out (n, width)."""
+    width, leaf_base = trees.widths[forest], trees.bases[forest]
+    n_trees, n_lanes = trees.roots.shape[1], lanes.base.size
+    votes = np.empty((n if bandwidth > 0 else 1, n_trees, width), np.float32)
+    for k in range(n):
+        for d in range(width):
+            out[k, d] = 0.0
+    for t in range(n_trees):
+        root = trees.roots[forest, t]
+        for first in range(0, n, LANES):
+            if n_views == 0:
+                walk_one_view(trees.nodes, root, lanes.pixels, lanes.base, lanes.scalar_base, lanes.inverse,
+                              lanes.views, n_lanes, side, lanes.leaf, first)  # fmt: skip
+            else:
+                walk_views(trees.nodes, root, lanes.pixels, lanes.base, lanes.scalar_base, lanes.inverse,
+                           lanes.views, VIEW * n_views, side, lanes.leaf, first)  # fmt: skip
+        for k in range(n):
+            at = leaf_base + lanes.leaf[k] * width
+            for d in range(width):
+                out[k, d] += trees.leaves[at + d]
+                if bandwidth > 0:
+                    votes[k, t, d] = trees.leaves[at + d]
+    for k in range(n):
+        for d in range(width):
+            out[k, d] /= n_trees
+        if bandwidth > 0:
+            mode_of_votes(votes[k], bandwidth, out[k, :width])
+
+
+@njit(cache=True)
+def _write_scalars(lanes, k, first, scalars):
+    """Put a lane's scalars behind the pixels, from number `first` on, rounded down."""
+    at = lanes.scalar_base[k] + first
+    for c in range(scalars.size):
+        lanes.pixels[at + c] = np.int16(np.floor(min(max(scalars[c], np.float32(-32768.0)), np.float32(32767.0))))
+
+
+@njit(cache=True)
+def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, scales):
+    """Fill the lanes' only view, from a joint, and their scalars."""
+    n_lanes = lanes.base.size
+    view, scalars = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32)
+    for s in range(n):
+        i, k = lanes.frame[s], lanes.pose[s]
+        fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
+        for c in range(VIEW):
+            lanes.views[c * n_lanes + s] = view[c]
+        fill_scalars(rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars)
+        _write_scalars(lanes, s, 0, scalars)
+
+
+@njit(cache=True)
+def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, positions, scales):
+    """Fill the lanes' views from all joints, and their scalars from the base and from the posed body."""
+    n_joints = positions.shape[2]
+    view, scalars, fit = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32), np.empty(N_FIT, np.float32)
+    for s in range(n):
+        i, k = lanes.frame[s], lanes.pose[s]
+        for joint in range(n_joints):
+            fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
+            for c in range(VIEW):
+                lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
+        fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)
+        _write_scalars(lanes, s, 0, scalars)
+        if body.radius.size > 0:
+            explain_pose(heights[i], looks[i], moments[i, 5], rotations[i, k], positions[i, k], scales[i, k], size,
+                         body, fit)  # fmt: skip
+            _write_scalars(lanes, s, N_SCALARS, fit)
+
+
+@njit(cache=True)
+def _lanes_for(heights, frames, n_poses, n_joints, size):
+    """Lanes for n_poses candidates of each of the frames, with the frames' height maps beside one another."""
+    side, n = heights.shape[1], frames.size * n_poses
+    area, n_lanes, n_scalars = side * side, LANES * ((n + LANES - 1) // LANES), N_SCALARS + N_FIT
+    pixels = np.zeros(frames.size * area + n_lanes * n_scalars, np.int16)
+    base, scalar_base = np.zeros(n_lanes, np.int32), np.zeros(n_lanes, np.int32)
+    frame, pose = np.zeros(n_lanes, np.int64), np.zeros(n_lanes, np.int64)
+    for m in range(frames.size):
+        for r in range(side):
+            for c in range(side):
+                pixels[m * area + r * side + c] = heights[frames[m], r, c]
+    for s in range(n_lanes):
+        scalar_base[s] = frames.size * area + s * n_scalars
+        if s < n:
+            base[s], frame[s], pose[s] = (s // n_poses) * area, frames[s // n_poses], s % n_poses
+    inverse = np.full(n_lanes, 1.0 / size, np.float32)
+    views = np.zeros(VIEW * n_lanes * n_joints, np.float32)
+    return _Lanes(pixels, base, scalar_base, inverse, views, np.zeros(n_lanes, np.int32), frame, pose)
+
+
+@njit(cache=True)
+def choose_survivors(rotations, scores, chosen):
+    """Which candidates (n_keep,) of K go on, best first: those with the lowest scores (K,), and in any case the best
+    one that points the other way, for the whole chain tells head from tail better than the base alone.
+
+    rotations (K, 3, 3) of the base.
+    """
+    keep, order = chosen.size, np.empty(scores.size, np.int64)
+    for k in range(scores.size):  # by insertion: they are few
+        place = k
+        while place > 0 and scores[order[place - 1]] > scores[k]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+    best = order[0]
+    for place in range(keep):
+        chosen[place] = order[place]
+    opposite = -1
+    for place in range(order.size):
+        along = 0.0
+        for i in range(3):
+            along += rotations[order[place], i, 0] * rotations[best, i, 0]
+        if along < 0.0:
+            opposite = place
+            break
+    if opposite >= keep:
+        chosen[keep - 1] = order[opposite]
+
+
+@njit(cache=True)
+def _solve_joint(joint, j, chain, regressors, tuning, lanes, n, side, looks, moments, size, rotations, positions,
+                 scales, values):  # fmt: skip
+    """All rounds of one joint, the j-th solved one, for n lanes."""
+    for s in range(n):
+        if joint > 0:
+            i, k = lanes.frame[s], lanes.pose[s]
+            place_joint(joint, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k], positions[i, k])
+    first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
+    for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
+        forest = first + c
+        _see(lanes, n, joint, looks, moments, size, tuning.reach, rotations, positions, scales)
+        _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
+        for s in range(n):
+            i, k = lanes.frame[s], lanes.pose[s]
+            if joint > 0:
+                correct_joint(rotations[i, k, joint], chain.axes[joint], values[s], tuning.levers[1])
+                continue
+            for d in range(3):
+                values[s, d] /= tuning.levers[0]
+            values[s, 6] = values[s, 6] / tuning.levers[2] if regressors.widths[forest] > 6 else 0.0
+            scales[i, k] = correct_base(rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], size)
+
+
+@njit(cache=True)
+def _estimate_block(
+    heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, body, starts, poses
+):  # fmt: skip
+    """Candidates of a few frames: `starts` (rotations, positions, scales) of their bases in, `poses` and scores out."""
+    start_rotations, start_positions, start_scales = starts
+    rotations, positions, scales, scores = poses
+    side, n_joints, n_starts = heights.shape[1], positions.shape[2], start_scales.shape[1]
+    lanes = _lanes_for(heights, frames, n_starts, 1, size)
+    n = frames.size * n_starts
+    values = np.empty((lanes.base.size, 7))
+    first, no_view = np.int64(0), np.int64(0)  # typed as numbers: a kernel is compiled anew for every literal
+    _solve_joint(chain.solved[0], first, chain, regressors, tuning, lanes, n, side, looks, moments, size,
+                 start_rotations, start_positions, start_scales, values)  # fmt: skip
+    if tuning.keep < n_starts:
+        _see(lanes, n, 0, looks, moments, size, tuning.reach, start_rotations, start_positions, start_scales)
+        _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
+    chosen, early = np.arange(tuning.keep), np.empty(n_starts)
+    for m in range(frames.size):
+        i = frames[m]
+        if tuning.keep < n_starts:
+            for k in range(n_starts):
+                early[k] = values[m * n_starts + k, 0]
+            choose_survivors(start_rotations[i, :, 0], early, chosen)
+        for p in range(tuning.keep):
+            scales[i, p] = start_scales[i, chosen[p]]
+            for a in range(3):
+                positions[i, p, 0, a] = start_positions[i, chosen[p], 0, a]
+                for b in range(3):
+                    rotations[i, p, 0, a, b] = start_rotations[i, chosen[p], 0, a, b]
+    lanes = _lanes_for(heights, frames, tuning.keep, n_joints, size)
+    n = frames.size * tuning.keep
+    for j in range(1, chain.solved.size):
+        _solve_joint(chain.solved[j], j, chain, regressors, tuning, lanes, n, side, looks, moments, size, rotations,
+                     positions, scales, values)  # fmt: skip
+    for s in range(n):
+        i, k = lanes.frame[s], lanes.pose[s]
+        place_rest(chain.solved, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k],
+                   positions[i, k])  # fmt: skip
+    _see_all(lanes, n, heights, looks, moments, size, tuning.reach, body, rotations, positions, scales)
+    _predict(metric, first, lanes, n, n_joints, side, 0.0, values)
+    for s in range(n):
+        scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner, metric, tuning, body, starts, poses):
+    """Algorithm 1 for the frames `seen`, in which an animal was found.
+
+    starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it moves; poses: rotations
+    (n, P, J, 3, 3), positions (n, P, J, 3), scales (n, P) and scores (n, P) of the P survivors, which it fills.
+    """
+    n_blocks = (seen.size + FRAMES - 1) // FRAMES
+    for b in prange(n_blocks):
+        frames = seen[b * FRAMES : (b + 1) * FRAMES]
+        _estimate_block(heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, body, starts,
+                        poses)  # fmt: skip

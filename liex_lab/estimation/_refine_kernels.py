@@ -1,0 +1,368 @@
+"""Numba kernels that move a pose until its body of balls lies in the readings: Gauss-Newton steps on the manifold.
+
+The regressors say where a pose is about; this takes it into the picture. Readings pull the nearest ball's surface onto
+themselves, balls beside the animal are pulled back over it, balls in front of the readings are pushed behind them, and
+all of it is held near the pose it began with.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.estimation._feature_kernels import so3_exp
+from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
+
+_STRIDE = 4  # every so many crop pixels a reading pulls
+_ROOT = 7  # twist of the base and log of the scale come before the angles
+_DAMPING = 0.02
+_MOST_GROWTH, _MOST_TURN = 0.1, 0.5  # of log scale, and of an angle (rad), in one step
+
+
+class Tree(NamedTuple):
+    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3); free (F, 2) joint and axis of every angle,
+    limits (F, 2) rad, moves (J, F) which of them turn which joint, turns (B, M) those that move each ball, in order and
+    -1 where there are no more.
+    """
+
+    parents: Any
+    offsets: Any
+    rest: Any
+    free: Any
+    limits: Any
+    moves: Any
+    turns: Any
+
+
+class Wishes(NamedTuple):
+    """What weighs how much. robust mm: readings this far off count a quarter; beside: of a ball beside the animal;
+    prior (4,): what a radian of the base, a millimetre of it, a unit of log scale and a radian of a joint away from the
+    start cost, in squared mm.
+    """
+
+    robust: float
+    beside: float
+    prior: Any
+
+
+@njit(cache=True)
+def nearest_reading(heights, r, c, known):
+    """The nearest pixel on the animal to a crop pixel off it: into known[r, c] (2,), row -2 where there is none.
+
+    Few pixels are ever asked for, so they are looked for in growing squares and remembered; known (S, S, 2) comes in
+    as -1.
+    """
+    if known[r, c, 0] != -1:
+        return
+    side, least = heights.shape[0], 1 << 30
+    known[r, c, 0] = -2
+    reach = 1
+    while reach < side and reach * reach < least:
+        for a in range(max(r - reach, 0), min(r + reach + 1, side)):
+            hop = 1 if abs(a - r) == reach else 2 * reach  # whole rows above and below, else both ends of the row
+            for b in range(c - reach, c + reach + 1, hop):
+                if 0 <= b < side and heights[a, b] > 0:
+                    off = (a - r) ** 2 + (b - c) ** 2
+                    if off < least:
+                        least = off
+                        known[r, c, 0], known[r, c, 1] = a, b
+        reach += 1
+
+
+@njit(cache=True)
+def point_of(heights, look, r, c, out):
+    """The point (3,) mm of the view frame that a crop pixel shows."""
+    dx = (look[14] + look[16] * c - look[2]) / look[0]
+    dy = (look[15] + look[16] * r - look[3]) / look[1]
+    h = heights[r, c] / 16.0
+    z = (h - look[13]) / (look[10] * dx + look[11] * dy + look[12])
+    out[0] = z * (look[4] * dx + look[5] * dy + look[6])
+    out[1] = z * (look[7] * dx + look[8] * dy + look[9])
+    out[2] = h
+
+
+@njit(cache=True)
+def crop_pixel(look, p):
+    """Row and column (rounded) of a point of the view frame in the crop, and millimetres a crop pixel there."""
+    x0, y0, z0 = p[0], p[1], p[2] - look[13]
+    x = look[4] * x0 + look[7] * y0 + look[10] * z0
+    y = look[5] * x0 + look[8] * y0 + look[11] * z0
+    z = max(look[6] * x0 + look[9] * y0 + look[12] * z0, 1.0)
+    column = int((look[0] * x / z + look[2] - look[14]) / look[16] + 0.5)
+    row = int((look[1] * y / z + look[3] - look[15]) / look[16] + 0.5)
+    return row, column
+
+
+@njit(cache=True)
+def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
+    """Joint frames of a pose, as `body.kinematics.forward_kinematics`."""
+    turn, local = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        positions[0, i] = root_position[i]
+        for k in range(3):
+            rotations[0, i, k] = root_rotation[i, k]
+    for j in range(1, tree.parents.size):
+        p = tree.parents[j]
+        so3_exp(angles[j, 0], angles[j, 1], angles[j, 2], turn)
+        for i in range(3):
+            for k in range(3):
+                local[i, k] = 0.0
+                for m in range(3):
+                    local[i, k] += tree.rest[j, i, m] * turn[m, k]
+        for i in range(3):
+            total = positions[p, i]
+            for k in range(3):
+                total += scale * rotations[p, i, k] * tree.offsets[j, k]
+            positions[j, i] = total
+            for k in range(3):
+                value = 0.0
+                for m in range(3):
+                    value += rotations[p, i, m] * local[m, k]
+                rotations[j, i, k] = value
+
+
+@njit(cache=True)
+def turning_axes(free, angles, rotations, axes):
+    """World axes (F, 3) about which the free angles (F, 2: joint, axis) turn: R J_r(w) e, J_r the right Jacobian."""
+    e = np.empty(3)
+    for f in range(len(free)):
+        j, k = free[f, 0], free[f, 1]
+        w0, w1, w2 = angles[j, 0], angles[j, 1], angles[j, 2]
+        th2 = w0 * w0 + w1 * w1 + w2 * w2
+        e[0], e[1], e[2] = 0.0, 0.0, 0.0
+        e[k] = 1.0
+        if th2 > 1e-8:
+            th = np.sqrt(th2)
+            b, c = (1.0 - np.cos(th)) / th2, (th - np.sin(th)) / (th2 * th)
+            # w x e and w x (w x e)
+            x, y, z = w1 * e[2] - w2 * e[1], w2 * e[0] - w0 * e[2], w0 * e[1] - w1 * e[0]
+            e[0] += c * (w1 * z - w2 * y) - b * x
+            e[1] += c * (w2 * x - w0 * z) - b * y
+            e[2] += c * (w0 * y - w1 * x) - b * z
+        for i in range(3):
+            axes[f, i] = rotations[j, i, 0] * e[0] + rotations[j, i, 1] * e[1] + rotations[j, i, 2] * e[2]
+
+
+@njit(cache=True)
+def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
+    """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles."""
+    slope[:] = 0.0
+    x0, y0, z0 = ball[0] - positions[0, 0], ball[1] - positions[0, 1], ball[2] - positions[0, 2]
+    for k in range(3):
+        ax, ay, az = rotations[0, 0, k], rotations[0, 1, k], rotations[0, 2, k]
+        slope[0, k], slope[1, k], slope[2, k] = ay * z0 - az * y0, az * x0 - ax * z0, ax * y0 - ay * x0
+        slope[0, 3 + k], slope[1, 3 + k], slope[2, 3 + k] = ax, ay, az
+    slope[0, 6], slope[1, 6], slope[2, 6] = x0, y0, z0
+    for e in range(2):
+        j = body.joints[b, e]
+        share = body.share[b] if e == 1 else 1.0 - body.share[b]
+        if share == 0.0:
+            continue
+        u, v, w = scale * body.offsets[b, e, 0], scale * body.offsets[b, e, 1], scale * body.offsets[b, e, 2]
+        ex = positions[j, 0] + rotations[j, 0, 0] * u + rotations[j, 0, 1] * v + rotations[j, 0, 2] * w
+        ey = positions[j, 1] + rotations[j, 1, 0] * u + rotations[j, 1, 1] * v + rotations[j, 1, 2] * w
+        ez = positions[j, 2] + rotations[j, 2, 0] * u + rotations[j, 2, 1] * v + rotations[j, 2, 2] * w
+        for m in range(tree.turns.shape[1]):
+            f = tree.turns[b, m]
+            if f < 0:
+                break
+            if tree.moves[j, f]:
+                a = tree.free[f, 0]
+                x, y, z = ex - positions[a, 0], ey - positions[a, 1], ez - positions[a, 2]
+                ax, ay, az = axes[f, 0], axes[f, 1], axes[f, 2]
+                slope[0, _ROOT + f] += share * (ay * z - az * y)
+                slope[1, _ROOT + f] += share * (az * x - ax * z)
+                slope[2, _ROOT + f] += share * (ax * y - ay * x)
+
+
+@njit(cache=True)
+def _add(row, residual, weight, gradient, curvature):
+    """One residual into the normal equations."""
+    n = row.size
+    for i in range(n):
+        if row[i] == 0.0:
+            continue
+        wi = weight * row[i]
+        gradient[i] += wi * residual
+        for k in range(i + 1):
+            curvature[i, k] += wi * row[k]
+
+
+@njit(cache=True)
+def _solve(curvature, gradient, step):
+    """Solve the positive definite system by Cholesky, lower half given; False where it is not definite."""
+    n = gradient.size
+    for i in range(n):
+        for k in range(i + 1):
+            total = curvature[i, k]
+            for m in range(k):
+                total -= curvature[i, m] * curvature[k, m]
+            if i == k:
+                if total <= 1e-12:
+                    return False
+                curvature[i, i] = np.sqrt(total)
+            else:
+                curvature[i, k] = total / curvature[k, k]
+    for i in range(n):
+        total = -gradient[i]
+        for m in range(i):
+            total -= curvature[i, m] * step[m]
+        step[i] = total / curvature[i, i]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for m in range(i + 1, n):
+            total -= curvature[m, i] * step[m]
+        step[i] = total / curvature[i, i]
+    return True
+
+
+@njit(cache=True)
+def _pull(points, balls, radius, slopes, robust, gradient, curvature):
+    """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B, 3) passes through
+    it. slopes (n, 3, P) of the first n balls, which are the body's own.
+    """
+    row, gaps = np.empty(gradient.size), np.empty(len(balls))
+    for i in range(len(points)):
+        best, which = nearest_ball(points[i, 0], points[i, 1], points[i, 2], balls, radius, gaps)
+        if which >= len(slopes):
+            continue
+        length = max(best + radius[which], 1e-6)
+        weight = 1.0 / (1.0 + (best / robust) ** 2) ** 2
+        row[:] = 0.0
+        for a in range(3):
+            direction = (points[i, a] - balls[which, a]) / length
+            for p in range(row.size):
+                row[p] -= direction * slopes[which, a, p]
+        row[6] -= radius[which]
+        _add(row, best, weight, gradient, curvature)
+
+
+@njit(cache=True)
+def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient, curvature):
+    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal. slopes (n, 3, P)."""
+    row, target = np.empty(gradient.size), np.empty(3)
+    last = heights.shape[0] - 1
+    for b in range(len(slopes)):
+        r, c = crop_pixel(look, balls[b])
+        r, c = min(max(r, 0), last), min(max(c, 0), last)
+        if heights[r, c] > 0:
+            out = balls[b, 2] + radius[b] - heights[r, c] / 16.0
+            if out > 0.0:
+                weight = 1.0 / (1.0 + (out / robust) ** 2) ** 2
+                row[:] = slopes[b, 2]
+                row[6] += radius[b]
+                _add(row, out, weight, gradient, curvature)
+            continue
+        nearest_reading(heights, r, c, known)
+        a, d = known[r, c, 0], known[r, c, 1]
+        if a < 0:
+            continue
+        point_of(heights, look, a, d, target)
+        for axis in range(2):
+            off = balls[b, axis] - target[axis]
+            weight = beside / (1.0 + (off / (2.0 * robust)) ** 2)
+            row[:] = slopes[b, axis]
+            _add(row, off, weight, gradient, curvature)
+
+
+@njit(cache=True)
+def _hold(tree, prior, moved, growth, turned, gradient, curvature):
+    """What the start wants: not to be left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3)."""
+    for k in range(3):
+        gradient[k] += prior[0] * moved[k]
+        gradient[3 + k] += prior[1] * moved[3 + k]
+        curvature[k, k] += prior[0]
+        curvature[3 + k, 3 + k] += prior[1]
+    gradient[6] += prior[2] * growth
+    curvature[6, 6] += prior[2]
+    for f in range(len(tree.free)):
+        j, k = tree.free[f, 0], tree.free[f, 1]
+        gradient[_ROOT + f] += prior[3] * turned[j, k]
+        curvature[_ROOT + f, _ROOT + f] += prior[3]
+
+
+@njit(cache=True)
+def _go(step, tree, root_rotation, root_position, angles, scale):
+    """Take a step (P,), in place; returns the new scale."""
+    turn = np.empty((3, 3))
+    so3_exp(step[0], step[1], step[2], turn)
+    for i in range(3):
+        x, y, z = root_rotation[i, 0], root_rotation[i, 1], root_rotation[i, 2]
+        root_position[i] += x * step[3] + y * step[4] + z * step[5]
+        for k in range(3):
+            root_rotation[i, k] = x * turn[0, k] + y * turn[1, k] + z * turn[2, k]
+    for f in range(len(tree.free)):
+        j, k = tree.free[f, 0], tree.free[f, 1]
+        turned = angles[j, k] + min(max(step[_ROOT + f], -_MOST_TURN), _MOST_TURN)
+        angles[j, k] = min(max(turned, tree.limits[f, 0]), tree.limits[f, 1])
+    return scale * np.exp(min(max(step[6], -_MOST_GROWTH), _MOST_GROWTH))
+
+
+@njit(cache=True)
+def _readings(heights, look):
+    """The points (n, 3) mm of the view frame that every `_STRIDE`-th crop pixel shows."""
+    side = heights.shape[0]
+    points, n = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3)), 0
+    for r in range(_STRIDE // 2, side, _STRIDE):
+        for c in range(_STRIDE // 2, side, _STRIDE):
+            if heights[r, c] > 0:
+                point_of(heights, look, r, c, points[n])
+                n += 1
+    return points[:n]
+
+
+@njit(cache=True)
+def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_rotation, root_position, angles,
+               scale):  # fmt: skip
+    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale.
+
+    known (S, S, 2) as in `nearest_reading`, points (n, 3) as `_readings` of the height map.
+    """
+    n_values, n_joints = _ROOT + len(tree.free), tree.parents.size
+    rotations, positions = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3))
+    balls, axes = np.empty((len(body.joints), 3)), np.empty((len(tree.free), 3))
+    slopes, step = np.empty((body.n_own, 3, n_values)), np.empty(n_values)
+    first_angles, first_scale = angles.copy(), scale
+    moved = np.zeros(6)  # of the base since the start, step by step
+    for _ in range(n_steps):
+        forward(tree, root_rotation, root_position, angles, scale, rotations, positions)
+        place_balls(rotations, positions, scale, body, balls)
+        turning_axes(tree.free, angles, rotations, axes)
+        for b in range(body.n_own):
+            ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
+        gradient, curvature, radius = np.zeros(n_values), np.zeros((n_values, n_values)), body.radius * scale
+        _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
+        _push(heights, look, known, balls, radius, slopes, wishes.robust, wishes.beside, gradient, curvature)
+        _hold(tree, wishes.prior, moved, np.log(scale / first_scale), angles - first_angles, gradient, curvature)
+        for i in range(n_values):
+            curvature[i, i] *= 1.0 + _DAMPING
+        if not _solve(curvature, gradient, step):
+            return scale
+        moved += step[:6]
+        scale = _go(step, tree, root_rotation, root_position, angles, scale)
+    return scale
+
+
+@njit(cache=True, parallel=True)
+def refine_all(heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales):
+    """`refine_one` for the K poses of each of n frames."""
+    for i in prange(len(scales)):
+        known = np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32)
+        points = _readings(heights[i], looks[i])
+        for k in range(scales.shape[1]):
+            scales[i, k] = refine_one(
+                heights[i],
+                looks[i],
+                known,
+                points,
+                tree,
+                body,
+                wishes,
+                n_steps,
+                root_rotations[i, k],
+                root_positions[i, k],
+                angles[i, k],
+                scales[i, k],
+            )

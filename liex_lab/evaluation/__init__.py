@@ -1,0 +1,1 @@
+"""Scores of poses and tracks against truth, and the NYU hand protocol."""

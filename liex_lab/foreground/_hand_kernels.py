@@ -1,0 +1,351 @@
+"""Numba kernels that cut the hand at an end of a surface from its arm, and its height map from the picture.
+
+blocks and labels are those of `_ends`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.foreground import _blob_kernels as segment
+from liex_lab.foreground._blob_kernels import BLOCK
+from liex_lab.foreground._geodesic_kernels import (
+    AROUND_MM,
+    MAX_SURFACES,
+    block_depths,
+    box_around,
+    label_surfaces,
+    nearest_ends,
+    point_of_block,
+    relabel,
+)
+from liex_lab.foreground._hand_score_kernels import unlikeness
+
+_TIP_MM = 60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
+_MOST_ENDS = 8  # that are looked at
+_PER_MM_BEHIND, _MOST_BEHIND_MM = 0.012, 800.0  # what it counts to be farther away than another end, in `unlikeness`
+_AS_LIKE = 1.0  # a second end is worth a look while it is not more unlike a hand than the first by this
+_LEAST_MM2 = 2500.0  # no hand is smaller
+_LENGTH_MM = 185.0  # of a home-sized hand
+_SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
+_SHELL_MM2 = 900.0
+_BIN_MM = 5.0
+_RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
+FIELDS = 8  # of a find: middle x y z, direction of the fingers x y z, where along it the arm is cut, area
+
+
+@njit(cache=True)
+def locate(blocks, labels, tip, size, intrinsics, found):
+    """Where the hand at an end of a surface is: fill `found` (FIELDS,), mark its blocks with MAX_SURFACES in labels.
+
+    What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's length long.
+    """
+    middle, fingers = np.empty(3), np.zeros(3)
+    slot = labels[int(tip[1]), int(tip[2])]
+    point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
+    _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
+    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
+    cut, area, base = -1e9, 0.0, 0.0
+    for step in range(3):
+        points = _within(blocks, labels, slot, around, intrinsics, middle)
+        has_arm = _away_from_arm(points, size, focal2, middle, fingers)
+        cut = _wrist(points, size, focal2, middle, fingers) if has_arm else -1e9
+        base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
+        area = BLOCK * BLOCK * _beyond(points, middle, fingers, cut, labels, step == 2) / focal2
+    for k in range(3):
+        found[k], found[3 + k] = middle[k], fingers[k]
+    found[6], found[7] = cut + base, area
+
+
+@njit(cache=True)
+def _within(blocks, labels, slot, radius, intrinsics, middle):
+    """The points of a surface within `radius` mm of the middle, rows of x, y, z, distance, block row, block column."""
+    p, box = np.empty(3), np.empty(4, np.int64)
+    box_around(blocks.shape, middle, radius, intrinsics, box)
+    points, n = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), 6)), 0
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
+            if labels[i, j] != slot:
+                continue
+            point_of_block(blocks, i, j, intrinsics, p)
+            off2 = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
+            if off2 < radius * radius:
+                points[n, 0], points[n, 1], points[n, 2] = p[0], p[1], p[2]
+                points[n, 3], points[n, 4], points[n, 5] = np.sqrt(off2), i, j
+                n += 1
+    return points[:n]
+
+
+@njit(cache=True)
+def _away_from_arm(points, size, focal2, middle, fingers):
+    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm leaves the sphere."""
+    shell = 0.0
+    for k in range(3):
+        fingers[k] = 0.0
+    for n in range(len(points)):
+        off = points[n, 3]
+        if off > _SHELL * AROUND_MM * size:
+            w = BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+            shell += w
+            for k in range(3):
+                fingers[k] -= w * (points[n, k] - middle[k]) / off
+    norm = np.sqrt(fingers[0] ** 2 + fingers[1] ** 2 + fingers[2] ** 2)
+    has_arm = shell > _SHELL_MM2 * size * size and norm > 0.3 * shell
+    for k in range(3):
+        fingers[k] = fingers[k] / norm if has_arm else 0.0
+    return has_arm
+
+
+@njit(cache=True)
+def _wrist(points, size, focal2, middle, fingers):
+    """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the fingertips."""
+    around = AROUND_MM * size
+    along = np.zeros(int(2.0 * around / _BIN_MM) + 2)
+    for n in range(len(points)):
+        s = _along(points[n], middle, fingers)
+        along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+    b, tip = along.size - 1, 0.0
+    while b > 0 and tip < 100.0 * size * size:
+        tip += along[b]
+        b -= 1
+    return b * _BIN_MM - around - _LENGTH_MM * size
+
+
+@njit(cache=True)
+def _beyond(points, middle, fingers, cut, labels, mark):
+    """Move `middle` (3,) to the middle of what lies beyond the cut, marked in labels if so asked; its sum of z^2."""
+    total, x, y, z = 0.0, 0.0, 0.0, 0.0
+    for n in range(len(points)):
+        if _along(points[n], middle, fingers) > cut:
+            w = points[n, 2] * points[n, 2]
+            total += w
+            x += w * points[n, 0]
+            y += w * points[n, 1]
+            z += w * points[n, 2]
+            if mark:
+                labels[int(points[n, 4]), int(points[n, 5])] = MAX_SURFACES
+    least = max(total, 1e-9)
+    middle[0], middle[1], middle[2] = x / least, y / least, z / least
+    return total
+
+
+@njit(cache=True)
+def _along(p, middle, fingers):
+    """How far p (3,) lies from `middle` along `fingers`."""
+    return (p[0] - middle[0]) * fingers[0] + (p[1] - middle[1]) * fingers[1] + (p[2] - middle[2]) * fingers[2]
+
+
+@njit(cache=True)
+def _settle(blocks, labels, slot, radius, intrinsics, middle):
+    """Move `middle` (3,) to the middle of what the surface has within `radius` mm of it."""
+    p, box, total, moved = np.empty(3), np.empty(4, np.int64), 0.0, np.zeros(3)
+    box_around(blocks.shape, middle, radius, intrinsics, box)
+    for i in range(box[0], box[1] + 1):
+        for j in range(box[2], box[3] + 1):
+            if labels[i, j] == slot:
+                point_of_block(blocks, i, j, intrinsics, p)
+                off = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
+                if off < radius * radius:
+                    w = p[2] * p[2]
+                    total += w
+                    for k in range(3):
+                        moved[k] += w * p[k]
+    for k in range(3):
+        middle[k] = moved[k] / total
+
+
+@njit(cache=True)
+def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
+    """How unlike a hand what would be cut at each of the ends is, into unlike (n,)."""
+    depth, found, nearest = np.empty(len(unlike)), np.empty(FIELDS), 1e9
+    for k in range(len(unlike)):
+        slot = labels[int(ends[k, 1]), int(ends[k, 2])]
+        locate(blocks, labels, ends[k], size, intrinsics, found)
+        depth[k], unlike[k] = unlikeness(blocks, labels, slot, MAX_SURFACES, found, size, intrinsics)
+        nearest = min(nearest, depth[k])
+    for k in range(len(unlike)):
+        unlike[k] += _PER_MM_BEHIND * min(depth[k] - nearest, _MOST_BEHIND_MM)
+
+
+@njit(cache=True)
+def box_of(labels, mark, box):
+    """First and last row and column of the blocks labelled `mark` into box (4,)."""
+    box[0], box[1], box[2], box[3] = labels.shape[0], -1, labels.shape[1], -1
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] == mark:
+                box[0], box[1] = min(box[0], i), max(box[1], i)
+                box[2], box[3] = min(box[2], j), max(box[3], j)
+
+
+@njit(cache=True)
+def sight_rotation(x, y, rotation):
+    """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as the camera's."""
+    length = np.sqrt(x * x + y * y + 1.0)
+    up = np.array([-x / length, -y / length, -1.0 / length])
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]
+    norm = np.sqrt(rotation[0, 0] ** 2 + rotation[0, 1] ** 2 + rotation[0, 2] ** 2)
+    for k in range(3):
+        rotation[0, k] /= norm
+        rotation[2, k] = up[k]
+    rotation[1, 0] = up[1] * rotation[0, 2] - up[2] * rotation[0, 1]
+    rotation[1, 1] = up[2] * rotation[0, 0] - up[0] * rotation[0, 2]
+    rotation[1, 2] = up[0] * rotation[0, 1] - up[1] * rotation[0, 0]
+
+
+@njit(cache=True)
+def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw):
+    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 not read."""
+    size = raw.shape[0]
+    reaches = np.full((labels.shape[0] + 1, labels.shape[1] + 1), -1.0, np.float32)
+    for r in range(size):
+        v = origin[1] + step * r
+        for c in range(size):
+            u = origin[0] + step * c
+            raw[r, c] = -1.0
+            if not (0 < r < size - 1 and 0 < c < size - 1 and 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]):
+                continue
+            row, column = v // BLOCK, u // BLOCK
+            if reaches[row, column] < 0.0:
+                reaches[row, column] = _reach(blocks, labels, row, column)
+            reach = reaches[row, column]
+            z = depth[v, u]
+            if reach == 0.0 or z >= min(reach, far):
+                continue
+            if z <= near:
+                raw[r, c] = -2.0
+                continue
+            x, y = (u - intrinsics[2]) / intrinsics[0] * z, (v - intrinsics[3]) / intrinsics[1] * z
+            if x * found[3] + y * found[4] + z * found[5] <= found[6]:
+                continue
+            above = distance * (1.0 - z * (plane[0] * u + plane[1] * v + plane[2]))
+            if above > 0.0:
+                raw[r, c] = above
+
+
+@njit(cache=True)
+def _reach(blocks, labels, row, column):
+    """How far, mm, a pixel of this block may be to belong to the hand; 0 where no block near it does."""
+    farthest = np.float32(0.0)
+    for a in range(max(row - 1, 0), min(row + 2, labels.shape[0])):
+        for b in range(max(column - 1, 0), min(column + 2, labels.shape[1])):
+            if labels[a, b] == MAX_SURFACES:
+                farthest = max(farthest, blocks[a, b])
+    return farthest + np.float32(_RIM_MM) if farthest > 0 else farthest
+
+
+@njit(cache=True)
+def extract_one(
+    depth, near, far, n_things, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
+    distance, n_blobs, k,
+):  # fmt: skip
+    """Find the hand in frame k (H, W) mm and fill row k of the batch; see `NearestScene.extract`. Where n_things is 2,
+    the batch has twice as many rows as there are frames, and the second half gets what may be a hand as well.
+    """
+    blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
+    labels = np.empty(blocks.shape, np.int32)
+    areas, ends = np.empty(MAX_SURFACES), np.empty((_MOST_ENDS, 4))
+    focal2 = intrinsics[0] * intrinsics[1]
+    block_depths(depth, near, far, blocks)
+    n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
+    n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, ends)
+    unlike = np.empty(n_ends)
+    compare_ends(blocks, labels, ends, size, intrinsics, unlike)
+    ranked = np.argsort(unlike)
+    n_alike = min(n_ends, 2)
+    if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
+        n_alike = 1
+    for rank in range(n_things):
+        row = k + rank * (len(n_px) // n_things)
+        n_blobs[row] = n_alike
+        if rank < n_alike:
+            cut_end(depth, near, far, blocks, labels, ends[ranked[rank]], size, behind, smooth, intrinsics, along_axis,
+                    heights, origin, n_steps, n_px, moments, distance, row)  # fmt: skip
+
+
+@njit(cache=True)
+def cut_end(
+    depth, near, far, blocks, labels, end, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps,
+    n_px, moments, distance, k,
+):  # fmt: skip
+    """The height map of the hand at an end of a surface, and its moments, into row k; labels stay as they are."""
+    found, box = np.empty(FIELDS), np.empty(4, np.int64)
+    slot = labels[int(end[1]), int(end[2])]
+    locate(blocks, labels, end, size, intrinsics, found)
+    box_of(labels, MAX_SURFACES, box)
+    if box[1] < 0:
+        return
+    crop = heights.shape[1]
+    span = BLOCK * (max(box[1] - box[0], box[3] - box[2]) + 3)
+    step = max(1, int(np.ceil(span / (crop - 4))))
+    middle_u, middle_v = 0.5 * BLOCK * (box[2] + box[3] + 1), 0.5 * BLOCK * (box[0] + box[1] + 1)
+    origin[k, 0], origin[k, 1] = int(middle_u - step * crop / 2), int(middle_v - step * crop / 2)
+    n_steps[k] = step
+    rotation = np.empty((3, 3))
+    x, y = view_axis(origin[k], step, crop, intrinsics, along_axis)
+    sight_rotation(x, y, rotation)
+    distance[k] = behind - (rotation[2, 0] * found[0] + rotation[2, 1] * found[1] + rotation[2, 2] * found[2])
+    plane = view_plane(rotation, distance[k], intrinsics)
+    raw = np.empty((crop, crop), np.float32)
+    cut_heights(depth, blocks, labels, found, plane, distance[k], intrinsics, origin[k], step, near, far, raw)
+    relabel(labels, box, MAX_SURFACES, slot)
+    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    mm_per_px = step * found[2] / np.sqrt(intrinsics[0] * intrinsics[1])
+    radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
+    segment.smooth_heights(raw, radius, heights[k])
+    segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k])
+    # the arm tells which way along the long axis the fingers point
+    along = rotation @ found[3:6]
+    if along[0] * np.cos(moments[k, 5]) + along[1] * np.sin(moments[k, 5]) < 0.0:
+        moments[k, 5] += np.pi
+    n_px[k] = int(moments[k, 0])
+
+
+@njit(cache=True)
+def view_axis(origin, step, crop, intrinsics, along_axis):
+    """Where the view's axis goes, (x, y) at z = 1: through the middle of the crop, or along the optical axis."""
+    if along_axis:
+        return 0.0, 0.0
+    return (
+        (origin[0] + step * crop / 2.0 - intrinsics[2]) / intrinsics[0],
+        (origin[1] + step * crop / 2.0 - intrinsics[3]) / intrinsics[1],
+    )
+
+
+@njit(cache=True)
+def view_plane(rotation, distance, intrinsics):
+    """Coefficients (3,) of the plane that a view measures heights from: 1 / z = a u + b v + c."""
+    a = -rotation[2, 0] / intrinsics[0] / distance
+    b = -rotation[2, 1] / intrinsics[1] / distance
+    return np.array([a, b, -rotation[2, 2] / distance - a * intrinsics[2] - b * intrinsics[3]])
+
+
+@njit(cache=True, parallel=True)
+def extract_all(
+    depths, near, far, n_things, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
+    distance, n_blobs,
+):  # fmt: skip
+    """`extract_one` for a batch; size, behind, smooth (n,) and intrinsics (n, 4) differ."""
+    for k in prange(depths.shape[0]):
+        extract_one(depths[k], near, far, n_things, size[k], behind[k], smooth[k], intrinsics[k], along_axis, heights,
+                    origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+
+
+@njit(cache=True)
+def fill_looks(intrinsics, origin, step, distance, crop, along_axis, looks):
+    """How each height map was cut (n, 17): see `Scene.looks`."""
+    rotation = np.empty((3, 3))
+    for k in range(len(step)):
+        x, y = view_axis(origin[k], step[k], crop, intrinsics[k], along_axis)
+        sight_rotation(x, y, rotation)
+        looks[k, :4] = intrinsics[k]
+        looks[k, 4:13] = rotation.ravel()
+        looks[k, 13], looks[k, 14], looks[k, 15], looks[k, 16] = distance[k], origin[k, 0], origin[k, 1], step[k]
+
+
+@njit(cache=True)
+def view_planes(looks, planes):
+    """`view_plane` of looks (n, 17) into planes (n, 3)."""
+    for k in range(len(looks)):
+        planes[k] = view_plane(looks[k, 4:13].reshape(3, 3), looks[k, 13], looks[k, :4])

@@ -1,0 +1,186 @@
+"""Numba kernels that find the animal's blob in a frame and cut its height map, over many frames at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.foreground import _blob_kernels as segment
+
+AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
+BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
+_MORE = 1.3  # times the area of the animal: there may be something with it
+_APART = 2.0  # roots of the animal's area: what lies farther before the animal is not a part of it
+_LAYERS = 3  # so often: before the animal a bar, behind it a speck
+_FAR = 65_535  # mm: behind everything
+_ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
+    """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
+    for k in prange(depths.shape[0]):
+        labels = np.empty((depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32)
+        blobs = np.empty((segment.MAX_BLOBS, 7))
+        for slot in range(segment.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)):
+            if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
+                areas[k, slot] = blob_area(blobs[slot], mm2_per_px)
+
+
+@njit(cache=True)
+def blob_area(blob, mm2_per_px):
+    """Area mm^2 seen from above of a blob (7,); mm2_per_px is 1 / (fx fy)."""
+    return blob[0] * (blob[5] / blob[0]) ** 2 * mm2_per_px
+
+
+@njit(cache=True)
+def order_blobs(blobs, n_blobs, area, mm2_per_px):
+    """The blobs in the order in which their areas come near to the animal's, and how many have about its area.
+
+    While `area` is 0 the largest comes first.
+    """
+    distances = np.full(n_blobs, np.inf)
+    n_near = 0
+    for slot in range(n_blobs):
+        if blobs[slot, 6] < _ON_FLOOR_SHARE * blobs[slot, 0]:
+            continue
+        here = blob_area(blobs[slot], mm2_per_px)
+        distances[slot] = abs(np.log(here / area)) if area > 0 else 1.0 / here
+        if area > 0 and distances[slot] > np.log(AREA_FACTOR):
+            distances[slot] = np.inf
+        else:
+            n_near += 1
+    return np.argsort(distances), n_near
+
+
+@njit(cache=True)
+def parted(depth, limit, labels, blobs, area, mm2_per_px):
+    """The picture without what hangs together with the animal in it alone, and whether there is such a thing.
+
+    Of two layers far from one another the animal is the one whose area is nearer to its own. What lies before it hides
+    parts of it, and is taken for unread; what lies behind it there is background. Elsewhere nothing is: of a bar and
+    some specks the bar is likest to the animal, which may swim beside them.
+    """
+    for slot in range(len(blobs)):
+        if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
+            cut, near, far = segment.layers(depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area))
+            if cut > 0.0:
+                behind = abs(np.log(far * mm2_per_px / area)) < abs(np.log(near * mm2_per_px / area))
+                out = depth.copy()
+                if behind:
+                    for v in range(depth.shape[0]):
+                        for u in range(depth.shape[1]):
+                            if depth[v, u] < cut:
+                                out[v, u] = 0
+                else:
+                    _push_back(out, labels, slot, cut)
+                return out, True
+    return depth, False
+
+
+@njit(cache=True)
+def _push_back(depth, labels, slot, cut):
+    """Make background of what lies farther than `cut` in a blob and at its border."""
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if segment.is_animal_block(labels, i, j, slot):
+                for v in range(i * segment.BLOCK, (i + 1) * segment.BLOCK):
+                    for u in range(j * segment.BLOCK, (j + 1) * segment.BLOCK):
+                        if depth[v, u] > cut:
+                            depth[v, u] = _FAR
+
+
+@njit(cache=True)
+def extract_one(
+    depth, limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs, k,
+):  # fmt: skip
+    """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's. Where n_things is 2,
+    the batch has twice as many rows as there are frames, and the second half gets what comes next near.
+
+    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth. parts:
+    what hangs together with the animal in the picture alone is told apart by its depth, see `parted`.
+    """
+    labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
+    blobs = np.empty((segment.MAX_BLOBS, 7))
+    mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
+    bridge = BRIDGE if behind_mm > 0.0 else 0
+    n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+    for _ in range(_LAYERS if parts and area > 0.0 else 0):
+        depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
+        if not changed:
+            break
+        n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+    order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
+    for rank in range(n_things):
+        row = k + rank * (len(n_px) // n_things)
+        n_blobs[row] = n_near
+        if rank < n_near:
+            slot = order[rank]
+            blob = blobs[slot]
+            cut_crop(depth, limit, labels, slot, blob, blob[5] / blob[0], smooth_mm, intrinsics, plane, rotation,
+                     behind_mm, heights, origin, n_steps, moments, distance, row)  # fmt: skip
+            n_px[row] = int(blob[0])
+
+
+@njit(cache=True)
+def cut_crop(
+    depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, moments, distance, k,
+):  # fmt: skip
+    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k; distance[k] moves to behind
+    the animal where heights are measured along the optical axis.
+    """
+    crop = heights.shape[1]
+    v0, v1 = blob[1] * segment.BLOCK, (blob[2] + 1) * segment.BLOCK
+    u0, u1 = blob[3] * segment.BLOCK, (blob[4] + 1) * segment.BLOCK
+    span = max(v1 - v0, u1 - u0) + 2 * segment.BLOCK
+    step = max(1, int(np.ceil(span / (crop - 4))))
+    origin[k, 0] = int((u0 + u1) / 2 - step * crop / 2)
+    origin[k, 1] = int((v0 + v1) / 2 - step * crop / 2)
+    n_steps[k] = step
+    raw = np.empty((crop, crop), np.float32)
+    view_plane = plane
+    if behind_mm > 0.0:  # first from far behind, for the blob's mean depth is that of all that hangs together
+        distance[k] = mean_depth + 8.0 * behind_mm
+        view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
+    segment.cut_heights(depth, limit, labels, slot, view_plane, distance[k], origin[k], step, raw)
+    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    if behind_mm > 0.0:
+        distance[k] += segment.level_heights(raw, behind_mm)
+        view_plane[2] = 1.0 / distance[k]
+    mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
+    radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
+    segment.smooth_heights(raw, radius, heights[k])
+    segment.blob_moments(heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k])
+    if behind_mm > 0.0:
+        moments[k, 8] = segment.back_slope(heights[k], origin[k], step, intrinsics, distance[k], moments[k])
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def extract_all(
+    depths, limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs,
+):  # fmt: skip
+    for k in prange(depths.shape[0]):
+        extract_one(depths[k], limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation,
+                    behind_mm, heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def extract_windows(
+    depths, background, margin, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
+    n_steps, n_px, moments, distance, n_blobs,
+):  # fmt: skip
+    for k in prange(depths.shape[0]):
+        limit, everywhere = np.empty(depths.shape[1:], np.float32), np.ones(depths.shape[1:], np.bool_)
+        for v in range(limit.shape[0]):
+            for u in range(limit.shape[1]):
+                behind = float(background[k, v, u])
+                if behind == 0.0:
+                    inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
+                    behind = 1.0 / inverse if inverse > 1e-6 else 0.0
+                limit[v, u] = max(behind - margin[k], 0.0)
+        extract_one(depths[k], limit, everywhere, area[k], n_things, False, smooth_mm[k], intrinsics[k], plane[k],
+                    rotation[k], behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs,
+                    k)  # fmt: skip

@@ -1,0 +1,260 @@
+"""The scene behind the animal, and the animal in front of it: background, floor, blob, height map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.arena.floor import Floor, find_floor, floor_region
+from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
+from liex_lab.errors import EstimationError
+from liex_lab.foreground import _height_map_kernels as kernels
+from liex_lab.foreground._blob_kernels import MAX_BLOBS
+from liex_lab.foreground.background import learn_background, sample_frames, stride_for
+from liex_lab.foreground.height_maps import CROP, Crops, Cutter, Windows
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.threads import threads
+
+__all__ = ["CROP", "Crops", "Scene", "Windows", "floor_region", "learn_background", "sample_frames"]
+
+Array = NDArray[np.float64]
+
+SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
+_AREA_SD, _VOLUME_SD = 0.25, 0.2  # of the logarithms, from posture to posture of one animal
+_TOUCH_SHARE = 0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
+
+
+@dataclass(frozen=True)
+class Scene(Cutter):
+    """What the camera sees without the animal, and what nearer than that counts as the animal.
+
+    background (H, W) mm; limit (H, W) mm: a reading below it is in front of the background; on_floor (H, W): the floor,
+    under which nothing lies, as far as the picture shows it: an animal stands on it with at least a part of its body;
+    area_mm2 and volume_mm3: the animal's usual area seen from above and volume under its back, 0 while unknown; view:
+    how such animals are looked at; stride: only every so many-th row and column of the picture is looked at, and H, W
+    count those.
+    """
+
+    camera: Camera
+    floor: Floor
+    background: NDArray[np.float32]
+    limit: NDArray[np.float32]
+    on_floor: NDArray[np.bool_]
+    area_mm2: float = 0.0
+    volume_mm3: float = 0.0
+    view: View = MOUSE_VIEW
+    stride: int = 1
+
+    @cached_property
+    def grid(self) -> Camera:
+        """The camera whose pixels are those that are looked at."""
+        return self.camera.every(self.stride)
+
+    @cached_property
+    def _grid_floor(self) -> Floor:
+        """The floor as that camera sees it."""
+        if self.stride == 1:
+            return self.floor
+        return Floor.from_plane(self.floor.normal, self.floor.distance_mm, self.grid)
+
+    @staticmethod
+    def from_floor(camera: Camera, floor: Floor, min_height_mm: float = 7.0) -> Scene:
+        """A scene of nothing but a known floor."""
+        bare = floor.depth(camera.width, camera.height)
+        limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
+        return Scene(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
+
+    @staticmethod
+    def learn(
+        recording: Recording, spine_mm: tuple[float, float], n_frames: int = 96, min_height_mm: float = 7.0,
+        view: View = MOUSE_VIEW,
+    ) -> tuple[Scene, NDArray[np.float32]]:  # fmt: skip
+        """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was learned.
+
+        The background of a pixel is the farthest depth that keeps coming back, which survives an animal that covers it
+        most of the time; where the animal never leaves its place the floor plane takes over. spine_mm: the smallest and
+        the largest animal to expect.
+        """
+        stride = stride_for(recording, spine_mm[0])
+        sample = sample_frames(recording, n_frames, stride)
+        background, spread, near = learn_background(sample)
+        _check_background(sample, background)
+        grid = recording.camera.every(stride)
+        seen = find_floor(background, grid)
+        floor = seen if stride == 1 else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
+        bare = seen.depth(grid.width, grid.height)
+        on_floor = floor_region(background, bare)
+        background = np.where((background == 0) & on_floor, bare, background)
+        # the rims and walls around the floor flicker between near and far: there, nearer than ever is what counts
+        behind = np.where(on_floor, background, near)
+        margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
+        limit = np.maximum(behind - margin, 0).astype(np.float32)
+        stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
+        over = on_floor if stands else np.ones_like(on_floor)
+        scene = Scene(recording.camera, floor, background, limit, over, view=view, stride=stride)
+        area, share = scene.usual_area(sample, spine_mm)
+        if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
+            bare_limit = np.where(on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit).astype(np.float32)
+            still = replace(scene, limit=bare_limit, background=np.where(on_floor, bare, background))
+            still_area, still_share = still.usual_area(sample, spine_mm)
+            if still_share > share:
+                scene, area, share = still, still_area, still_share
+        elif stands:
+            scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
+        if share == 0.0:
+            raise EstimationError(
+                f"no animal was found in {len(sample)} frames spread over the recording: nothing between "
+                f"{view.area[0] * spine_mm[0] ** 2:.0f} and {view.area[1] * spine_mm[1] ** 2:.0f} mm^2 "
+                "stands on the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in the plan"
+            )
+        scene = replace(scene, area_mm2=area)
+        return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+
+    def with_its_still_part(
+        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float, area: float
+    ) -> tuple[Scene, float]:
+        """The scene with the floor put under an animal that has left a part of itself in the background.
+
+        Such a part is a lump on the floor that the moving animal of area mm^2 touches in (nearly) every frame, and with
+        which it is still no larger than an animal. Returns the animal's area, too.
+        """
+        import cv2
+
+        bare = self._grid_floor.depth(self.grid.width, self.grid.height)
+        lump = self.on_floor & (self.background > 0) & (bare - self.background > min_height_mm)
+        n, labels, stats, _ = cv2.connectedComponentsWithStats(lump.astype(np.uint8))
+        crops = replace(self, area_mm2=area).extract(sample, 1.0)
+        moving = np.zeros((int(crops.found.sum()), *lump.shape), np.bool_)
+        for k, i in enumerate(np.flatnonzero(crops.found)):
+            rows, columns = np.nonzero(crops.heights[i])
+            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
+            moving[k, v + step * rows, u + step * columns] = True
+        best, best_area = self, area
+        for k in range(1, n):
+            part = labels == k
+            if stats[k, cv2.CC_STAT_AREA] < 16:
+                continue
+            near = cv2.dilate(part.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+            if moving[:, near].any(axis=1).mean() < _TOUCH_SHARE:
+                continue
+            floor = np.where(near & self.on_floor, bare, self.background)
+            limit = np.where(near & self.on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit)
+            whole = replace(self, background=floor, limit=limit.astype(np.float32))
+            whole_area, share = whole.usual_area(sample, spine_mm)
+            if share >= 0.5 and whole_area > best_area:
+                best, best_area = whole, whole_area
+        return best, best_area
+
+    def usual_area(self, depths: NDArray[np.float32], spine_mm: tuple[float, float]) -> tuple[float, float]:
+        """The area mm^2 that the most frames have a blob of, and the share of frames that do.
+
+        One object of constant size is in (nearly) every frame, the animal; other things come and go or differ.
+        """
+        areas = np.zeros((len(depths), MAX_BLOBS))
+        bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
+        kernels.blob_areas(depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas)
+        low, high = self.view.area[0] * spine_mm[0] ** 2, self.view.area[1] * spine_mm[1] ** 2
+        candidates = np.sort(areas[(areas > low) & (areas < high)])
+        if not len(candidates):
+            return 0.0, 0.0
+        tried = candidates[np.linspace(0, len(candidates) - 1, min(200, len(candidates))).astype(int)]
+        distance = np.abs(np.log(np.maximum(areas, 1e-9)[None] / tried[:, None, None])).min(axis=2)
+        support = np.exp(-0.5 * (distance / 0.35) ** 2).sum(axis=1)
+        best = tried[np.argmax(support)]
+        return float(best), float((distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean())
+
+    def usual_volume(self, depths: NDArray[np.float32]) -> float:
+        """The median volume mm^3 of the animal in the frames (n, H, W) mm in which nothing else has about its area."""
+        volume, n_blobs = np.zeros(len(depths)), np.zeros(len(depths), np.int64)
+        for start in range(0, len(depths), 16):
+            crops = self.extract(depths[start : start + 16], 1.0)
+            volume[start : start + 16], n_blobs[start : start + 16] = crops.moments[:, 2], crops.n_blobs
+        alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
+        return float(np.median(volume[alone]))
+
+    def every(self, step: int) -> Scene:
+        """The same with every `step`-th pixel along rows and columns."""
+        camera, cut = self.camera.every(step), (slice(None, None, step), slice(None, None, step))
+        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
+        return replace(
+            self, camera=camera, floor=floor, background=np.ascontiguousarray(self.background[cut]),
+            limit=np.ascontiguousarray(self.limit[cut]), on_floor=np.ascontiguousarray(self.on_floor[cut]),
+        )  # fmt: skip
+
+    def misfit(self, crops: Crops) -> Array:
+        """How unlike the animal each crop (n) is in area and volume: the square of a number of standard deviations."""
+        area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)
+        if self.view.frame != VIEWS[0]:  # what is below an animal that swims or is held up is not its own
+            return (np.log(area / self.area_mm2) / _AREA_SD) ** 2
+        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (np.log(volume / self.volume_mm3) / _VOLUME_SD) ** 2
+
+    def view_rotation(self, camera_view: bool) -> Array:
+        """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame."""
+        return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
+
+    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+        if not camera_view:
+            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
+        level = np.zeros((len(crops.step), 3))
+        level[:, 2] = 1.0 / crops.distance
+        return level
+
+    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
+        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+        middle = crops.centroid
+        if camera_view:  # the view's frame is not the arena's
+            middle[:, 2] -= crops.distance
+            middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
+        return middle
+
+    def looks(self, crops: Crops, camera_view: bool = False) -> Array:
+        """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""
+        looks = np.empty((len(crops.step), 17))
+        looks[:, :4] = self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
+        looks[:, 4:13] = self.view_rotation(camera_view).ravel()
+        looks[:, 13] = crops.distance
+        looks[:, 14:16] = crops.origin
+        looks[:, 16] = crops.step
+        return looks
+
+    def _extract(
+        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+    ) -> Crops:
+        """See `Cutter`: the blobs whose areas are nearest to the animal's own. depths: whole pictures, or a sample of
+        them with the scene's own stride. camera_view: heights are measured from the view's behind_mm behind the
+        animal's mean depth, as the paper's features see them; otherwise above the floor.
+        """
+        if depths.shape[1:] != self.limit.shape:
+            depths = depths[:, :: self.stride, :: self.stride]
+        crops = Crops.blank(n_things * len(depths), self.floor.distance_mm)
+        grid = self.grid
+        with threads(parallel):
+            kernels.extract_all(
+                depths, self.limit, self.on_floor, self.area_mm2, n_things, camera_view, self.view.smooth_mm * size,
+                np.array([grid.fx, grid.fy, grid.cx, grid.cy]), self._grid_floor.inverse_depth,
+                self.view_rotation(camera_view), self.view.behind_mm if camera_view else 0.0,
+                crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
+            )  # fmt: skip
+        if self.stride > 1:  # told in pixels of the picture
+            for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
+                values *= self.stride * factor
+        return crops
+
+
+def _check_background(sample: NDArray[np.float32], background: NDArray[np.float32]) -> None:
+    """Refuse a sample (n, H, W) mm of frames from which no background (H, W) mm can be learned."""
+    n = len(sample)
+    if not (sample > 0).any():
+        raise EstimationError(
+            f"no depth was read in {n} frames spread over the recording; check the camera, its range and its cable"
+        )
+    if not (background > 0).any():
+        raise EstimationError(
+            f"a background is what keeps coming back, and {n} frame{'' if n == 1 else 's'} cannot tell; record some "
+            "seconds at least"
+        )

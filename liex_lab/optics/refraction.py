@@ -1,0 +1,156 @@
+"""A flat water surface between the camera and what it looks at: where a point truly is that seems to be nearer.
+
+Light from under water bends at the surface, so a camera above it sees every point in a wrong direction and reports a
+wrong depth. The direction is put right by following the camera's ray down (Snell's law). Which depth the camera
+reports, the *apparent* depth, depends on how it measures:
+
+- `light_field` (plenoptic cameras, many small views in all directions) and `structured_light` (also stereo; two views
+  side by side along the picture's rows) triangulate: the apparent point is where the back-traced rays of neighbouring
+  views intersect. Seen straight down that is at depth / n below the surface. Obliquely the rays of a point meet in two
+  places (refraction at a plane is astigmatic): views displaced within the plane of incidence see it at
+  d cos^3(i) / (n cos^3(r)), views displaced across it at d tan(r) / tan(i), for a point d below the surface, i and r
+  the angles in air and in water. A camera reports the depth of which the disparity is the sum of both, each with the
+  part of the displacement along it; for a light field the mean over all directions is taken.
+- `time_of_flight` cameras report half the way that the light would have gone in air: the way in water counts n times,
+  so that things seem farther, not nearer. (n is that of the group velocity, and near infrared is soon absorbed.)
+- `paraxial`: depth / n below the surface at every angle, the textbook's rule; for comparison.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.optics.camera import Camera
+
+Array = NDArray[np.float64]
+
+RANGINGS = ("light_field", "structured_light", "time_of_flight", "paraxial")
+N_LAW = 10  # numbers that say all about one ray
+_STEEPEST = 0.05  # cosine between a ray and the perpendicular; flatter rays do not reach the water
+
+
+@dataclass(frozen=True)
+class Water:
+    """A flat water surface that the camera looks down through.
+
+    height_mm: of the lens above the surface, along the perpendicular; tilt_x_rad, tilt_y_rad: how the surface recedes
+    from the camera towards the right and towards the lower edge of the picture; ranging: one of `RANGINGS`, see above.
+    """
+
+    height_mm: float
+    refractive_index: float = 1.333
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    ranging: str = "light_field"
+
+    def __post_init__(self) -> None:
+        numbers = (self.height_mm, self.refractive_index, self.tilt_x_rad, self.tilt_y_rad)
+        possible = self.height_mm > 0 and self.refractive_index >= 1 and np.abs(numbers[2:]).max() < 1.2
+        if not (possible and np.isfinite(numbers).all() and self.ranging in RANGINGS):
+            raise LiexError(
+                f"a water surface lies a positive height_mm below the lens, with a refractive_index of at least 1, "
+                f"tilts below 1.2 rad and ranging {', '.join(RANGINGS)}, got {asdict(self)}; correct [water] in the "
+                "plan"
+            )
+
+    @property
+    def normal(self) -> Array:
+        """Unit vector (3,) perpendicular to the surface, away from the camera, in the camera frame."""
+        down = np.array([-np.tan(self.tilt_x_rad), -np.tan(self.tilt_y_rad), 1.0])
+        return down / np.linalg.norm(down)
+
+    @property
+    def lift_mm(self) -> Array:
+        """What carries points (3,) mm from the frame of the camera into that of `without`, whose axes are parallel."""
+        return (self.refractive_index - 1.0) * self.height_mm * self.normal
+
+    def without(self, camera: Camera) -> Camera:
+        """The ideal camera that sees without the water what this one sees through it, from higher up (see `lift_mm`).
+
+        Under water the rays that meet in the lens run, near the perpendicular, as if they met n times as high above
+        the surface. An ideal camera there, with focal lengths n times as long, sees everything from the same side and
+        in the same pixel; off the perpendicular a point moves a little towards the middle.
+        """
+        n = self.refractive_index
+        way = self.law(np.zeros(2))[7:]
+        return replace(
+            camera, fx=n * camera.fx, fy=n * camera.fy, cx=camera.cx - n * camera.fx * float(way[0] / way[2]),
+            cy=camera.cy - n * camera.fy * float(way[1] / way[2]),
+        )  # fmt: skip
+
+    def law(self, rays: ArrayLike) -> Array:
+        """What refraction does to rays (..., 2), the x and y of (x, y, 1): `N_LAW` numbers for each (..., N_LAW).
+
+        (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z lies d below the surface, where
+        a d^2 + (b - c z) d = k z - 1, if k z > 1, else above the water and where it seems to be; and its place is
+        (sx, sy, sz) + d (bx, by, bz), mm in the camera frame: the ray's own place on the surface, and its way down.
+        """
+        xy = np.asarray(rays, float)
+        ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+        ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+        down, n, h = self.normal, self.refractive_index, self.height_mm
+        cos_air = ray @ down
+        reaches = cos_air > _STEEPEST
+        cos_air = np.maximum(cos_air, _STEEPEST)
+        cos_water = np.sqrt(1.0 - (1.0 - cos_air**2) / n**2)
+        surface = ray * (h / cos_air)[..., None]
+        way = ray / n + (cos_water - cos_air / n)[..., None] * down
+        law = np.concatenate(
+            [self._depth_law(ray, cos_air, cos_water), surface, way / cos_water[..., None]], axis=-1
+        )  # fmt: skip
+        law[..., 3] = np.where(reaches, cos_air / (ray[..., 2] * h), 0.0)
+        return law
+
+    def _depth_law(self, ray: Array, cos_air: Array, cos_water: Array) -> Array:
+        """a, b, c and room for k of `law` (..., 4), from unit rays (..., 3) and the cosines (...) of i and r."""
+        n, h, zero = self.refractive_index, self.height_mm, np.zeros_like(cos_air)
+        if self.ranging == "paraxial":
+            return np.stack([zero, zero + 1.0 / (n * h), zero, zero], axis=-1)
+        if self.ranging == "time_of_flight":
+            return np.stack([zero, n * cos_air / (h * cos_water), zero, zero], axis=-1)
+        within = cos_air**3 / (n * cos_water**3)  # apparent over true depth, views displaced in the plane of incidence
+        across = cos_air / (n * cos_water)  # tan r / tan i
+        weight_within, weight_across = self._weights(ray, cos_air)
+        return np.stack([
+            within * across / h**2, (within + across) / h, (weight_within * across + weight_across * within) / h**2,
+            zero,
+        ], axis=-1)  # fmt: skip
+
+    def _weights(self, ray: Array, cos_air: Array) -> tuple[Array, Array]:
+        """The parts (...) of the views' displacement within and across the plane of incidence of unit rays (..., 3).
+
+        They weigh the disparities: cos i / z' summed over both foci, z' being how far below the lens each lies.
+        """
+        side = np.cross(self.normal, ray)
+        straight_down = np.linalg.norm(side, axis=-1, keepdims=True) < 1e-9  # where both foci are one
+        side = np.where(straight_down, np.cross([0.0, 1.0, 0.0], ray), side)
+        side = side / np.linalg.norm(side, axis=-1, keepdims=True)
+        along = np.cross(side, ray)
+        axes = (0, 1) if self.ranging == "light_field" else (0,)
+        within, across = np.zeros_like(cos_air), np.zeros_like(cos_air)
+        for k in axes:  # the disparity of a displacement along one picture axis is measured along that axis
+            slope = ray[..., k] / ray[..., 2]
+            within += (along[..., k] - slope * along[..., 2]) * along[..., k]
+            across += (side[..., k] - slope * side[..., 2]) * side[..., k]
+        share = cos_air / ray[..., 2] / len(axes)
+        return within * share, across * share
+
+    def true_points(self, rays: ArrayLike, depth: ArrayLike) -> Array:
+        """Where points (..., 3) mm truly are that are seen along rays (..., 2) at apparent depth (...) mm."""
+        xy, z = np.asarray(rays, float), np.asarray(depth, float)
+        law = self.law(xy)
+        excess = law[..., 3] * z - 1.0
+        wet = np.maximum(excess, 0.0)
+        b = law[..., 1] - law[..., 2] * z
+        below = 2.0 * wet / (b + np.sqrt(b * b + 4.0 * law[..., 0] * wet))
+        seeming = np.concatenate([xy * z[..., None], (z * np.ones(xy.shape[:-1]))[..., None]], axis=-1)
+        return np.where((excess > 0)[..., None], law[..., 4:7] + below[..., None] * law[..., 7:10], seeming)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for session.json."""
+        return asdict(self)

@@ -1,0 +1,221 @@
+"""A plan: everything a run depends on, in one small TOML file. Equal plans give equal results."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import textwrap
+import tomllib
+from collections.abc import Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import Field, ValidationError
+
+from liex_lab.errors import PlanError
+from liex_lab.plan.sections import (
+    Actions,
+    Animal,
+    ArenaFacts,
+    Behaviour,
+    CameraOverride,
+    Estimation,
+    Foreground,
+    RecordingOptions,
+    Replay,
+    SessionFacts,
+    Table,
+    Tracking,
+    WaterSurface,
+)
+
+_HERE = Path(__file__).resolve().parents[1]
+_NOT_PLANS = {"slurm"}  # it says where sessions are measured, not how
+_HEADER = """\
+# A plan of liex_lab: everything a run depends on. Copy this file, change the copy, and name it:
+#     liex run RECORDING --plan my-plan.toml
+# or change one value for one run:  --set animal.spine_mm=65
+# A line that is left out has its default value; a line in the form '# name =' is not set.
+# Lengths are millimetres, times seconds, angles radians.
+"""
+
+
+class Plan(Table):
+    """Everything a run depends on. Units are in the names; None is 'not set'."""
+
+    seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
+    animal: Animal = Animal()
+    camera: CameraOverride = CameraOverride()
+    recording: RecordingOptions = RecordingOptions()
+    water: WaterSurface = WaterSurface()
+    arena: ArenaFacts = ArenaFacts()
+    foreground: Foreground = Foreground()
+    estimation: Estimation = Estimation()
+    tracking: Tracking = Tracking()
+    session: SessionFacts = SessionFacts()
+    actions: Actions = Actions()
+    behaviour: Behaviour = Behaviour()
+    replay: Replay = Replay()
+
+    @staticmethod
+    def load(plan: str | Path) -> Plan:
+        """The bundled plan of this name ('mouse'), or the plan in a TOML file."""
+        path = plans_folder() / f"{plan}.toml"
+        if not path.is_file():
+            path = Path(plan)
+        if not path.is_file():
+            known = known_plans()
+            near = difflib.get_close_matches(str(plan), known, 1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            raise PlanError(
+                f"there is no plan '{plan}': {hint}bundled are: {', '.join(known) or 'none'}, or give the path of a "
+                ".toml file"
+            )
+        return Plan.from_toml(_read(path), origin=str(path))
+
+    @staticmethod
+    def from_toml(text: str, origin: str = "the plan") -> Plan:
+        """The plan in a TOML text; `origin` names the file in errors."""
+        try:
+            table = tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            raise PlanError(
+                f"{origin} should be a TOML file, but: {error}; compare it with `liex info --plan`"
+            ) from None
+        return Plan.from_table(table, origin)
+
+    @staticmethod
+    def from_table(table: dict[str, Any], origin: str = "the plan") -> Plan:
+        """The plan in a nested dict, as TOML or JSON gives it; missing settings have their defaults."""
+        try:
+            return Plan.model_validate(table)
+        except ValidationError as error:
+            raise PlanError(f"{origin}: {_sentence(error)}") from None
+
+    def with_settings(self, settings: Iterable[str]) -> Plan:
+        """This plan with settings like 'animal.spine_mm=65' put in; 'animal.spine_mm=' brings the default back."""
+        chosen = list(settings)
+        table = self.model_dump(exclude_none=True)
+        for setting in chosen:
+            dotted, equals, text = (part.strip() for part in setting.partition("="))
+            if not equals or not dotted:
+                raise PlanError(f"--set takes key=value, as in --set animal.spine_mm=65, got '{setting}'")
+            *sections, key = dotted.split(".")
+            inner = table
+            for section in sections:
+                inner = inner.setdefault(section, {})
+                if not isinstance(inner, dict):
+                    raise PlanError(f"--set {setting}: {_unknown(dotted)}")
+            inner.pop(key, None)
+            if text or dotted not in _settings():
+                inner[key] = _value(dotted, text)
+        return Plan.from_table(table, " ".join(f"--set {setting}" for setting in chosen)) if chosen else self
+
+    def to_toml(self) -> str:
+        """The plan as TOML with a comment for every setting; loading it gives an equal plan."""
+        lines = [_HEADER]
+        for name, field in Plan.model_fields.items():
+            value = getattr(self, name)
+            if not isinstance(value, Table):
+                lines += [*_entry(name, value, field.description), ""]
+                continue
+            lines += [*_comment(type(value).__doc__ or ""), f"[{name}]"]
+            for key, inner in type(value).model_fields.items():
+                lines += _entry(key, getattr(value, key), inner.description)
+            lines.append("")
+        return "\n".join(lines).rstrip() + "\n"
+
+
+def plans_folder() -> Path:
+    """The folder of bundled plans: inside the package once installed, beside it in a clone."""
+    installed = _HERE / "pipelines" / "plans"
+    return installed if installed.is_dir() else _HERE.parent / "pipelines" / "plans"
+
+
+def known_plans() -> list[str]:
+    """The names of the bundled plans."""
+    return sorted(path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise PlanError(f"the plan {path} should be a TOML text in UTF-8, but it is not a text file") from None
+
+
+def _settings() -> dict[str, Any]:
+    """Every setting, dotted, with the type it takes."""
+    found: dict[str, Any] = {}
+    for name, field in Plan.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Table):
+            inner = field.annotation.model_fields
+            found |= {f"{name}.{key}": inner[key].annotation for key in inner}
+        else:
+            found[name] = field.annotation
+    return found
+
+
+def _value(dotted: str, text: str) -> Any:
+    """The value that a person typed after --set: as TOML, or as the plain word it is."""
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return text
+    annotation = _settings().get(dotted)
+    takes_text = str in (get_args(annotation) or (annotation,))
+    return text if takes_text and not isinstance(value, str) else value  # subject_id=0123 is a name, not a number
+
+
+def _unknown(dotted: str) -> str:
+    """What to say about a setting that does not exist: the nearest one that does."""
+    known = list(_settings())
+    section, _, key = dotted.rpartition(".")
+    tables = sorted({name.partition(".")[0] for name in known if "." in name})
+    elsewhere = [name for name in known if name.rpartition(".")[2] == key]
+    beside = [name for name in known if section and name.startswith(f"{section}.")]
+    if not section and not elsewhere and difflib.get_close_matches(key, tables, 1, cutoff=0.7):
+        return f"[{key}] is not a section of a plan; the nearest one is [{_nearest(key, tables)}]"
+    near = elsewhere[0] if elsewhere else _nearest(dotted, beside or known)
+    return f"{dotted} is not a setting of a plan; the nearest one is {near}"
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    return difflib.get_close_matches(word, known, 1, cutoff=0.0)[0]
+
+
+def _sentence(error: ValidationError) -> str:
+    """The first complaint, as one sentence that says what to do."""
+    first, *others = error.errors(include_url=False)
+    dotted = ".".join(str(part) for part in first["loc"])
+    more = f" (and {len(others)} more)" if others else ""
+    if first["type"] == "extra_forbidden":
+        return _unknown(dotted) + more
+    if first["type"] in {"model_type", "model_attributes_type"}:
+        return f"[{dotted}] is a section with settings below it, got {first['input']!r}{more}"
+    if first["type"] == "value_error" and dotted not in _settings():
+        return f"[{dotted}]: {first['msg'].removeprefix('Value error, ')}{more}"
+    expected = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    got = first["input"].isoformat() if isinstance(first["input"], datetime) else repr(first["input"])
+    return f"{dotted} {expected}, got {got}; correct it in the plan or with --set {dotted}=...{more}"
+
+
+def _entry(name: str, value: Any, description: str | None) -> list[str]:
+    text = "# " + name + " =" if value is None else f"{name} = {_literal(value)}"
+    return [*_comment(description or ""), text]
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, 116, initial_indent="# ", subsequent_indent="# ")
+
+
+def _literal(value: bool | int | float | str | list[float]) -> str:
+    """A value as TOML writes it. JSON's string escapes are TOML's, but for DEL."""
+    if isinstance(value, list):
+        return f"[{', '.join(_literal(item) for item in value)}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)

@@ -1,0 +1,237 @@
+"""A folder of depth pictures (PNG, TIFF, PGM or PCLZF), with a camera.toml and time stamps beside them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.camera_file import CAMERA_FILE, WHAT_TO_WRITE, CameraFile, rate
+from liex_lab.recordings.depth_units import COLOUR, Stored
+from liex_lab.recordings.formats.images.stack import Stack
+from liex_lab.recordings.frame import Depth
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamp_files import name_times, read_csv_times
+from liex_lab.recordings.timestamps import Settled, from_rate, match_counts, settle, start_of_clock
+from liex_lab.runtime.progress import Progress, silent
+
+KINDS: dict[str, tuple[str, ...]] = {  # of pictures: how their files' names end
+    "PNG": (".png",), "TIFF": (".tif", ".tiff"), "PGM": (".pgm",), "PCLZF": (".pclzf",),
+}  # fmt: skip
+SUFFIXES = tuple(suffix for kind in KINDS.values() for suffix in kind)
+_EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".gif", ".webp")
+_COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one beside every depth picture
+
+
+class Pictures:
+    """Pictures as depth: a cut or damaged one is wholly unread, and `problems` says so once."""
+
+    def __init__(self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]) -> None:
+        """decode: stored values of one picture -> depth (H, W) float32 mm."""
+        self.stack, self.problems = stack, problems
+        self._decode = decode
+        self._bad = {i for i, whole in enumerate(stack.whole) if not whole}
+
+    def read(self, index: int) -> Depth:
+        """Depth (H, W) float32 mm of one picture."""
+        stored = self.stack.read(index)
+        if stored is not None:
+            return self._decode(stored)
+        if index not in self._bad:
+            self._bad.add(index)
+            self.problems.append(f"frame {index} ({self.stack.label(index)}) is damaged and was taken as wholly unread")
+        return np.zeros((self.stack.height, self.stack.width), np.float32)
+
+
+def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
+    """The kind of the depth pictures of a folder, and they in natural order: frame_2 before frame_10."""
+    inside = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    chosen = [path for path in inside if fnmatch(path.name, pattern) and not path.name.endswith(_COLOUR_PCLZF)]
+    kinds = {kind: [p for p in chosen if p.suffix.lower() in ends] for kind, ends in KINDS.items()}
+    found = [kind for kind, files in kinds.items() if files]
+    if len(found) > 1:
+        raise RecordingError(
+            f"{folder} holds both {found[0]} and {found[1]} pictures, and a recording has one kind; choose with a line "
+            f'such as pattern = "*{KINDS[found[0]][0]}" under [camera] in camera.toml'
+        )
+    eight_bit = [path for path in chosen if path.suffix.lower() in _EIGHT_BIT]
+    if not found and eight_bit:
+        raise RecordingError(
+            f"expected 16-bit depth pictures (PNG or TIFF), got 8-bit pictures such as {eight_bit[0].name} "
+            f"in {folder}; give the folder of the camera's depth pictures"
+        )
+    if not found:
+        raise RecordingError(f"no picture in {folder} fits pattern = {pattern!r}; correct it in camera.toml")
+    return found[0], sorted(kinds[found[0]], key=lambda path: natural_key(path.name))
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sorts digits by their value and the rest by its letters."""
+    return [
+        (0, int(part), "") if part.isascii() and part.isdigit() else (1, 0, part)
+        for part in re.findall(r"[0-9]+|[^0-9]+", name)
+    ]
+
+
+def open_images(
+    path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
+) -> Recording:
+    """A folder of pictures, or one picture or stack, as a recording."""
+    folder = path if path.is_dir() else path.parent
+    told = CameraFile.read(folder / CAMERA_FILE)
+    kind, files = list_pictures(path, told.pattern) if path.is_dir() else (_kind(path), [path])
+    if kind == "PCLZF":
+        told = _with_xml(told, files[0])
+    stack = open_stack(kind, files, told, progress)
+    return Folder(path, files, told, stack, told.decode).recording("images", camera, fps)
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Pictures and all that is needed to make a recording of them.
+
+    path: what was asked for, a folder or one file; told: what its camera.toml says; decode: stored values -> depth
+    (H, W) float32 mm; beside: further files that say how to read the pictures.
+    """
+
+    path: Path
+    files: list[Path]
+    told: CameraFile
+    stack: Stack
+    decode: Callable[[Stored], Depth]
+    beside: Sequence[Path] = ()
+
+    def recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
+        """The recording, with its camera and times; the stack is closed where that fails."""
+        try:
+            return self._recording(format, camera, fps)
+        except BaseException:
+            self.stack.close()
+            raise
+
+    def _recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
+        path, stack, told = self.path, self.stack, self.told
+        the_camera = told.camera(stack.width, stack.height, camera)
+        problems = [*told.problems, *stack.problems, *_say_cut(stack)]
+        settled, start = self._times(fps, problems)
+        _refuse_negative(stack, self.decode, told)
+        stated_in = [self.folder / CAMERA_FILE, self.folder / told.timestamps, *self.beside]
+        return Recording(
+            name=path.resolve().stem if path.is_file() else path.resolve().name, format=format, camera=the_camera,
+            times_ns=settled.times_ns, read=Pictures(stack, self.decode, problems).read,
+            sources=[*self.files, *(file for file in stated_in if file.is_file())], problems=problems,
+            truncated=stack.truncated, n_whole=sum(stack.whole[: len(settled.times_ns)]),
+            metadata=({"session_start_time": start} if start else {}) | told.metadata,
+            close=stack.close, faults=settled.faults,
+        )  # fmt: skip
+
+    @property
+    def folder(self) -> Path:
+        """Where the pictures lie."""
+        return self.path if self.path.is_dir() else self.path.parent
+
+    def _times(self, fps: float | None, problems: list[str]) -> tuple[Settled, str | None]:
+        """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they tell it.
+
+        From the stamp file, or else from the names of the pictures, or else from a stated rate.
+        """
+        path, n = self.folder / self.told.timestamps, len(self.stack)
+        if path.is_file():
+            times = read_csv_times(path, self.told.time_column, self.told.time_unit)
+            n, counts = match_counts(n, times, self.folder.name, path.name)
+            if not n:
+                raise RecordingError(
+                    f"{path} holds no time stamp; write one per picture, or remove it and state fps in camera.toml"
+                )
+            problems += [counts] if counts else []
+            moment = True
+        elif len(self.files) == n and (named := name_times([file.name for file in self.files])) is not None:
+            times, moment = named
+        else:
+            hz = rate(fps, "the call") or self.told.fps
+            if hz is None:
+                raise self._no_times()
+            problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
+            times, moment = from_rate(n, hz), False
+        settled = settle(times[:n])
+        problems += [settled.problem] if settled.problem else []
+        return settled, start_of_clock(int(settled.times_ns[0])) if moment else None
+
+    def _no_times(self) -> RecordingError:
+        return RecordingError(
+            f"the times of the pictures in {self.folder} are not known; write {self.told.timestamps} with a line "
+            "time_ns (or time_s) and then one time per picture, or state a constant rate with fps = 30.0 under "
+            "[camera] in camera.toml" + ("" if self.told.path.is_file() else f" ({WHAT_TO_WRITE})")
+        )
+
+
+def _kind(path: Path) -> str:
+    return next(kind for kind, ends in KINDS.items() if path.suffix.lower() in ends)
+
+
+def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
+    """The camera file completed by the intrinsics that PCL writes beside each picture."""
+    from liex_lab.recordings.formats.images.pclzf import read_pclzf_camera
+
+    found = read_pclzf_camera(picture)
+    if camera_file.intrinsics or found is None:
+        return camera_file
+    unit_mm = found.pop("unit_mm")
+    stated = camera_file.path.is_file()
+    return replace(
+        camera_file, intrinsics=found, unit_mm=camera_file.unit_mm if stated else unit_mm,
+        source="the XML files beside the pictures",
+    )  # fmt: skip
+
+
+def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: Progress) -> Stack:
+    """The pictures of one kind, a key of `KINDS`."""
+    if kind == "PNG":
+        from liex_lab.recordings.formats.images.png import open_pngs
+
+        return open_pngs(files, progress, colour=camera_file.encoding == COLOUR)
+    if camera_file.encoding == COLOUR:
+        raise RecordingError(
+            f'{camera_file.path} states encoding = "{COLOUR}", which is one of colour PNG pictures, but '
+            f"{files[0].name} is a {kind} picture; correct it"
+        )
+    if kind == "PGM":
+        from liex_lab.recordings.formats.images.pgm import open_pgms
+
+        return open_pgms(files, progress, camera_file.byte_order)
+    if kind == "PCLZF":
+        from liex_lab.recordings.formats.images.pclzf import open_pclzfs
+
+        return open_pclzfs(files, progress)
+    from liex_lab.recordings.formats.images.tiff import open_tiffs
+
+    return open_tiffs(files, progress)
+
+
+def _say_cut(stack: Stack) -> list[str]:
+    cut = [i for i, whole in enumerate(stack.whole) if not whole]
+    if not cut:
+        return []
+    return [
+        f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as wholly unread, the first is "
+        f"frame {cut[0]} ({stack.label(cut[0])})"
+    ]
+
+
+def _refuse_negative(stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile) -> None:
+    """Float pictures may count away from the camera with a minus sign; nothing would be left of them unread."""
+    stored = stack.read(stack.whole.index(True))
+    if stored is None or stored.dtype.kind != "f" or decode(stored).any():
+        return
+    read = stored[np.isfinite(stored) & (stored != 0)] * camera_file.unit_mm
+    if read.size and np.median(read) < 0:
+        raise RecordingError(
+            f"the depths in {stack.label(stack.whole.index(True))} are negative, so its depth axis points towards the "
+            f"camera; write unit_mm = {-camera_file.unit_mm:g} under [camera] in camera.toml"
+        )

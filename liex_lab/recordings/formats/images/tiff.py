@@ -1,0 +1,194 @@
+"""16-bit or float32 TIFF pictures, one to a file or many."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings.formats.images.stack import none_whole_error, not_depth_error, one_size_error, too_large
+from liex_lab.runtime.progress import Progress
+
+# tifffile reports damage twice, as an exception and in the log; the log would come out between our sentences
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+class _Page(NamedTuple):
+    """One picture: its page, and where its pixels lie when they are plain bytes in one piece (else offset -1)."""
+
+    path: Path
+    page: int
+    offset: int
+    dtype: str
+    whole: bool
+
+
+@dataclass
+class TiffStack:
+    """TIFF pictures of one size, in order; whole: which of them are not cut short. One file is open at a time."""
+
+    pages: list[_Page]
+    width: int
+    height: int
+    problems: list[str]
+    _open: tifffile.TiffFile | None = None
+    _open_path: Path | None = None
+    _lock: Lock = field(default_factory=Lock)
+
+    def __len__(self) -> int:
+        return len(self.pages)
+
+    @property
+    def whole(self) -> list[bool]:
+        """Which pictures are not cut short."""
+        return [page.whole for page in self.pages]
+
+    @property
+    def truncated(self) -> bool:
+        """True where a picture, or the end of a stack, is missing."""
+        return bool(self.problems) or not all(self.whole)
+
+    def read(self, index: int) -> NDArray[Any] | None:
+        """Stored values (H, W) uint16 or float32; None where the picture is cut or damaged."""
+        page = self.pages[index]
+        if not page.whole:
+            return None
+        if page.offset >= 0:
+            count = self.width * self.height
+            return np.fromfile(page.path, page.dtype, count, offset=page.offset).reshape(self.height, self.width)
+        with self._lock:
+            picture = self._decode(page)
+        return picture if picture is not None and picture.shape == (self.height, self.width) else None
+
+    def _decode(self, page: _Page) -> NDArray[Any] | None:
+        if self._open_path != page.path:
+            self.close()
+            self._open, self._open_path = tifffile.TiffFile(page.path), page.path
+        assert self._open is not None
+        try:
+            return self._open.asarray(key=page.page)
+        except Exception:  # damage inside compressed data comes out as almost any exception
+            return _decode_with_opencv(page)
+
+    def label(self, index: int) -> str:
+        """The file and page of a picture, for a sentence."""
+        page = self.pages[index]
+        return f"page {page.page} of {page.path.name}"
+
+    def close(self) -> None:
+        """Close the file that is open."""
+        if self._open is not None:
+            self._open.close()
+        self._open = self._open_path = None
+
+
+def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
+    """LZW and other codecs that tifffile leaves to another package; None where OpenCV cannot either."""
+    import cv2
+
+    try:
+        found, pictures = cv2.imreadmulti(str(page.path), page.page, 1, flags=cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    return np.asarray(pictures[0]) if found and pictures and pictures[0].ndim == 2 else None
+
+
+def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
+    """List every page and check that its bytes are there, without decoding any."""
+    pages: list[_Page] = []
+    problems: list[str] = []
+    sizes: dict[tuple[int, int], str] = {}
+    for number, path in enumerate(files, start=1):
+        found, size, ends = _list_pages(path)
+        n_whole = next((i for i, page in enumerate(found) if not page.whole), len(found))
+        if n_whole and (n_whole < len(found) or not ends):
+            # a stack ends at its first bad page: what follows cannot be told from noise
+            problems.append(f"{path.name} is cut short: only its first {n_whole} pictures are whole")
+            found = found[:n_whole]
+        pages += found or [_Page(path, 0, -1, "<u2", False)]
+        if size is not None:
+            sizes.setdefault(size, path.name)
+        progress(number, len(files), "looking at the pictures")
+    if not any(page.whole for page in pages):
+        raise none_whole_error(files, "TIFF")
+    if len(sizes) > 1:
+        raise one_size_error([(name, *size) for size, name in sizes.items()])
+    ((width, height),) = sizes
+    return TiffStack(pages, width, height, problems)
+
+
+def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
+    """The pictures of one file in order, their (width, height), and whether the list of pages comes to its end.
+
+    No pictures and no size where the directory is cut off.
+    """
+    size_bytes = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(4)
+    if len(head) == 4 and head not in _SIGNATURES:
+        raise RecordingError(f"{path} is named like a TIFF picture but holds something else; remove it")
+    listed: list[_Page] = []
+    size: tuple[int, int] | None = None
+    try:
+        with tifffile.TiffFile(path) as tif:
+            page: Any
+            for page in tif.pages:
+                listed.append(_describe(path, len(listed), page, size_bytes))
+                size = size or (int(page.imagewidth), int(page.imagelength))
+            ends = _list_ends(tif)
+            return (_imagej_stack(tif, listed[0], size_bytes) if len(listed) == 1 else listed), size, ends
+    except RecordingError:
+        if not any(page.whole for page in listed):
+            raise
+        # damage inside a directory, or a picture of another kind behind the depth: the stack ends before it
+        return listed, size, False
+    except Exception:  # the directory of a cut file is garbage, and comes out as almost any exception
+        return listed, size, False
+
+
+def _list_ends(tif: tifffile.TiffFile) -> bool:
+    """Whether the last page that was found says that it is the last: each page ends with the place of the next."""
+    layout, last = tif.tiff, tif.pages[len(tif.pages) - 1]
+    file = tif.filehandle
+    file.seek(last.offset)
+    n_tags = int.from_bytes(file.read(layout.tagnosize), "little" if tif.byteorder == "<" else "big")
+    file.seek(last.offset + layout.tagnosize + n_tags * layout.tagsize)
+    return file.read(layout.offsetsize) == bytes(layout.offsetsize)
+
+
+def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
+    width, height, dtype = int(page.imagewidth), int(page.imagelength), np.dtype(page.dtype or "V1")
+    if page.samplesperpixel != 1 or dtype.kind + str(dtype.itemsize) not in ("u2", "f4") or not (width and height):
+        colour = "grey" if page.samplesperpixel == 1 else "colour"
+        raise not_depth_error(str(path), f"{page.bitspersample}-bit {colour}", width, height)
+    ends = [offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)]
+    plain = page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
+    # without compression the size follows from the bytes; a directory that contradicts itself is damaged
+    agrees = page.compression != 1 or sum(page.databytecounts) == width * height * dtype.itemsize
+    return _Page(
+        path=path,
+        page=index,
+        offset=int(page.dataoffsets[0]) if plain else -1,
+        dtype=page.parent.byteorder + dtype.kind + str(dtype.itemsize),
+        whole=bool(ends) and max(ends) <= size_bytes and agrees and not too_large((width, height)),
+    )
+
+
+def _imagej_stack(tif: tifffile.TiffFile, first: _Page, size_bytes: int) -> list[_Page]:
+    """ImageJ describes a stack of over 4 GB as one page; its other pictures follow the first without a gap."""
+    shape = tif.series[0].shape if tif.series else ()
+    n_pictures = int(np.prod(shape[:-2])) if len(shape) > 2 else 1
+    if n_pictures == 1 or first.offset < 0:
+        return [first]
+    n_bytes = shape[-1] * shape[-2] * int(first.dtype[-1])
+    offsets = [first.offset + k * n_bytes for k in range(n_pictures)]
+    return [first._replace(page=k, offset=o, whole=o + n_bytes <= size_bytes) for k, o in enumerate(offsets)]

@@ -1,0 +1,128 @@
+"""Foxglove's messages that hold depth, in protobuf and in JSON."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudMessage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+
+from liex_lab.recordings.formats.messages.messages import (
+    Calibration,
+    DamagedMessage,
+    Message,
+    PackedPicture,
+    Parser,
+    PointCloud,
+    RawPicture,
+)
+
+# foxglove.PackedElementField's NumericType: NumPy's name of it
+_FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
+_SECOND = 10**9
+
+
+def _raw_image(message: Any) -> RawPicture:
+    m = message
+    return RawPicture(_stamp(m), m.frame_id, int(m.width), int(m.height), m.encoding, int(m.step), False, m.data)
+
+
+def _packed_image(message: Any) -> PackedPicture:
+    return PackedPicture(_stamp(message), message.frame_id, message.format, message.data)
+
+
+def _calibration(message: Any) -> Calibration:
+    m = message
+    size = int(m.width), int(m.height)
+    return Calibration(m.frame_id, *size, m.distortion_model, tuple(m.D), tuple(m.K), tuple(m.P))
+
+
+def _cloud(message: Any) -> PointCloud:
+    columns = {f.name: (int(f.offset), _FIELD_TYPES[f.type]) for f in message.fields if f.type in _FIELD_TYPES}
+    step, data = int(message.point_stride), message.data
+    n = len(data) // max(step, 1)
+    at, turn = message.pose.position, message.pose.orientation
+    pose = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+    moved = any(pose[:6])
+    return PointCloud(_stamp(message), message.frame_id, n, 1, columns, step, n * step, data, pose if moved else None)
+
+
+def _stamp(message: Any) -> int:
+    stamp = message.timestamp
+    return int(stamp.seconds) * _SECOND + int(stamp.nanos)
+
+
+_JSON_NAMES = {"seconds": "sec", "nanos": "nsec"}  # protobuf's name: JSON's
+
+
+class _Json:
+    """A JSON object whose keys are attributes, as protobuf's messages have them; what is missing is empty."""
+
+    _TEXTS = ("frame_id", "encoding", "format", "distortion_model", "name")
+    _LISTS = ("D", "K", "P")
+    _OBJECTS = ("timestamp", "pose", "position", "orientation")
+
+    def __init__(self, content: Any) -> None:
+        if not isinstance(content, dict):
+            raise DamagedMessage("a message is not a JSON object")
+        self._content = content
+
+    def __getattr__(self, name: str) -> Any:
+        value = self._content.get(_JSON_NAMES.get(name, name))
+        if name == "data":
+            return base64.b64decode(value or b"", validate=True)
+        if name in self._OBJECTS:
+            return _Json(value or {})
+        if name in self._TEXTS:
+            return str(value or "")
+        if name == "fields":
+            return [_Json(item) for item in value or []]
+        if name in self._LISTS:
+            return [float(number) for number in value or []]
+        number = float(value or 0)
+        return int(number) if number.is_integer() else number
+
+
+_READ: dict[str, Callable[[Any], Message]] = {
+    "foxglove.RawImage": _raw_image,
+    "foxglove.CompressedImage": _packed_image,
+    "foxglove.CameraCalibration": _calibration,
+    "foxglove.PointCloud": _cloud,
+}
+_PROTOBUF: dict[str, Any] = {
+    "foxglove.RawImage": RawImage,
+    "foxglove.CompressedImage": CompressedImage,
+    "foxglove.CameraCalibration": CameraCalibration,
+    "foxglove.PointCloud": PointCloudMessage,
+}
+
+
+def parser(schema: str, encoding: str) -> Parser | None:
+    """What reads this kind of message; None where there is nothing for it."""
+    if schema in _READ and encoding == "protobuf":
+        return partial(_from_protobuf, schema)
+    if schema in _READ and encoding == "json":
+        return partial(_from_json, schema)
+    return None
+
+
+def _from_protobuf(schema: str, data: memoryview) -> Message:
+    try:
+        return _READ[schema](_PROTOBUF[schema].FromString(data))
+    except DecodeError as error:
+        raise DamagedMessage(str(error)) from None
+
+
+def _from_json(schema: str, data: memoryview) -> Message:
+    try:
+        return _READ[schema](_Json(json.loads(bytes(data))))
+    except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
+        raise DamagedMessage(str(error)) from None

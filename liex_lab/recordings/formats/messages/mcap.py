@@ -1,0 +1,233 @@
+"""MCAP recordings: depth in Foxglove's messages (protobuf or JSON) or in ROS's, packed or not, whole or cut."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from io import BytesIO
+from pathlib import Path
+from typing import IO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Metadata as MetadataRecord
+from mcap.records import Schema as SchemaRecord
+
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.formats.messages.depth_topics import open_topic
+from liex_lab.recordings.formats.messages.message_file import (
+    Channel,
+    Chunk,
+    DamagedChunk,
+    Envelope,
+    MessageFile,
+    Place,
+    unpacked,
+)
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.progress import Progress, silent
+
+MAGIC = b"\x89MCAP0\r\n"
+NOTES = "liex_lab"  # the name of the metadata record in files of our own making
+_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQI")  # its record: opcode, length, where the summary and its offsets begin, CRC
+_CHUNK = struct.Struct("<QQQII")  # first and last log time, unpacked size, its CRC, length of the packing's name
+_BLOCK = 1 << 20
+_THREADS, _SMALL_CHUNK = 2, 1 << 23  # chunks of so many bytes at most are unpacked before it is their turn
+_FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
+_LARGEST_FACT = 1 << 24  # bytes of one of them
+_DAMAGE = (McapError, KeyError, ValueError, OverflowError, MemoryError, RuntimeError, struct.error, EOFError)
+
+Wanted = Callable[[Channel], bool]
+
+
+def open_mcap(
+    path: Path,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    progress: Progress = silent,
+    topic: str | None = None,
+) -> Recording:
+    """One depth topic of an MCAP file as a recording. `fps` is not needed: every message has its time."""
+    file = path.open("rb")
+    if file.read(len(MAGIC)) != MAGIC:
+        file.close()
+        raise RecordingError(f"{path} is named like an MCAP file but holds something else; give another file")
+    return open_topic(McapFile(path, file), "mcap", camera, topic, progress)
+
+
+class McapFile(MessageFile):
+    """An open MCAP file."""
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        super().__init__(path, file)
+        self._by_id: dict[int, Channel] = {}
+        self._schemas: dict[int, str] = {0: "no schema"}
+        self._coming: dict[int, Future[bytes]] = {}  # chunks that are being unpacked, by where their content begins
+        self._sure = (len(MAGIC), 0, True)  # behind the last whole record: where, chunks until there, `whole`
+
+    def go_on(self) -> int | None:
+        """See `MessageFile`."""
+        size = self.path.stat().st_size
+        if size < self.size:
+            return None
+        self.size, (_, n_chunks, self.whole) = size, self._sure
+        del self.chunks[n_chunks:]
+        self._last_chunk = (-1, memoryview(b""))
+        return n_chunks
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
+        """Every whole message of the wanted channels, in file order; a second walk begins where the first was sure."""
+        self._learn_ending()
+        with ThreadPoolExecutor(_THREADS) as unpackers:
+            try:
+                yield from self._walk(wanted, progress, unpackers)
+            finally:
+                unpackers.shutdown(wait=False, cancel_futures=True)
+                self._coming.clear()
+
+    def _walk(self, wanted: Wanted, progress: Progress, unpackers: ThreadPoolExecutor) -> Iterator[Envelope]:
+        at, footer = self._sure[0], False
+        while at + _RECORD.size <= self.size and not footer:
+            opcode, start, end = self._record(at)
+            whole = end <= self.size and opcode != 0
+            if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
+                end = self.resume(at)  # a size that cannot be; and no record has the opcode 0: these are zeros
+            elif opcode == Opcode.CHUNK:
+                self._look_ahead(at, unpackers)
+                yield from self._walk_chunk(start, end - start, wanted)
+            elif opcode == Opcode.MESSAGE or (opcode in _FACTS and end - start <= _LARGEST_FACT):
+                data = memoryview(self.file.read(end - start))
+                yield from self._take(opcode, data, Place(-1, start, end - start), wanted)
+            at, footer = end, opcode == Opcode.FOOTER
+            if whole and not footer:
+                self._sure = (at, len(self.chunks), self.whole)
+            progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+        self.whole = self.whole and footer and at + len(MAGIC) <= self.size
+
+    def _look_ahead(self, at: int, unpackers: ThreadPoolExecutor) -> None:
+        """Have the chunks after the one at `at` unpacked meanwhile, where the file's index says where they are."""
+        n = bisect_right(self.starts, at)
+        for later in self.starts[n : n + _THREADS]:
+            if later + _RECORD.size + _CHUNK.size > self.size:
+                return
+            opcode, start, end = self._record(later)
+            if opcode != Opcode.CHUNK or start in self._coming:
+                continue
+            try:
+                chunk = self._chunk(start, end - start)
+            except (DamagedChunk, struct.error, UnicodeDecodeError):
+                return  # the walk says so when it is there
+            if chunk.size <= _SMALL_CHUNK:
+                self.file.seek(chunk.offset)
+                self._coming[start] = unpackers.submit(unpacked, self.file.read(chunk.length), chunk)
+
+    def _record(self, at: int) -> tuple[int, int, int]:
+        """What kind of record begins at `at`, and where its content begins and ends."""
+        self.file.seek(at)
+        opcode, length = _RECORD.unpack(self.file.read(_RECORD.size))
+        return opcode, at + _RECORD.size, at + _RECORD.size + length
+
+    def _learn_ending(self) -> None:
+        """The schemas, channels and places of chunks that a finished file repeats: where the first ones are damaged,
+        they are all that tells what the messages are. A repetition that is damaged itself teaches nothing.
+        """
+        self.starts = []
+        try:
+            ending = self.size - _FOOTER.size - len(MAGIC)
+            self.file.seek(max(0, ending))
+            opcode, _, at, _, crc = _FOOTER.unpack(self.file.read(_FOOTER.size))
+            if (
+                opcode != Opcode.FOOTER
+                or not 0 < at < ending
+                or (crc and crc != self._crc(at, self.size - 4 - len(MAGIC)))
+            ):
+                return
+            while at < ending:
+                kind, start, end = self._record(at)
+                if kind == Opcode.CHUNK_INDEX:
+                    self.starts.append(struct.unpack("<QQQ", self.file.read(24))[2])
+                elif kind in _FACTS and end - start <= _LARGEST_FACT:
+                    self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
+                at = end
+        except _DAMAGE:
+            pass  # the walk says what it finds
+        self.starts.sort()
+
+    def _crc(self, start: int, end: int) -> int:
+        """CRC-32 of the bytes between; a block at a time."""
+        self.file.seek(start)
+        crc = 0
+        while start < end and (block := self.file.read(min(_BLOCK, end - start))):
+            crc, start = zlib.crc32(block, crc), start + len(block)
+        return crc
+
+    def _walk_chunk(self, start: int, length: int, wanted: Wanted) -> Iterator[Envelope]:
+        number = len(self.chunks)
+        try:
+            self.chunks.append(self._chunk(start, length))
+            if start in self._coming:
+                self._last_chunk = (number, memoryview(self._coming.pop(start).result()))
+            data = self.unpack(number)
+        except (DamagedChunk, struct.error, UnicodeDecodeError):
+            self.whole = False
+            return
+        at = 0
+        while at + _RECORD.size <= len(data):
+            opcode, length = _RECORD.unpack_from(data, at)
+            begin, at = at + _RECORD.size, at + _RECORD.size + length
+            if at > len(data) or opcode == 0:
+                break
+            yield from self._take(opcode, data[begin:at], Place(number, begin, length), wanted)
+        self.whole = self.whole and at == len(data) and not self.chunks[number].cut
+
+    def _chunk(self, start: int, length: int) -> Chunk:
+        """The chunk whose record begins at `start`, as far as the file goes."""
+        cut = start + length > self.size
+        end = min(start + length, self.size)
+        self.file.seek(start)
+        head = self.file.read(min(_CHUNK.size + 64, end - start))
+        *_, size, crc, n_name = _CHUNK.unpack_from(head)
+        packed = _CHUNK.size + n_name
+        packing = head[_CHUNK.size : packed].decode()
+        (n_packed,) = struct.unpack_from("<Q", head, packed)
+        offset = start + packed + 8
+        if not cut and offset + n_packed > end:
+            raise DamagedChunk("its parts do not fit into it")
+        return Chunk(offset, min(n_packed, end - offset), packing, size, crc, cut)
+
+    def _take(self, opcode: int, payload: memoryview, place: Place, wanted: Wanted) -> Iterator[Envelope]:
+        try:
+            if opcode == Opcode.MESSAGE:
+                number, _, log_time_ns, _ = _MESSAGE.unpack_from(payload)
+                channel = self._by_id[number]
+                if wanted(channel):
+                    head = _MESSAGE.size
+                    inner = Place(place.chunk, place.offset + head, place.length - head)
+                    yield Envelope(channel, log_time_ns, inner, payload[head:])
+            elif opcode in _FACTS:
+                self._learn(opcode, ReadDataStream(BytesIO(payload)))
+        except _DAMAGE:
+            self.whole = False
+
+    def _learn(self, opcode: int, stream: ReadDataStream) -> None:
+        """What the file says about its messages."""
+        if opcode == Opcode.SCHEMA:
+            schema = SchemaRecord.read(stream)
+            self._schemas[schema.id] = schema.name
+        elif opcode == Opcode.CHANNEL:
+            record = ChannelRecord.read(stream)
+            known = Channel(record.topic, self._schemas.get(record.schema_id, "no schema"), record.message_encoding)
+            if self._by_id.setdefault(record.id, known) == known and known not in self.channels:
+                self.channels.append(known)
+        elif opcode == Opcode.METADATA:
+            note = MetadataRecord.read(stream)
+            if note.name == NOTES:
+                self.notes.update(note.metadata)

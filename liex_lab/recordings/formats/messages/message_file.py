@@ -1,0 +1,164 @@
+"""Files of messages on named topics: what MCAP files and ROS bags have in common.
+
+A file is walked once from its beginning to its end, which needs no index and so reads cut files too; afterwards every
+message is fetched from its place.
+"""
+
+from __future__ import annotations
+
+import bz2
+import zlib
+from abc import ABC, abstractmethod
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from liex_lab.errors import RecordingError
+from liex_lab.runtime.progress import Progress
+
+# A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many zeros as one likes.
+_LARGEST_CHUNK = 1 << 27
+
+
+class Place(NamedTuple):
+    """Where a message's data lies: in the file, or (chunk >= 0) in the unpacked bytes of a chunk."""
+
+    chunk: int
+    offset: int
+    length: int
+
+
+class Channel(NamedTuple):
+    """What is on a topic. schema: the message's type, as in sensor_msgs/Image; encoding: protobuf, json, ros1, cdr."""
+
+    topic: str
+    schema: str
+    encoding: str
+
+
+class Envelope(NamedTuple):
+    """A message as it is met on the walk."""
+
+    channel: Channel
+    log_time_ns: int
+    place: Place
+    data: memoryview
+
+
+class Chunk(NamedTuple):
+    """Messages packed together. offset, length: of the packed bytes in the file; size: unpacked; crc: 0 for none.
+
+    cut: the file ends before the chunk does.
+    """
+
+    offset: int
+    length: int
+    packing: str
+    size: int
+    crc: int
+    cut: bool
+
+
+class DamagedChunk(Exception):
+    """A chunk that does not unpack to what was packed."""
+
+
+class MessageFile(ABC):
+    """An open file of messages.
+
+    whole: the file ends as it should and nothing in it was found damaged; channels: all that were met; notes: facts
+    that the file states about itself.
+    """
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        self.path, self.file, self.size = path, file, path.stat().st_size
+        self.whole = True
+        self.channels: list[Channel] = []
+        self.notes: dict[str, str] = {}
+        self.chunks: list[Chunk] = []
+        self.starts: list[int] = []  # where the records of chunks begin, as the file's own index says, in order
+        self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
+
+    @abstractmethod
+    def walk(self, wanted: Callable[[Channel], bool], progress: Progress) -> Iterator[Envelope]:
+        """Every whole message of the wanted channels, in file order."""
+
+    def go_on(self) -> int | None:
+        """Make ready for a walk over what was written behind the last whole record since; returns how many chunks the
+        walks before are sure of, None where the file has to be opened anew.
+        """
+        return None
+
+    def resume(self, at: int) -> int:
+        """Where to go on behind a record at `at` that is damaged: at the next chunk that is known, or the end."""
+        self.whole = False
+        n = bisect_right(self.starts, at)
+        return self.starts[n] if n < len(self.starts) else self.size
+
+    def read(self, place: Place) -> memoryview:
+        """The data of one message."""
+        if place.chunk >= 0:
+            try:
+                return self.unpack(place.chunk)[place.offset : place.offset + place.length]
+            except DamagedChunk as error:
+                raise RecordingError(f"{self.path} changed while it was read ({error}); copy it again") from None
+        self.file.seek(place.offset)
+        return memoryview(self.file.read(place.length))
+
+    def unpack(self, number: int) -> memoryview:
+        """The unpacked bytes of a chunk; the last one is kept, for neighbouring frames share it."""
+        if self._last_chunk[0] != number:
+            chunk = self.chunks[number]
+            if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
+                raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
+            self.file.seek(chunk.offset)
+            self._last_chunk = (-1, memoryview(b""))  # never two at once
+            self._last_chunk = (number, memoryview(unpacked(self.file.read(chunk.length), chunk)))
+        return self._last_chunk[1]
+
+    def close(self) -> None:
+        """Close the file and let go of the last chunk."""
+        self.file.close()
+        self._last_chunk = (-1, memoryview(b""))
+
+
+def unpacked(packed: bytes, chunk: Chunk) -> bytes:
+    """A chunk's bytes. Of one that is cut, as many as there are: what lies before the cut is as it was written."""
+    try:
+        data = _inflate(packed, chunk.packing, chunk.size)
+    except DamagedChunk:
+        raise
+    except Exception as error:  # the codecs are foreign and have exceptions of their own
+        raise DamagedChunk(str(error)) from None
+    if chunk.cut:
+        return data
+    if len(data) != chunk.size:
+        raise DamagedChunk(f"{len(data)} bytes came out of it and {chunk.size} went in")
+    if chunk.crc and zlib.crc32(data) != chunk.crc:
+        raise DamagedChunk("its checksum is wrong")
+    return data
+
+
+def _inflate(packed: bytes, packing: str, size: int) -> bytes:
+    """At most `size` bytes. Piece by piece, so that a chunk that is cut gives what it still holds."""
+    if packing in ("", "none"):
+        return packed[:size]
+    if packing == "zstd":
+        import zstandard
+
+        with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
+            return reader.read(size)
+    if packing == "lz4":
+        import lz4.frame
+
+        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
+        return unpacked
+    if packing == "bz2":
+        return bz2.BZ2Decompressor().decompress(packed, max_length=size)
+    raise DamagedChunk(f"its packing {packing[:20]!r} is not known")
+
+
+def printable(text: str, length: int = 80) -> str:
+    """A name out of a file, fit for a sentence: a damaged one may hold anything."""
+    return "".join(c if c.isprintable() else "?" for c in text[:length]) + ("..." if len(text) > length else "")

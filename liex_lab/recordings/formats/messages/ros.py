@@ -1,0 +1,146 @@
+"""The few `sensor_msgs` that hold depth, as ROS 1 and ROS 2 (CDR) lay them out, read without copying the pixels.
+
+Their definitions have been the same for as long as there are recordings, so they are written down here; both systems
+order the fields alike and differ in alignment, in the header and in the zero at a string's end.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from liex_lab.recordings.formats.messages.messages import (
+    Calibration,
+    DamagedMessage,
+    DepthUnit,
+    Message,
+    PackedPicture,
+    Parser,
+    PointCloud,
+    RawPicture,
+)
+
+# sensor_msgs/PointField: number of a type, and NumPy's name of it without the byte order
+_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_MOST_FIELDS = 256
+
+
+class _Fields:
+    """Reads one field after the other: ROS 1, little endian, nothing aligned."""
+
+    order, origin, aligned, end_of_text = "<", 0, False, 0
+
+    def __init__(self, data: memoryview) -> None:
+        self.data, self.at = data, self.origin
+
+    def numbers(self, kind: str, n: int = 1) -> tuple[float, ...]:
+        """`n` numbers of a type, as `struct` names it."""
+        size = struct.calcsize(f"<{kind}")
+        if self.aligned:
+            self.at += (self.origin - self.at) % size
+        begin, self.at = self.at, self.at + n * size
+        if self.at > len(self.data):
+            raise DamagedMessage("a message ends too early")
+        return struct.unpack_from(f"{self.order}{n}{kind}", self.data, begin)
+
+    def whole(self, kind: str = "I") -> int:
+        """One integer."""
+        return int(self.numbers(kind)[0])
+
+    def floats(self) -> tuple[float, ...]:
+        """Float64s with their number before them."""
+        n = self.whole()
+        if n > len(self.data) // 8:
+            raise DamagedMessage("a message states more numbers than it has bytes")
+        return self.numbers("d", n) if n else ()
+
+    def blob(self) -> memoryview:
+        """Bytes with their number before them."""
+        n = self.whole()
+        begin, self.at = self.at, self.at + n
+        if self.at > len(self.data):
+            raise DamagedMessage("a message ends too early")
+        return self.data[begin : self.at]
+
+    def text(self) -> str:
+        """A string."""
+        raw = self.blob()
+        return bytes(raw[: len(raw) - self.end_of_text]).decode("utf-8", "replace")
+
+    def header(self) -> tuple[int, str]:
+        """The stamp, ns, and the frame's name of a std_msgs/Header."""
+        self.whole()  # a number that counts up
+        return self.whole() * 10**9 + self.whole(), self.text()
+
+
+class _CdrFields(_Fields):
+    """The same in ROS 2: four bytes that tell the byte order, numbers aligned, strings with a zero, no counter."""
+
+    origin, aligned, end_of_text = 4, True, 1
+
+    def __init__(self, data: memoryview) -> None:
+        super().__init__(data)
+        if len(data) < 4 or data[0] != 0 or data[1] > 1:
+            raise DamagedMessage("a message is not in plain CDR")
+        self.order = "<" if data[1] else ">"
+
+    def header(self) -> tuple[int, str]:
+        return self.whole("i") * 10**9 + self.whole(), self.text()  # seconds have a sign here
+
+
+def _image(fields: _Fields) -> RawPicture:
+    stamp_ns, frame_id = fields.header()
+    height, width = fields.whole(), fields.whole()
+    encoding, big_endian, step = fields.text(), fields.whole("B"), fields.whole()
+    return RawPicture(stamp_ns, frame_id, width, height, encoding, step, bool(big_endian), fields.blob())
+
+
+def _packed_image(fields: _Fields) -> PackedPicture:
+    stamp_ns, frame_id = fields.header()
+    return PackedPicture(stamp_ns, frame_id, fields.text(), fields.blob())
+
+
+def _camera_info(fields: _Fields) -> Calibration:
+    _, frame_id = fields.header()
+    height, width = fields.whole(), fields.whole()
+    model, d = fields.text(), fields.floats()
+    k, _, p = fields.numbers("d", 9), fields.numbers("d", 9), fields.numbers("d", 12)
+    return Calibration(frame_id, width, height, model, d, k, p)
+
+
+def _cloud(fields: _Fields) -> PointCloud:
+    stamp_ns, frame_id = fields.header()
+    height, width, n_fields = fields.whole(), fields.whole(), fields.whole()
+    if n_fields > _MOST_FIELDS:
+        raise DamagedMessage(f"a cloud's points have {n_fields} fields")
+    found = []
+    for _ in range(n_fields):
+        found.append((fields.text(), fields.whole(), fields.whole("B")))
+        fields.whole()  # how many numbers the field has: one
+    order = ">" if fields.whole("B") else "<"
+    columns = {name: (at, order + _FIELD_TYPES[kind]) for name, at, kind in found if kind in _FIELD_TYPES}
+    point_step, row_step, data = fields.whole(), fields.whole(), fields.blob()
+    return PointCloud(stamp_ns, frame_id, width, height, columns, point_step, row_step, data)
+
+
+def _unit(fields: _Fields) -> DepthUnit:
+    return DepthUnit(fields.numbers("f")[0])
+
+
+_PARSERS: dict[str, Callable[[_Fields], Message]] = {
+    "sensor_msgs/Image": _image,
+    "sensor_msgs/CompressedImage": _packed_image,
+    "sensor_msgs/CameraInfo": _camera_info,
+    "sensor_msgs/PointCloud2": _cloud,
+    "std_msgs/Float32": _unit,
+}
+_LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
+
+
+def parser(schema: str, encoding: str) -> Parser | None:
+    """What reads this kind of message; None where there is nothing for it."""
+    layout = _LAYOUTS.get(encoding)
+    if layout is None or schema not in _PARSERS:
+        return None
+    read = _PARSERS[schema]
+    return lambda data: read(layout(data))

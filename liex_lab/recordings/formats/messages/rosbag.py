@@ -1,0 +1,217 @@
+"""ROS bags: `.bag` files of ROS 1 (and of the RealSense programs) and `.db3` files of ROS 2, whole or cut.
+
+A `.bag` is walked from its beginning and needs no index, which is written last and so is missing exactly where a
+recording broke off; `rosbags`, the library that the tests compare with, refuses such files.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.formats.messages.depth_topics import open_topic
+from liex_lab.recordings.formats.messages.message_file import Channel, Chunk, DamagedChunk, Envelope, MessageFile, Place
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.progress import Progress, silent
+
+Wanted = Callable[[Channel], bool]
+
+_MAGIC = b"#ROSBAG V"
+_VERSION = b"#ROSBAG V2.0\n"
+_SQLITE = b"SQLite format 3\0"
+_U32 = struct.Struct("<I")
+_TIME = struct.Struct("<II")
+_MESSAGE, _HEADER, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
+_LARGEST_HEADER = 1 << 24  # bytes; a connection's holds the definition of its messages
+_DAMAGE = (KeyError, ValueError, OverflowError, struct.error)
+
+
+def open_bag(
+    path: Path,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    progress: Progress = silent,
+    topic: str | None = None,
+) -> Recording:
+    """One depth topic of a ROS bag as a recording. `fps` is not needed: every message has its time."""
+    file = path.open("rb")
+    magic = file.read(len(_SQLITE))
+    if magic.startswith(_VERSION):
+        return open_topic(BagFile(path, file), "rosbag", camera, topic, progress)
+    if magic == _SQLITE:
+        return open_topic(Db3File(path, file), "rosbag2", camera, topic, progress)
+    file.close()
+    if magic.startswith(_MAGIC):
+        raise RecordingError(f"{path} is a bag of an old ROS; bring it to version 2.0 with `rosbag fix` and give that")
+    raise RecordingError(f"{path} is named like a ROS bag but holds something else; give another file")
+
+
+class BagFile(MessageFile):
+    """An open ROS 1 bag, version 2.0: records, each with a header of named fields and data."""
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        super().__init__(path, file)
+        self._by_id: dict[int, Channel] = {}
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
+        """Every whole message of the wanted channels, in file order."""
+        at, indexed = len(_VERSION), False
+        while at + _U32.size <= self.size:
+            try:
+                header, begin, end = self._record(at)
+                opcode = header["op"][0]
+                if opcode == _CHUNK and (end <= self.size or not self.starts):
+                    yield from self._walk_chunk(header, begin, end, wanted)
+                elif end > self.size:
+                    raise ValueError("a record reaches past the end of the file")
+                elif opcode == _HEADER:
+                    indexed = self._learn_ending(header)
+                elif opcode in (_CONNECTION, _MESSAGE):
+                    self.file.seek(begin)
+                    data = memoryview(self.file.read(end - begin))
+                    yield from self._take(opcode, header, data, Place(-1, begin, end - begin), wanted)
+                at = end
+            except DamagedChunk:
+                self.whole, at = False, end
+            except (*_DAMAGE, IndexError):
+                at = self.resume(at)
+            progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+        # A recording that broke off has no index yet, and every other one ends with it.
+        self.whole = self.whole and at == self.size and indexed
+
+    def _record(self, at: int) -> tuple[dict[str, bytes], int, int]:
+        """The header of the record that begins at `at`, and where its data begin and end."""
+        self.file.seek(at)
+        (n_header,) = _U32.unpack(self.file.read(_U32.size))
+        begin = at + 2 * _U32.size + n_header
+        if n_header > _LARGEST_HEADER or begin > self.size:
+            raise ValueError("a header is too long")
+        block = self.file.read(n_header + _U32.size)
+        (n_data,) = _U32.unpack_from(block, n_header)
+        return _fields(memoryview(block)[:n_header]), begin, begin + n_data
+
+    def _learn_ending(self, header: dict[str, bytes]) -> bool:
+        """The connections and places of chunks that the index at the end repeats; False where there is no index."""
+        if header.get("encryptor"):
+            raise RecordingError(f"{self.path} is an encrypted bag, which cannot be read; give it without encryption")
+        (at,) = struct.unpack("<Q", header["index_pos"])
+        indexed = at > 0
+        try:
+            while 0 < at < self.size:
+                facts, begin, end = self._record(at)
+                if facts["op"][0] == _CHUNK_INFO:
+                    self.starts += struct.unpack("<Q", facts["chunk_pos"])
+                elif facts["op"][0] == _CONNECTION and end <= self.size:  # else it would be read into nothing
+                    self.file.seek(begin)
+                    self._connect(facts, memoryview(self.file.read(end - begin)))
+                else:
+                    break
+                at = end
+        except (*_DAMAGE, IndexError):
+            pass  # the walk says what it finds
+        self.starts.sort()
+        return indexed
+
+    def _walk_chunk(self, header: dict[str, bytes], begin: int, end: int, wanted: Wanted) -> Iterator[Envelope]:
+        cut = end > self.size
+        (size,) = _U32.unpack(header["size"])
+        packing = header["compression"].decode()
+        number = len(self.chunks)
+        self.chunks.append(Chunk(begin, min(end, self.size) - begin, packing, size, 0, cut))
+        data = self.unpack(number)
+        at = 0
+        while at + _U32.size <= len(data):
+            (n_header,) = _U32.unpack_from(data, at)
+            start = at + 2 * _U32.size + n_header
+            if start > len(data):
+                break
+            inner = _fields(data[at + _U32.size : start - _U32.size])
+            (length,) = _U32.unpack_from(data, start - _U32.size)
+            at = start + length
+            if at > len(data):
+                break
+            yield from self._take(inner["op"][0], inner, data[start:at], Place(number, start, length), wanted)
+        self.whole = self.whole and at == len(data) and not cut
+
+    def _take(
+        self, opcode: int, header: dict[str, bytes], data: memoryview, place: Place, wanted: Wanted
+    ) -> Iterator[Envelope]:
+        """A connection, which is noted, or a message, which is handed out."""
+        if opcode == _CONNECTION:
+            self._connect(header, data)
+        elif opcode == _MESSAGE:
+            (number,) = _U32.unpack(header["conn"])
+            seconds, nanoseconds = _TIME.unpack(header["time"])
+            channel = self._by_id[number]
+            if wanted(channel):
+                yield Envelope(channel, seconds * 10**9 + nanoseconds, place, data)
+
+    def _connect(self, header: dict[str, bytes], data: memoryview) -> None:
+        """Note what is on a topic."""
+        (number,) = _U32.unpack(header["conn"])
+        topic = "/" + "/".join(part for part in header["topic"].decode().split("/") if part)
+        channel = Channel(topic, _fields(data)["type"].decode(), "ros1")
+        if self._by_id.setdefault(number, channel) == channel and channel not in self.channels:
+            self.channels.append(channel)
+
+
+def _fields(header: memoryview) -> dict[str, bytes]:
+    """The named fields of a header: each with its length before it, and an = between name and value."""
+    fields: dict[str, bytes] = {}
+    at = 0
+    while at < len(header):
+        (length,) = _U32.unpack_from(header, at)
+        at += _U32.size + length
+        if at > len(header):
+            raise ValueError("a header ends too early")
+        name, _, value = bytes(header[at - length : at]).partition(b"=")
+        fields[name.decode()] = value
+    return fields
+
+
+class Db3File(MessageFile):
+    """An open ROS 2 bag in SQLite: a table of topics and a table of messages."""
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        super().__init__(path, file)
+        # opened by several threads, of which one reads at a time; immutable: no lock file is made beside it
+        uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+        self._base = sqlite3.connect(uri, uri=True, check_same_thread=False)
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
+        """Every message of the wanted channels, in the order in which they were stored."""
+        try:
+            rows = self._base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            by_id = {int(row[0]): Channel(*map(str, row[1:])) for row in rows}
+            self.channels = list(by_id.values())
+            (last,) = self._base.execute("SELECT max(id) FROM messages").fetchone()
+            messages = self._base.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id")
+            for number, topic, log_time_ns in messages:
+                channel = by_id[topic]
+                if wanted(channel):
+                    place = Place(-1, number, 0)
+                    yield Envelope(channel, int(log_time_ns), place, self._fetch(number))
+                progress(number, last, "looking through the recording (messages)")
+        except (sqlite3.Error, KeyError, ValueError, TypeError, OverflowError):
+            self.whole = False
+
+    def _fetch(self, number: int) -> memoryview:
+        row = self._base.execute("SELECT data FROM messages WHERE id = ?", (number,)).fetchone()
+        return memoryview(row[0])
+
+    def read(self, place: Place) -> memoryview:
+        """The data of one message."""
+        try:
+            return self._fetch(place.offset)
+        except (sqlite3.Error, TypeError):
+            return memoryview(b"")  # no message is empty: a damaged one
+
+    def close(self) -> None:
+        """Close the file."""
+        self._base.close()
+        super().close()

@@ -1,0 +1,1 @@
+"""MoSeq sessions: raw, video or archive, with their metadata; Azure Kinect's own files."""

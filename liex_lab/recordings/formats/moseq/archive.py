@@ -1,0 +1,174 @@
+"""A session out of a .tar.gz: streamed once, and every byte that a cut archive still holds is kept."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tarfile
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from liex_lab.errors import RecordingError
+from liex_lab.runtime.progress import Progress
+
+_BLOCK = 1 << 16
+_PACKED = 1 << 16  # bytes read at once
+_UNPACKED = 1 << 20  # and unpacked at once: an empty picture is a thousand times its packed size
+_PIECE = 256  # packed bytes tried at once where there is damage
+_ENOUGH_ZEROS = 1 << 22  # far more than the end of any tar; a walk that asks for more skips over what is missing
+_GZIP_MAGIC = b"\x1f\x8b"
+
+
+@dataclass(frozen=True)
+class Unpacked:
+    """What came out of an archive. files: by plain names; seen: all names; cut: the archive is cut or damaged."""
+
+    files: dict[str, Path]
+    seen: frozenset[str]
+    cut: bool
+
+
+class _Patient:
+    """The unpacked bytes of a tar, followed by zeros without end once the archive breaks off.
+
+    tarfile throws away the block in which an archive ends too early. Here it never ends, and `n_true` says how many of
+    the bytes were real; a tar ends in zeros by itself, so the walk over its members ends too.
+    """
+
+    def __init__(self, file: IO[bytes], size: int, progress: Progress) -> None:
+        self._file, self._size, self._progress = file, size, progress
+        self._zipped = file.read(2) == _GZIP_MAGIC
+        file.seek(0)
+        self._inflate = zlib.decompressobj(31)
+        self._buffer, self._pending = bytearray(), b""
+        self.n_true, self._n_zeros = 0, 0
+        self.ended = False  # nothing more will come
+        self.whole = not self._zipped  # it ended where it should
+
+    def read(self, n: int) -> bytes:
+        """Exactly n bytes."""
+        while len(self._buffer) < n and not self.ended:
+            self._fill()
+        block = bytes(self._buffer[:n])
+        del self._buffer[:n]
+        self.n_true += len(block)
+        self._n_zeros += n - len(block)
+        if self._n_zeros > _ENOUGH_ZEROS:
+            raise tarfile.ReadError("the archive ended long ago")
+        return block + bytes(n - len(block))
+
+    def finish(self) -> None:
+        """Read to the end: a tar is over before the gzip around it is, and only gzip's end tells that it is whole."""
+        while not self.ended:
+            self._buffer.clear()
+            self._fill()
+
+    def _fill(self) -> None:
+        """Some more bytes into the buffer, or the end."""
+        if not self._pending:
+            self._pending = self._file.read(_PACKED)
+            self._progress(self._file.tell() >> 20, (self._size >> 20) + 1, "unpacking the recording (MB)")
+        if not self._pending:
+            self.ended = True
+            self._buffer += b"" if self.whole else self._inflate.flush()
+        elif self._zipped:
+            self._unzip()
+        else:
+            self._buffer += self._pending
+            self._pending = b""
+
+    def _unzip(self) -> None:
+        if self._inflate.eof:  # a gzip file may be several, one after the other; anything else behind it is padding
+            if len(self._pending) < len(_GZIP_MAGIC):
+                self._pending += self._file.read(_PACKED)
+            if not self._pending.startswith(_GZIP_MAGIC):
+                self.ended = True
+                return
+            self._inflate = zlib.decompressobj(31)
+        spare = self._inflate.copy()
+        try:
+            self._buffer += self._inflate.decompress(self._pending, _UNPACKED)
+            self._pending = self._inflate.unused_data if self._inflate.eof else self._inflate.unconsumed_tail
+            self.whole = self._inflate.eof
+        except zlib.error:
+            self._salvage(spare)
+            self.ended, self.whole = True, False
+
+    def _salvage(self, inflate: zlib._Decompress) -> None:
+        """What comes out before the damage: zlib keeps back all of a piece in which it finds some."""
+        for size in (_PIECE, 1):
+            with suppress(zlib.error):
+                while self._pending:
+                    before = inflate.copy() if size > 1 else inflate
+                    self._buffer += inflate.decompress(self._pending[:size])
+                    self._pending = self._pending[size:]
+            inflate = before
+
+
+def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progress) -> Unpacked:
+    """Write the wanted members of a .tar or .tar.gz into `folder`, by their plain names."""
+    files: dict[str, Path] = {}
+    seen: set[str] = set()
+    cut = False
+    with archive.open("rb") as file:
+        stream = _Patient(file, archive.stat().st_size, progress)
+        try:
+            with tarfile.open(fileobj=stream, mode="r|", bufsize=_BLOCK) as tar:  # type: ignore[call-overload]
+                for member in tar:
+                    name = PurePosixPath(member.name).name
+                    if cut or not member.isfile() or name.startswith("._"):
+                        continue
+                    if name in wanted and name in seen:
+                        raise RecordingError(
+                            f"{archive} holds more than one {name}; unpack it and give the folder of one session"
+                        )
+                    seen.add(name)
+                    if name in wanted:
+                        files[name] = folder / name
+                        cut = _copy(tar, member, files[name], stream)
+        except tarfile.TarError:
+            if not seen:
+                raise RecordingError(
+                    f"{archive} should be a MoSeq session packed as .tar.gz, but nothing can be unpacked from it; "
+                    "pack the session's folder again"
+                ) from None
+            cut = True
+        stream.finish()
+    return Unpacked(files, frozenset(seen), cut or not stream.whole)
+
+
+def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
+    """Write one member as far as its bytes are real; True where some are missing."""
+    source = tar.extractfile(member)
+    assert source is not None
+    written = 0
+    try:
+        with to.open("wb") as out:
+            while written < member.size:
+                block = source.read(min(_BLOCK, member.size - written))
+                # tarfile reads ahead by whole blocks, never behind: what lies beyond n_true is padding
+                real = min(len(block), max(0, stream.n_true - member.offset_data - written))
+                out.write(block[:real])
+                written += real
+                if real < len(block):
+                    return True
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise RecordingError(
+                f"there is no room to unpack {member.size / 1e9:.1f} GB into {to.parent}; free some, or set TMPDIR to "
+                "a folder on a larger disk"
+            ) from None
+        raise
+    return False
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder of unpacked files; files that are gone already are none of our concern."""
+    for name in os.listdir(folder) if folder.is_dir() else []:
+        (folder / name).unlink(missing_ok=True)
+    if folder.is_dir():
+        folder.rmdir()

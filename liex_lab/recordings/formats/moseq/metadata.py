@@ -1,0 +1,116 @@
+"""What lies beside the depth in a MoSeq session: metadata.json and the time stamps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings.timestamp_files import CSV_COLUMNS, read_column_times, read_csv_times
+from liex_lab.recordings.timestamps import Times, median_step, start_of_day
+
+STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
+METADATA = "metadata.json"
+AZURE, KINECT, OTHER = "Azure Kinect", "Kinect v2", "other"  # cameras, as far as they are told apart
+
+_CAMERA_KEYS = ("camera", "cameratype", "cameramodel", "device", "devicename", "devicemodel", "sensor")
+_CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is found counts
+    "azure": AZURE, "k4a": AZURE, "femto": AZURE, "kinectv2": KINECT, "kinect2": KINECT, "kinectone": KINECT,
+    "kinectforwindowsv2": KINECT,
+}  # fmt: skip
+_PLAUSIBLE_HZ = (0.5, 2000.0)
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What metadata.json says.
+
+    size: (width, height), None when unstated; dtype: of the stored depths; camera: `AZURE`, `KINECT`, `OTHER` or
+    None when it does not say, and camera_name: its words; facts: for `Recording.metadata`; problems: sentences.
+    """
+
+    size: tuple[int, int] | None
+    dtype: str
+    camera: str | None
+    camera_name: str
+    facts: dict[str, Any]
+    problems: list[str]
+
+
+_NOTHING = Metadata(None, "<u2", None, "", {}, [])
+
+
+def read_metadata(path: Path | None, cut: bool) -> Metadata:
+    """What metadata.json tells; it is often missing, and then there is nothing to say. cut: its archive is."""
+    if path is None:
+        return _NOTHING
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        if not isinstance(document, dict):
+            raise ValueError("it is not an object in braces")
+    except (ValueError, RecursionError) as error:  # broken JSON and broken UTF-8 are both ValueErrors
+        if cut:
+            return Metadata(None, "<u2", None, "", {}, [f"{METADATA} is cut short and was not used"])
+        raise RecordingError(f"{METADATA} of the session is not JSON ({error}); correct or remove it") from None
+    facts, problems = {}, []
+    for key, ours in (("SubjectName", "subject_id"), ("SessionName", "session_name")):
+        if isinstance(document.get(key), str) and document[key].strip():
+            facts[ours] = document[key].strip()
+    if (stated := document.get("StartTime")) is not None:
+        if (start := start_of_day(stated if isinstance(stated, str) else None)) is not None:
+            facts["session_start_time"] = start
+        else:
+            problems.append(f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used")
+    little = document.get("IsLittleEndian", True) is not False
+    size = _stated_size(document.get("DepthResolution"))
+    return Metadata(size, "<u2" if little else ">u2", *_stated_camera(document), facts, problems)
+
+
+def _stated_size(value: Any) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    if isinstance(value, list) and len(value) == 2 and all(type(v) is int and 0 < v < 20_000 for v in value):
+        return value[0], value[1]
+    raise RecordingError(f"{METADATA} states DepthResolution = {value!r}; it is [width, height] in pixels")
+
+
+def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
+    """Which camera the metadata name, and in which words: programs that record for MoSeq have no common key for it."""
+    told = {key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()}
+    name = next((told[key] for key in _CAMERA_KEYS if isinstance(told.get(key), str) and told[key].strip()), None)
+    if name is None:
+        return None, ""
+    plain = "".join(letter for letter in name.lower() if letter.isalnum())
+    return next((camera for word, camera in _CAMERA_WORDS.items() if word in plain), OTHER), name.strip()
+
+
+def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple[str, Times] | None:
+    """The file of time stamps and what it holds; None where there is none.
+
+    depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a column in another unit.
+    """
+    name = next((name for name in STAMPS if name in files), None)
+    if name is None:
+        return None
+    path = files[name]
+    if cut and not path.read_bytes().endswith(b"\n"):
+        # the archive broke off inside this file: half a number is a wrong number
+        text = path.read_bytes()
+        path.write_bytes(text[: text.rfind(b"\n") + 1])
+    with path.open("rb") as file:
+        first = file.readline(4096).decode("utf-8", "replace")
+    named = any(column in first for column in CSV_COLUMNS)
+    times = read_csv_times(path) if named else read_column_times(path, STAMPS[name])
+    if not len(times):
+        problems.append(f"{name} holds no time stamp")
+        return None
+    step = median_step(times)
+    if not named and step > 0 and not _PLAUSIBLE_HZ[0] <= 1e9 / step <= _PLAUSIBLE_HZ[1]:
+        problems.append(
+            f"the stamps in {name} were taken as {'milli' if name == 'depth_ts.txt' else ''}seconds, as MoSeq writes "
+            f"them, which makes {1e9 / step:.3g} frames/s; if they have another unit, say so in a first line such as "
+            "time_ns or time_s"
+        )
+    return name, times

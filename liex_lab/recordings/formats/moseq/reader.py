@@ -1,0 +1,296 @@
+"""MoSeq sessions: depth.dat, depth.avi or depth.mkv with stamps and metadata, in a folder or in a .tar.gz."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import KINECT_V2, Camera, Lens
+from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
+from liex_lab.recordings.formats.images.folder import Pictures
+from liex_lab.recordings.formats.images.stack import Stack
+from liex_lab.recordings.formats.moseq.archive import Unpacked, remove_tree, unpack
+from liex_lab.recordings.formats.moseq.azure_kinect import azure_camera, mode_of, read_calibration
+from liex_lab.recordings.formats.moseq.metadata import (
+    AZURE,
+    KINECT,
+    METADATA,
+    STAMPS,
+    Metadata,
+    read_metadata,
+    read_stamps,
+)
+from liex_lab.recordings.formats.video.index import DepthTrack
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamps import Times, from_rate, match_counts, median_step, settle
+from liex_lab.runtime.progress import Progress, silent
+
+DEPTH = "depth.dat"
+VIDEOS = ("depth.avi", "depth.mkv")
+DEPTHS = (DEPTH, *VIDEOS)
+_NOMINAL_HZ = 30.0  # what every camera that MoSeq records from delivers when nothing is lost
+_KINECT_V2_SIZE = (512, 424)
+_OTHER_SIZES = ((640, 480), (640, 576), (320, 288), (512, 512), (1024, 1024), (848, 480), (1280, 720))
+
+
+@dataclass
+class RawFrames:
+    """Frames one after the other in a file without a header, read with `seek`; a `Stack`.
+
+    Not a memory map: mapped pages count as the process's memory, and a long session would look like a leak.
+    """
+
+    path: Path
+    width: int
+    height: int
+    dtype: str
+    n: int
+    truncated: bool
+    problems: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._file, self._lock = self.path.open("rb"), Lock()
+
+    def __len__(self) -> int:
+        return self.n
+
+    @property
+    def whole(self) -> list[bool]:
+        """Only whole frames are counted."""
+        return [True] * self.n
+
+    def read(self, index: int) -> NDArray[Any]:
+        """Stored values (H, W) of one frame."""
+        n_bytes = 2 * self.width * self.height
+        with self._lock:
+            self._file.seek(index * n_bytes)
+            raw = self._file.read(n_bytes)
+        if len(raw) < n_bytes:
+            raise RecordingError(f"{self.path} became shorter while it was read; frame {index} is no longer there")
+        return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
+
+    def label(self, index: int) -> str:
+        """The frame, for a sentence."""
+        return f"frame {index} of {self.path.name}"
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def open_moseq(
+    path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
+) -> Recording:
+    """A MoSeq session: its folder, its depth.dat, a depth video, or the archive around all of it."""
+    names = (*STAMPS, METADATA, CAMERA_FILE)
+    if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
+        folder = path if path.is_dir() else path.parent
+        depth = next((folder / name for name in DEPTHS if (folder / name).is_file()), path) if path.is_dir() else path
+        files = {depth.name: depth} | {name: folder / name for name in names if (folder / name).is_file()}
+        found = Unpacked(files, frozenset(), False)
+        name = folder.resolve().name if depth.name in DEPTHS else depth.stem
+        return _Session(path, depth, found, camera, fps, progress).open(name, list(files.values()))
+    # gzip has no random access, so the session is streamed once into a folder that lives as long as the recording
+    folder = Path(tempfile.mkdtemp(prefix="liex-"))
+    try:
+        found = unpack(path, (*DEPTHS, *names), folder, progress)
+        inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
+        if inside is None:
+            raise _no_depth(path, found)
+        return _Session(path, inside, found, camera, fps, progress).open(_archive_name(path), [path], folder)
+    except BaseException:
+        remove_tree(folder)
+        raise
+
+
+def _no_depth(path: Path, found: Unpacked) -> RecordingError:
+    if found.cut:
+        return RecordingError(f"{path} is cut short before its {DEPTH}, so no frame can be read; copy it again")
+    return RecordingError(f"{path} should hold a MoSeq session, but there is no {DEPTH} in it; give another archive")
+
+
+def _archive_name(path: Path) -> str:
+    name = path.name
+    for suffix in (".tar.gz", ".tgz", ".tar"):
+        if name.lower().endswith(suffix):
+            return name[: -len(suffix)]
+    return path.stem
+
+
+class _Session:
+    """A session while it is opened: its depth file, what lies beside it, and what was odd so far."""
+
+    def __init__(
+        self, path: Path, depth: Path, found: Unpacked, camera: Lens | None, fps: float | None, progress: Progress
+    ) -> None:
+        self.path, self.depth, self.cut, self.progress = path, depth, found.cut, progress
+        self.stated_camera, self.fps = camera, fps
+        self.camera_file = CameraFile.read(found.files.get(CAMERA_FILE, path.parent / CAMERA_FILE))
+        self.metadata: Metadata = read_metadata(found.files.get(METADATA), found.cut)
+        self.problems = [*self.camera_file.problems, *self.metadata.problems]
+        self.stamps = read_stamps(found.files, found.cut, self.problems)
+
+    def open(self, name: str, sources: list[Path], folder: Path | None = None) -> Recording:
+        """The recording. folder: of unpacked files, removed on closing."""
+        stack, track = self._open_depth()
+
+        def close() -> None:
+            stack.close()
+            if folder is not None:
+                remove_tree(folder)
+
+        try:
+            return self._recording(name, sources, stack, track, close)
+        except BaseException:
+            stack.close()
+            raise
+
+    def _open_depth(self) -> tuple[Stack, DepthTrack | None]:
+        if self.depth.suffix.lower() == ".dat":
+            return self._open_raw(), None
+        from liex_lab.recordings.formats.video.video import open_video
+
+        video = open_video(self.depth, self.progress)
+        if self.metadata.size not in (None, (video.width, video.height)):
+            self.problems.append(
+                f"{METADATA} states pictures of {self.metadata.size}, but those in {self.depth.name} have "
+                f"{video.width} x {video.height} pixels, which was used"
+            )
+        if video.truncated or self.cut:
+            self.problems.append(f"{self.depth.name} is cut or damaged; its {len(video)} whole frames can be read")
+        return video, video.track
+
+    def _open_raw(self) -> RawFrames:
+        n_bytes = self.depth.stat().st_size
+        width, height = self.metadata.size or self._size_of_camera() or self._guess_size(n_bytes)
+        n, left_over = divmod(n_bytes, 2 * width * height)
+        if not n:
+            raise RecordingError(
+                f"{DEPTH} of {self.path} holds {n_bytes} bytes, less than one frame of {width} x {height} pixels "
+                f"({2 * width * height} bytes); copy the recording again, or state DepthResolution in {METADATA}"
+            )
+        if left_over or self.cut:
+            where = (
+                f"ends in the middle of frame {n}"
+                if left_over
+                else f"holds {n} frames, but its archive is cut or damaged"
+            )
+            self.problems.append(f"{DEPTH} {where}; its {n} whole frames can be read")
+        return RawFrames(self.depth, width, height, self.metadata.dtype, n, bool(left_over) or self.cut)
+
+    def _size_of_camera(self) -> tuple[int, int] | None:
+        if isinstance(self.stated_camera, Camera):
+            return self.stated_camera.width, self.stated_camera.height
+        width, height = self.camera_file.width, self.camera_file.height
+        return (width, height) if width and height else None
+
+    def _guess_size(self, n_bytes: int) -> tuple[int, int]:
+        """That of a Kinect v2, unless the stamps say that another camera's size fits and this one does not."""
+        n = 0 if self.stamps is None else len(self.stamps[1])
+        kinect_bytes = 2 * _KINECT_V2_SIZE[0] * _KINECT_V2_SIZE[1]
+        other = next(((w, h) for w, h in _OTHER_SIZES if n and n_bytes == 2 * w * h * n), None)
+        if other is not None and n_bytes % kinect_bytes:
+            raise RecordingError(
+                f"{DEPTH} of {self.path} does not fit frames of 512 x 424 pixels, but it fits {n} of {other[0]} x "
+                f'{other[1]}; write {{"DepthResolution": [{other[0]}, {other[1]}]}} into {METADATA} if that is your '
+                "camera"
+            )
+        return _KINECT_V2_SIZE
+
+    def _recording(
+        self, name: str, sources: list[Path], stack: Stack, track: DepthTrack | None, close: Callable[[], None]
+    ) -> Recording:
+        camera = self._camera(stack, track)
+        times = self._times(len(stack), track)
+        settled = settle(times)
+        self.problems += [settled.problem] if settled.problem else []
+        start = {"session_start_time": track.session_start} if track is not None and track.session_start else {}
+        return Recording(
+            name=name, format="moseq", camera=camera, times_ns=settled.times_ns,
+            read=Pictures(stack, self.camera_file.decode, self.problems).read, sources=sources, problems=self.problems,
+            truncated=stack.truncated or self.cut, close=close, faults=settled.faults,
+            metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
+        )  # fmt: skip
+
+    def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
+        """Stated, or else from the factory's calibration in the file, or else typical of the camera that recorded."""
+        width, height = stack.width, stack.height
+        if self.stated_camera is not None or self.camera_file.intrinsics:
+            return self.camera_file.camera(width, height, self.stated_camera)
+        mode = mode_of(width, height)
+        lenses = [read_calibration(data) for data in track.attachments.values()] if track is not None else []
+        lens = next((lens for lens in lenses if lens is not None), None)
+        if mode is not None and lens is not None:
+            return azure_camera(mode, lens)
+        kind = self._which_camera(track)
+        if kind == KINECT and (width, height) == _KINECT_V2_SIZE:
+            self._say_typical("Kinect v2")
+            return KINECT_V2
+        if kind == AZURE and mode is not None:
+            self._say_typical(f"Azure Kinect in the mode {mode.name}")
+            return azure_camera(mode, None)
+        whose = (
+            f"the camera {self.metadata.camera_name!r}" if self.metadata.camera_name else "a camera that is not known"
+        )
+        raise RecordingError(
+            f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a camera.toml beside it with "
+            "[camera], fx = ..., fy = ..., cx = ... and cy = ... in pixels"
+        )
+
+    def _which_camera(self, track: DepthTrack | None) -> str | None:
+        """The camera as the files name it; where they do not, only a Kinect v2 has pictures of its size."""
+        if track is not None and any(name.startswith("K4A_") for name in track.tags):
+            return AZURE
+        return self.metadata.camera or KINECT
+
+    def _say_typical(self, camera: str) -> None:
+        self.problems.append(
+            f"the files hold no intrinsics, so those of a typical {camera} were taken; state your camera's "
+            "own in a camera.toml beside the recording"
+        )
+
+    def _times(self, n: int, track: DepthTrack | None) -> Times:
+        """The stamps beside the depth, or else its own, or else a constant rate."""
+        own = None if track is None or not len(track.times_ns) else track
+        if self.stamps is not None:
+            name, stamps = self.stamps
+            if self.cut and 1 < len(stamps) < n:
+                stamps = self._continue(stamps, n)
+            if len(stamps) == n or own is None or own.even:
+                n, counts = match_counts(n, stamps, self.depth.name, name)
+                self.problems += [counts] if counts else []
+                return stamps[:n]
+            self.problems.append(
+                f"{self.depth.name} holds {n} frames but {name} holds {len(stamps)} time stamps; those of the video "
+                "itself are used"
+            )
+        hz = rate(self.fps, "the call")
+        if own is not None and not (own.even and hz):
+            if own.even:
+                self.problems.append(
+                    f"there are no time stamps, so the constant {1e9 / max(median_step(own.times_ns), 1):g} frames/s "
+                    f"that {self.depth.name} states were assumed"
+                )
+            return own.times_ns
+        origin = "as stated" if hz else "which is the usual rate; state fps if yours differs"
+        self.problems.append(
+            f"there are no time stamps, so a constant {hz or _NOMINAL_HZ:g} frames/s was assumed, {origin}"
+        )
+        return from_rate(n, hz or _NOMINAL_HZ)
+
+    def _continue(self, stamps: Times, n: int) -> Times:
+        """Stamps for the frames whose own were cut off: a whole frame is worth more than its exact time."""
+        step, n_lost = max(1, median_step(stamps)), n - len(stamps)
+        self.problems.append(
+            f"the time stamps of the last {n_lost} frames are cut off, so these frames were taken to follow every "
+            f"{step / 1e6:.4g} ms, the median step of those before"
+        )
+        return np.concatenate([stamps, stamps[-1] + step * np.arange(1, n_lost + 1)])

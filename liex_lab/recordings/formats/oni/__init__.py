@@ -1,0 +1,1 @@
+"""PrimeSense's `.oni`, read and written."""

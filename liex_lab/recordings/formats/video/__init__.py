@@ -1,0 +1,1 @@
+"""Depth in video containers: AVI and Matroska, FFV1 and raw pictures."""

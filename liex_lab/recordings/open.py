@@ -1,0 +1,168 @@
+"""The one door to depth recordings of every format: which module reads what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+from liex_lab.errors import LiexError, RecordingError
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.camera_file import CAMERA_FILE
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.progress import Progress, silent
+
+_READS = (
+    "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix camera with a "
+    "raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or .tar.gz), a PrimeSense recording "
+    "(.oni), an MCAP file or a ROS bag (.bag, .db3)"
+)
+_PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
+_MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
+_ALONE = {  # how the name of a file ends that holds a whole recording: its module and function
+    ".tar.gz": "moseq.reader.open_moseq",
+    ".tgz": "moseq.reader.open_moseq",
+    ".tar": "moseq.reader.open_moseq",
+    ".avi": "moseq.reader.open_moseq",
+    ".mkv": "moseq.reader.open_moseq",
+    ".mcap": "messages.mcap.open_mcap",
+    ".oni": "oni.reader.open_oni",
+    ".bag": "messages.rosbag.open_bag",
+    ".db3": "messages.rosbag.open_bag",
+}
+_FILES = _ALONE | {".dat": "moseq.reader.open_moseq"} | dict.fromkeys(_PICTURES, "images.folder.open_images")
+_RENDERED = "synthetic:"  # an address of a virtual recording; rendering stands above reading, so it is named only here
+_RENDERER = "liex_lab.simulation.address"
+_WITH_TOPICS = ("messages.mcap.open_mcap", "messages.rosbag.open_bag")
+_RAYTRIX = (
+    "is in Raytrix's own format, which only the maker's licensed software reads; compute metric depth in RxLive, save "
+    "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, write a raytrix.toml "
+    'with the line profile = "raytrix-f32-negative-mm" into it, and give that folder'
+)
+_CLOUD = (
+    "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says what its numbers "
+    'mean, with a line such as profile = "raytrix-points-mm", and give the folder'
+)
+_EIGHT_BIT = (
+    "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give the depth itself"
+)
+_NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
+_NOT_READ = {
+    **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
+    **dict.fromkeys((".ply", ".xyz"), _CLOUD),
+    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT),
+    **dict.fromkeys((".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
+}
+
+
+@dataclass(frozen=True)
+class _How:
+    """What was asked for besides the path."""
+
+    camera: Lens | None
+    fps: float | None
+    topic: str | None
+    progress: Progress
+
+    def open(self, where: str, path: Path) -> Recording:
+        """By the function `where` of `formats`, as in "oni.reader.open_oni"; it brings its libraries when asked for."""
+        module, name = where.rsplit(".", 1)
+        opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
+        topic = (self.topic,) if where in _WITH_TOPICS else ()
+        recording: Recording = opener(path, self.camera, self.fps, self.progress, *topic)
+        return recording
+
+    def render(self, address: str) -> Recording:
+        """The virtual recording of an address such as "synthetic:walk?seed=3"."""
+        recording: Recording = import_module(_RENDERER).open_synthetic(address, self.camera)
+        return recording
+
+
+def open_recording(
+    path: str | Path,
+    *,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    topic: str | None = None,
+    strict: bool = False,
+    progress: Progress = silent,
+) -> Recording:
+    """Open a depth recording of any format; frames are read when asked for.
+
+    path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see `open_synthetic`); camera:
+    comes before whatever the files state, a `Lens` for pictures of any size; fps: used only where the files hold no
+    time stamps; topic: of an MCAP file or a ROS bag with several depth topics; strict: refuse a recording that is cut
+    short, instead of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an
+    index made.
+    """
+    path = Path(path)
+    try:
+        recording = _open(path, _How(camera, fps, topic, progress))
+    except OSError as error:
+        raise RecordingError(f"{error.filename or path} cannot be read ({error.strerror or error}); check it") from None
+    except RecordingError:
+        raise
+    except LiexError as error:  # a camera that cannot be: it came out of this recording
+        raise RecordingError(f"{path}: {error}") from None
+    if strict and recording.truncated:
+        recording.close()
+        n_whole = f"{recording.n_whole} whole frame{'' if recording.n_whole == 1 else 's'}"
+        raise RecordingError(
+            f"{path} is cut short or damaged, {n_whole} can be read from it; copy it again, or go on with what is "
+            "whole by adding --set recording.accept_truncated=true"
+        )
+    return recording
+
+
+def _open(path: Path, how: _How) -> Recording:
+    if str(path).startswith(_RENDERED):
+        return how.render(str(path))
+    if not path.exists():
+        raise RecordingError(f"there is no file or folder {path}; check the spelling")
+    if path.is_dir():
+        return _open_folder(path, how)
+    from liex_lab.recordings.formats.images.nyu import looks_like_nyu
+
+    if looks_like_nyu(path.parent, [path.name]):
+        return how.open("images.nyu.open_nyu", path)
+    if (where := _reader(path.name)) is not None:
+        if not path.stat().st_size:
+            raise RecordingError(f"{path} is empty; copy the recording again")
+        return how.open(where, path)
+    why = _NOT_READ.get(path.suffix.lower())
+    raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")
+
+
+def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
+    return next((where for end, where in files.items() if name.lower().endswith(end)), None)
+
+
+def _open_folder(folder: Path, how: _How) -> Recording:
+    from liex_lab.recordings.formats.images.nyu import looks_like_nyu
+    from liex_lab.recordings.formats.images.raytrix import PROFILE_FILE, looks_like_raytrix, no_profile_error
+
+    inside = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
+    if not inside:
+        raise RecordingError(f"{folder} is an empty folder; give {_READS}")
+    if any(name in inside for name in _MOSEQ):
+        return how.open("moseq.reader.open_moseq", folder)
+    if PROFILE_FILE in inside:
+        return how.open("images.raytrix.open_raytrix", folder)
+    if CAMERA_FILE not in inside and looks_like_raytrix(folder, inside):
+        raise no_profile_error(folder)
+    if looks_like_nyu(folder, inside):
+        return how.open("images.nyu.open_nyu", folder)
+    if "session.json" in inside:
+        raise RecordingError(
+            f"{folder} is a session, the result of a run; look at it with `liex show`, or give a recording"
+        )
+    if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
+        return how.open("images.folder.open_images", folder)
+    files = [name for name in inside if _reader(name, _ALONE)]
+    if len(files) == 1:
+        return _open(folder / files[0], how)
+    offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]
+    raise RecordingError(
+        f"{folder} holds no depth pictures and no depth.dat; "
+        + (f"give one of these in it: {', '.join(offer[:6])}" if offer else f"give {_READS}")
+    )

@@ -1,0 +1,195 @@
+"""Frames that are still to come: of a file or folder that is being written, or replayed through a socket."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from queue import Queue
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.recording import Recording
+
+_FRAME = struct.Struct("<qqII")  # index, time ns, height, width; then float32 mm, row by row
+_HEAD = struct.Struct("<I")  # length of the greeting, JSON
+_POLL_S = 0.02
+_GREETING_S, _LONGEST_GREETING = 10.0, 1 << 20
+_MOST_WAITING = 128  # frames that have come and were not asked for yet; then the sender waits
+
+
+class Arrival(NamedTuple):
+    """A frame, and when it was there, on the clock of `time.perf_counter`."""
+
+    frame: DepthFrame
+    at_s: float
+
+
+@dataclass(frozen=True)
+class Arriving:
+    """A recording that goes on: its name and camera, and its frames as they come. Iterate once."""
+
+    name: str
+    camera: Camera
+    frames: Iterator[Arrival]
+
+
+def growing(reopen: Callable[[], Recording], patience_s: float) -> Arriving:
+    """A file or folder that is being written; it is over when nothing has come for patience_s.
+
+    reopen: opens what is there now, as far as it is whole. It is asked again whenever the last look found all read.
+    """
+    first = _when_there(reopen, patience_s)
+    return Arriving(first.name, first.camera, _grown(first, reopen, patience_s))
+
+
+def _when_there(reopen: Callable[[], Recording], patience_s: float) -> Recording:
+    """The recording as soon as it has a first frame."""
+    began = time.perf_counter()
+    while True:
+        try:
+            opened = reopen()
+            if len(opened):
+                return opened
+        except RecordingError:
+            if time.perf_counter() - began > patience_s:
+                raise
+        if time.perf_counter() - began > patience_s:
+            raise RecordingError(f"nothing has come for {patience_s:g} s; begin the recording first, or wait longer")
+        time.sleep(_POLL_S)
+
+
+def _grown(opened: Recording, reopen: Callable[[], Recording], patience_s: float) -> Iterator[Arrival]:
+    done, last = 0, time.perf_counter()
+    while time.perf_counter() - last < patience_s:
+        for index in range(done, len(opened)):
+            last = time.perf_counter()
+            yield Arrival(opened.frame(index), last)
+        done = max(done, len(opened))
+        time.sleep(_POLL_S)
+        try:
+            opened = _again(opened, reopen)
+        except RecordingError:  # caught in the middle of a write
+            continue
+    opened.close()
+
+
+def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
+    """What is there now: read on where the format can, else opened anew."""
+    more = opened.grown()
+    if more is None:
+        opened.close()
+        more = reopen()
+    return more
+
+
+def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
+    """A recording sent through a socket of this machine at its own pace, or `speed` times as fast."""
+    server = socket.create_server(("127.0.0.1", 0))
+    threading.Thread(target=_send, args=(server, recording, speed), daemon=True).start()
+    return received(*server.getsockname()[:2])
+
+
+def received(host: str, port: int) -> Arriving:
+    """What a sender like `replayed` offers at an address."""
+    try:
+        link = socket.create_connection((host, port), timeout=_GREETING_S)
+    except OSError as error:
+        raise RecordingError(f"nobody sends frames at {host}:{port} ({error}); start the sender first") from None
+    greeting = _greeting(link, f"{host}:{port}")
+    link.settimeout(None)  # the first frame may be long in the making; who is gone closes the link
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    return Arriving(greeting["name"], Camera.from_dict(greeting["camera"]), _stamped(_frames(link)))
+
+
+def _greeting(link: socket.socket, where: str) -> dict[str, Any]:
+    """What a sender says first."""
+    head = _exactly(link, _HEAD.size)
+    length = _HEAD.unpack(head)[0] if head else 0
+    try:
+        said = json.loads(_exactly(link, length)) if 0 < length < _LONGEST_GREETING else None
+    except ValueError:
+        said = None
+    if not isinstance(said, dict) or not {"name", "camera"} <= set(said):
+        link.close()
+        raise RecordingError(
+            f"what is at {where} does not send depth frames as `replayed` does: no greeting with name and camera came; "
+            "check the port"
+        )
+    return said
+
+
+def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
+    """The same, read on a thread of its own, so that a frame's time is when it came and not when it was asked for."""
+    waiting: Queue[Arrival | None] = Queue(_MOST_WAITING)
+
+    def fetch() -> None:
+        try:
+            for arrival in frames:
+                waiting.put(arrival)
+        finally:
+            waiting.put(None)
+
+    threading.Thread(target=fetch, daemon=True).start()
+    while (arrival := waiting.get()) is not None:
+        yield arrival
+
+
+def _send(server: socket.socket, recording: Recording, speed: float) -> None:
+    """Greet the one who connects, then send every frame when its time has come."""
+    with server, closing(server.accept()[0]) as link:
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        greeting = json.dumps({"name": recording.name, "camera": recording.camera.to_dict()}).encode()
+        link.sendall(_HEAD.pack(len(greeting)) + greeting)
+        first = int(recording.times_ns[0])
+        began: float | None = None  # when the first frame is read: what that takes is not the recording's pace
+        for frame in recording:
+            began = time.perf_counter() if began is None else began
+            late = (frame.time_ns - first) * 1e-9 / speed - (time.perf_counter() - began)
+            if late > 0:
+                time.sleep(late)
+            height, width = frame.depth.shape
+            try:
+                link.sendall(_FRAME.pack(frame.index, frame.time_ns, height, width))
+                link.sendall(np.ascontiguousarray(frame.depth, np.float32).data.cast("B"))
+            except OSError:  # nobody listens any more
+                return
+
+
+def _frames(link: socket.socket) -> Iterator[Arrival]:
+    with link:
+        while head := _exactly(link, _FRAME.size):
+            index, time_ns, height, width = _FRAME.unpack(head)
+            depth = np.empty((height, width), np.float32)
+            if not _fill(link, depth.data.cast("B")):
+                return
+            yield Arrival(DepthFrame(index, time_ns, depth), time.perf_counter())
+
+
+def _exactly(link: socket.socket, n: int) -> bytes:
+    """The next n bytes, none where the sender has gone."""
+    data = bytearray(n)
+    return bytes(data) if _fill(link, memoryview(data)) else b""
+
+
+def _fill(link: socket.socket, place: memoryview) -> bool:
+    """Whether the next bytes came, as many as there is room for; they go where they stay, a frame is millions."""
+    filled = 0
+    while filled < len(place):
+        try:
+            n = link.recv_into(place[filled:])
+        except OSError:
+            return False
+        if not n:
+            return False
+        filled += n
+    return True

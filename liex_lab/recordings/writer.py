@@ -1,0 +1,167 @@
+"""Recordings written frame by frame: what every writer promises; folders of PNG pictures, and .oni.
+
+A writer is left with its `with` block: what belongs at the end is written where the block ended well. `notes` then says
+what a reader of the file should know.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.camera_file import CAMERA_FILE
+from liex_lab.recordings.depth_units import LARGEST_STEP, nearest_steps, whole_steps
+from liex_lab.recordings.frame import Depth, DepthFrame
+
+STAMPS = "timestamps.csv"
+_FACTS = ("subject_id", "session_start_time")  # of the metadata, those that a camera.toml can state
+
+
+class RecordingWriter(ABC):
+    """Takes the frames of a recording in order of time. path: what is written, and there must be nothing yet."""
+
+    def __init__(self, path: Path, camera: Camera) -> None:
+        self.path, self.camera = path, camera
+        self.notes: list[str] = []
+
+    @abstractmethod
+    def add(self, frame: DepthFrame) -> None:
+        """The next frame."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Write what belongs at the end."""
+
+    @abstractmethod
+    def release(self) -> None:
+        """Let go of open files, whether the recording is whole or not."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        try:
+            if kind is None:
+                self.finish()
+        finally:
+            self.release()
+
+
+class PictureFolderWriter(RecordingWriter):
+    """16-bit PNG pictures, one to a frame, with a camera.toml and a timestamps.csv in nanoseconds.
+
+    step_mm: of a stored step; exact: refuse depths between steps instead of rounding them.
+    """
+
+    def __init__(
+        self, path: Path, camera: Camera, *, step_mm: float = 1.0, exact: bool = True,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(path, camera)
+        self._step_mm, self._exact = step_mm, exact
+        self._facts = {key: str(value) for key, value in (metadata or {}).items() if key in _FACTS}
+        self._times: list[int] = []
+        path.mkdir()
+
+    def add(self, frame: DepthFrame) -> None:
+        """Write a picture; a stamp is kept until the end."""
+        steps = steps_of(frame, self._step_mm, self._exact)
+        (self.path / f"frame_{len(self._times):06d}.png").write_bytes(png_of(steps))
+        self._times.append(frame.time_ns)
+
+    def finish(self) -> None:
+        """Write camera.toml and timestamps.csv."""
+        camera = self.camera
+        numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+        facts: dict[str, Any] = numbers | {"unit_mm": self._step_mm} | self._facts
+        if camera.distortion is not None:
+            facts |= {"distortion": camera.distortion.coefficients, "distortion_model": camera.distortion.model}
+        lines = [f"# intrinsics: {' '.join(camera.source.split())}", "[camera]"]
+        lines += [f"{key} = {json.dumps(value)}" for key, value in facts.items()]
+        (self.path / CAMERA_FILE).write_text("\n".join([*lines, ""]), encoding="utf-8")
+        (self.path / STAMPS).write_text("\n".join(["time_ns", *map(str, self._times), ""]), encoding="utf-8")
+        if not self._exact:
+            self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
+
+    def release(self) -> None:
+        """Nothing is held open."""
+
+
+class OniRecordingWriter(RecordingWriter):
+    """PrimeSense's .oni; step_mm: 1.0 or 0.1; exact: refuse depths between steps instead of rounding them."""
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        *,
+        step_mm: float = 1.0,
+        exact: bool = True,
+        start_ns: int = 0,
+        rate_hz: float = 30.0,
+    ) -> None:
+        """start_ns: of the first frame, for the format has no time before zero; rate_hz: what the file says of it."""
+        from liex_lab.recordings.formats.oni.writer import OniWriter
+
+        super().__init__(path, camera)
+        self._step_mm, self._exact, self._earlier_ns = step_mm, exact, min(0, start_ns)
+        self._rounded = False
+        self._oni = OniWriter(path, camera, unit_mm=step_mm, rate_hz=rate_hz, exact=exact)
+
+    def add(self, frame: DepthFrame) -> None:
+        """Write a picture with its time in microseconds."""
+        time_us, rest = divmod(frame.time_ns - self._earlier_ns + 500, 1000)
+        self._rounded |= rest != 500
+        self._oni.add(time_us, frame.depth)
+
+    def finish(self) -> None:
+        """Write the table of seeking."""
+        self._oni.close()
+        if self._rounded:
+            self.notes.append("times were rounded to microseconds, which is what .oni holds")
+        if self._earlier_ns:
+            self.notes.append(f"times count from {self._earlier_ns} ns, for .oni has none before zero")
+        if self.camera.distortion is not None:
+            self.notes.append(
+                f"the lens distortion ({self.camera.distortion}) was left out, for .oni has no place for it"
+            )
+        if not self._exact:
+            self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
+
+    def release(self) -> None:
+        """Close the file."""
+        self._oni.abandon()  # closing twice does no harm
+
+
+def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint16]:
+    """A frame's depth in steps of 16 bits, or the sentence why there are none."""
+    depth: Depth = frame.depth
+    steps = whole_steps(depth, step_mm) if exact else nearest_steps(depth, step_mm)
+    if steps is not None:
+        return steps
+    if float(depth.max()) > LARGEST_STEP * step_mm:
+        raise RecordingError(
+            f"frame {frame.index} holds depths up to {depth.max():.0f} mm, and 16 bits in steps of {step_mm:g} mm hold "
+            f"up to {LARGEST_STEP * step_mm:.0f} mm; write an .mcap file, or choose a larger step with --step-mm"
+        )
+    raise RecordingError(
+        f"frame {frame.index} holds depths between whole steps of {step_mm:g} mm, which 16 bits do not keep; write an "
+        "unpacked .mcap file, which does, or let the depths be rounded with --step-mm 0.1"
+    )
+
+
+def png_of(steps: NDArray[np.uint16]) -> bytes:
+    """A picture (H, W) as 16-bit PNG."""
+    import cv2
+
+    good, packed = cv2.imencode(".png", steps)
+    assert good
+    return bytes(packed.tobytes())

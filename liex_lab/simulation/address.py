@@ -1,0 +1,92 @@
+"""Virtual recordings by address: synthetic:walk?seed=3&frames=300 and what else moves."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Any, Final
+from urllib.parse import parse_qsl
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.camera_file import fitting
+from liex_lab.recordings.recording import Recording
+from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.sensors import BY_NAME
+from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.tracking_sequences import SEQUENCES, tracking_sequence
+
+_ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
+_SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES)
+_SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
+_EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
+_MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
+_SIZES = (0.5, 2.9)  # of the home length
+
+
+def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
+    """The virtual recording of an address, as in synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
+
+    walk: a mouse, swim: a fish, gesture: a hand, move: the animal of a skeleton's TOML, animal=snake.toml. Each setting
+    may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn from the seed. track-easy and
+    track-hard: the test sequences of `simulation.tracking_sequences`, of a mouse, or animal=fish or animal=hand, with a
+    seed or more frames others of their kind. camera: taken for the one that made the pictures, to see what a wrong one does.
+    """
+    kind, _, query = address.removeprefix("synthetic:").partition("?")
+    if kind not in _KINDS:
+        raise RecordingError(f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in {_EXAMPLE}")
+    stated = dict(parse_qsl(query, keep_blank_values=True))
+    animal = _ANIMALS[kind] if kind in _ANIMALS else stated.pop("animal", "mouse" if kind in _SEQUENCES else "")
+    if not animal:
+        raise RecordingError(f"{address} lacks the animal that moves, as in synthetic:move?animal=snake.toml&seed=3")
+    skeleton = Skeleton.load(animal)
+    settings = _settings(kind, skeleton.length)
+    for key in stated:
+        if key not in settings:
+            near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
+            raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
+    values = {key: _value(address, key, text, settings[key]) for key, text in stated.items()}
+    world = world_of(skeleton)
+    session: TrueRecording
+    if kind in _SEQUENCES:
+        seed, n_frames = values.pop("seed", None), values.pop("frames", None)
+        session = tracking_sequence(world, _SEQUENCES[kind], seed=seed, n_frames=n_frames, **values)
+    else:
+        seed, n_frames = values.pop("seed", 0), values.pop("frames", 300)
+        session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
+    if camera is not None:
+        session.camera = fitting(camera, session.width, session.height, "the camera that was stated")
+    return session
+
+
+_Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]
+
+
+def _settings(kind: str, home_mm: float) -> dict[str, _Setting]:
+    """Of each setting: how to read it, what holds for it, what to say otherwise."""
+    low, high = (30.0, 150.0) if kind == "walk" else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES)
+    settings: dict[str, _Setting] = {
+        "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
+        "frames": (int, lambda n: 1 <= n <= _MOST_FRAMES, f"a whole number from 1 to {_MOST_FRAMES}"),
+        "spine_mm": (float, lambda mm: low <= mm <= high, f"a length from {low:g} to {high:g} mm"),
+    }
+    if sensors := _SENSORS.get(kind):
+        settings["sensor"] = (
+            lambda name: BY_NAME[name] if name in sensors else BY_NAME[""], lambda _: True,
+            f"one of {', '.join(sensors)}",
+        )  # fmt: skip
+    return settings
+
+
+def _value(address: str, key: str, text: str, setting: _Setting) -> Any:
+    """The value of one setting of an address."""
+    read, holds, expected = setting
+    try:
+        value = read(text)
+        if holds(value):
+            return value
+    except (KeyError, ValueError):
+        pass
+    raise RecordingError(f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}")

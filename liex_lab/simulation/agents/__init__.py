@@ -1,0 +1,1 @@
+"""Virtual animals that act: sequences of named behaviour, rendered frame by frame."""

@@ -1,0 +1,304 @@
+"""The actions of a mouse, and what it does between them, by their kinematic definitions.
+
+Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are mm/s of a mouse of
+home size. A posture is one elevation for each of the four bones, a turn at each of the three inner joints, and how far
+the body is stretched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.simulation.agents.agent import (
+    SPEED,
+    STEP_S,
+    TURN,
+    UNLABELLED,
+    Individual,
+    Motion,
+    Story,
+    bump,
+    clock,
+    slow_noise,
+)
+from liex_lab.simulation.pose_prior import Posture, resting_heights, stand
+from liex_lab.simulation.species import MouseHabits
+
+Array = NDArray[np.float64]
+
+ACTIONS = (
+    "walk", "run", "turn_left", "turn_right", "rear_supported", "rear_unsupported", "groom", "pause", "freeze", "sniff",
+    "dart", "stretch_attend",
+)  # fmt: skip
+_RISE, _BEND = slice(3, 7), slice(7, 10)  # elevations of the bones, turns at the inner joints, rad
+_STRETCH, _ROLL = 10, 11
+_CHANNELS = 12
+_BLEND_S = 0.035
+_SHARES = {
+    "walk": 5.0, "run": 2.5, "turn_left": 1.2, "turn_right": 1.2, "rear_supported": 2.0, "rear_unsupported": 2.0,
+    "groom": 1.2, "pause": 4.0, "freeze": 1.5, "sniff": 2.2, "dart": 2.5, "stretch_attend": 1.5,
+}  # fmt: skip
+_BETWEEN = 0.3  # of the acts are followed by something without a name
+_STRIDE_HZ_PER_SPINE = 1.6
+_WALL_MM = 50.0  # a nose nearer to a wall can lean on it
+
+
+@dataclass(frozen=True)
+class MouseActor:
+    """A mouse that acts. half: half sides x and y (2,) mm of its box around the origin; rest (4,) rad: elevations of
+    its bones when it stands; spine_mm: its own.
+    """
+
+    mouse: Individual
+    spine_mm: float
+    half: Array
+    rest: Array
+
+    @staticmethod
+    def of(mouse: Individual, skeleton: Skeleton, shape: BodyShape, half: Array) -> MouseActor:
+        """An actor with this body."""
+        height = resting_heights(skeleton, shape)[0] + np.array([0.5, 1.5, 2.5, 3.0, 3.5])
+        height[-1] = 9.0
+        rest = np.arcsin(np.clip(np.diff(height) / np.linalg.norm(skeleton.offsets[1:], axis=1), -0.9, 0.9))
+        return MouseActor(mouse, mouse.size * skeleton.length, half, rest)
+
+    def fits(self, position: Array, heading: Array) -> bool:
+        """Whether a body with these middles and headings stays inside the box, nose and rump too."""
+        ahead = 0.55 * self.spine_mm * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        middle = position[:, :2]
+        reach = np.maximum(np.abs(middle + ahead), np.abs(middle - 0.8 * ahead))
+        return bool((reach < self.half).all())
+
+    def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
+        """A recording: actions in random order, some of them with something unnamed between."""
+        rest = np.zeros(_CHANNELS)
+        rest[_RISE], rest[_STRETCH] = self.rest, 1.0
+        start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
+        story, names = Story(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits), list(_SHARES)
+        share = np.array([_SHARES[name] for name in names]) * np.exp(rng.normal(0.0, 0.25, len(names)))
+        while story.n_steps * STEP_S < seconds:
+            word = str(rng.choice(names, p=share / share.sum()))
+            if word == "rear_supported":
+                self._to_wall(rng, story)
+            done = self._possible(story, word) and story.play(word, lambda word=word: self.act(rng, word), 6)  # type: ignore[misc]
+            if not done and word in ("walk", "run", "dart"):  # no room ahead
+                self._turn_home(rng, story)
+                story.play(word, lambda word=word: self.act(rng, word), 8)  # type: ignore[misc]
+            elif rng.random() < _BETWEEN and not story.play(UNLABELLED, lambda: self._between(rng), 4):
+                self._turn_home(rng, story)
+        return story.told()
+
+    def _possible(self, story: Story, word: str) -> bool:
+        """Whether a rear here is of that kind: one on a wall has it before the nose, any other is away from walls."""
+        if word == "rear_supported":
+            return self._room(story) < _WALL_MM
+        nose = story.position[:2] + 0.5 * self.spine_mm * np.array([np.cos(story.heading), np.sin(story.heading)])
+        return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
+
+    def _room(self, story: Story) -> float:
+        """From the nose to the wall ahead, mm."""
+        way = np.array([np.cos(story.heading), np.sin(story.heading)])
+        nose = story.position[:2] + 0.5 * self.spine_mm * way
+        ahead = np.where(np.abs(way) > 0.3, (self.half - np.sign(way) * nose) / np.maximum(np.abs(way), 1e-9), np.inf)
+        return float(ahead.min())
+
+    def _to_wall(self, rng: np.random.Generator, story: Story) -> None:
+        """Turn to the nearest wall and walk up to it."""
+        axis = int(np.argmin(self.half - np.abs(story.position[:2])))
+        toward = np.zeros(2)
+        toward[axis] = np.sign(story.position[axis]) or 1.0
+        self._turn_by(rng, story, np.arctan2(toward[1], toward[0]) + rng.normal(0.0, 0.25))
+        for _ in range(3):
+            room = self._room(story)
+            if room < 0.8 * _WALL_MM or not np.isfinite(room):
+                return
+            speed = self.mouse.vigour * self.mouse.size * rng.uniform(90.0, 240.0)
+            seconds = max(0.3, (room - 0.3 * _WALL_MM) / speed)
+            story.play("walk", lambda seconds=seconds, speed=speed: self._stride(rng, seconds, speed), 2)  # type: ignore[misc]
+
+    def _turn_home(self, rng: np.random.Generator, story: Story) -> None:
+        """Turn to the middle of the box, on the spot where there is no room."""
+        self._turn_by(rng, story, np.arctan2(-story.position[1], -story.position[0]) + rng.normal(0.0, 0.3))
+
+    def _turn_by(self, rng: np.random.Generator, story: Story, heading: float) -> None:
+        away = (heading - story.heading + np.pi) % (2 * np.pi) - np.pi
+        if abs(away) < np.radians(32.0):
+            return
+        word = "turn_left" if away > 0 else "turn_right"
+        if not story.play(word, lambda: self._turning(rng, away, rng.uniform(0.0, 40.0)), 3):
+            limit = self.half - 0.58 * self.spine_mm
+            story.nudge(np.array([*np.clip(story.position[:2], -limit, limit), 0.0]))
+            story.play(word, lambda: self._turning(rng, away, 0.0), 3)
+
+    def act(self, rng: np.random.Generator, word: str) -> Array:
+        """Channels of one action."""
+        vigour, size = self.mouse.vigour, self.mouse.size
+        table: dict[str, Callable[[], Array]] = {
+            "walk": lambda: self._stride(rng, self._seconds(rng, 0.4, 2.8), vigour * size * rng.uniform(60.0, 290.0)),
+            "run": lambda: self._stride(rng, self._seconds(rng, 0.5, 1.3), vigour * size * rng.uniform(300.0, 540.0)),
+            "dart": lambda: self._dart(rng),
+            "turn_left": lambda: self._turning(rng, np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)),
+            "turn_right": lambda: self._turning(rng, -np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)),
+            "rear_supported": lambda: self._rear(rng, True), "rear_unsupported": lambda: self._rear(rng, False),
+            "groom": lambda: self._groom(rng), "pause": lambda: self._pause(rng), "freeze": lambda: self._freeze(rng),
+            "sniff": lambda: self._sniff(rng), "stretch_attend": lambda: self._stretch(rng),
+        }  # fmt: skip
+        return table[word]()
+
+    def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
+        return float(np.clip(shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.mouse.patience, 0.25, longest))
+
+    def _blank(self, rng: np.random.Generator, seconds: float, unrest: float = 1.0) -> tuple[Array, Array]:
+        """The clock and the channels of a standing mouse, a little restless."""
+        t = clock(seconds)
+        c = np.zeros((len(t), _CHANNELS))
+        c[:, _RISE] = self.rest + np.radians(rng.normal(0.0, 3.0, 4))
+        c[:, _RISE.stop - 1] += np.radians(rng.normal(0.0, 7.0))
+        c[:, _STRETCH] = rng.normal(1.0, 0.015)
+        c[:, _BEND] = np.radians(rng.normal(0.0, 4.0, 3))
+        amount = unrest * (0.6 + 0.8 * self.mouse.restless)
+        c[:, _BEND] += amount * np.radians([1.5, 2.0, 6.0]) * slow_noise(rng, len(t), 0.5, 3)
+        c[:, _RISE] += amount * np.radians([0.8, 1.0, 2.0, 5.0]) * slow_noise(rng, len(t), 0.5, 4)
+        return t, c
+
+    def _gait(self, c: Array) -> None:
+        """The trunk sways with the stride."""
+        spines = np.abs(c[:, SPEED]) / self.spine_mm
+        phase = 2 * np.pi * np.cumsum(np.sqrt(spines) * _STRIDE_HZ_PER_SPINE * self.mouse.tempo) * STEP_S
+        sway = 0.06 * np.minimum(spines, 1.0) * np.sin(phase)
+        c[:, _BEND] += sway[:, None] * [1.0, -0.5, -0.5]
+
+    def _stride(self, rng: np.random.Generator, seconds: float, speed: float) -> Array:
+        t, c = self._blank(rng, seconds, 0.7)
+        c[:, SPEED] = speed * np.clip(1.0 + 0.13 * slow_noise(rng, len(t), 0.5)[:, 0], 0.5, 1.5)
+        c[:, TURN] = np.radians(rng.normal(0.0, 10.0)) + np.radians(11.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        c[:, _STRETCH] += 0.02
+        self._gait(c)
+        return c
+
+    def _dart(self, rng: np.random.Generator) -> Array:
+        t, c = self._blank(rng, 0.15 + self._seconds(rng, 0.4, 0.9), 0.5)
+        peak = max(245.0, self.mouse.vigour * rng.uniform(260.0, 520.0)) * self.mouse.size
+        burst = t[-1] - 0.15  # it starts from a stand and stops again
+        c[:, SPEED] = peak * bump(t - 0.05, burst, rng.uniform(0.2, 0.35)) ** 0.7
+        c[:, TURN] = np.radians(rng.normal(0.0, 25.0))
+        c[:, _STRETCH] += 0.03
+        self._gait(c)
+        return c
+
+    def _turning(self, rng: np.random.Generator, angle: float, speed: float) -> Array:
+        rate = rng.uniform(1.6, 4.2) * self.mouse.tempo
+        t, c = self._blank(rng, float(np.clip(abs(angle) / rate, 0.3, 1.3)), 0.7)
+        shape = bump(t, t[-1]) ** 0.6
+        c[:, TURN] = angle * shape / (shape.sum() * STEP_S)
+        curl = np.sign(angle) * self.mouse.bend * np.radians(rng.uniform(8.0, 30.0))
+        c[:, _BEND] += curl * shape[:, None] * [0.6, 0.8, 0.9]
+        c[:, SPEED] = speed * self.mouse.size
+        self._gait(c)
+        return c
+
+    def _rear(self, rng: np.random.Generator, supported: bool) -> Array:
+        t, c = self._blank(rng, 0.35 + self._seconds(rng, 0.6, 3.0), 1.0 if not supported else 0.6)
+        rise, fall = rng.uniform(0.2, 0.4, 2)
+        up = np.clip(np.minimum(t / rise, (t[-1] - t) / fall), 0.0, 1.0)[:, None] ** 1.3
+        steep = rng.uniform(50.0, 80.0) if supported else rng.uniform(38.0, 76.0)
+        tower = np.radians(steep + rng.normal(0.0, 7.0, 4) + [8.0, 4.0, 0.0, -25.0 + rng.normal(0.0, 12.0)])
+        if not supported:
+            tower = tower + np.radians(4.0) * slow_noise(rng, len(t), 0.35)
+        c[:, _RISE] = c[:, _RISE] * (1.0 - up) + (tower + 0.5 * (c[:, _RISE] - self.rest)) * up
+        c[:, SPEED] = rng.uniform(0.0, 12.0)
+        return c
+
+    def _hunch(self, rng: np.random.Generator) -> Array:
+        """Elevations (4,) of an arched back."""
+        return self.rest + np.radians(np.array([30.0, 12.0, -22.0, -38.0]) * rng.uniform(0.4, 1.05))
+
+    def _groom(self, rng: np.random.Generator) -> Array:
+        t, c = self._blank(rng, 0.4 + self._seconds(rng, 0.8, 5.0), 0.5)
+        c[:, _RISE] += self._hunch(rng) - self.rest
+        rate = self.mouse.tempo * rng.uniform(3.0, 6.0) * (1.0 + 0.1 * slow_noise(rng, len(t), 0.7)[:, 0])
+        phase, strength = 2 * np.pi * np.cumsum(rate) * STEP_S, 0.7 + 0.3 * slow_noise(rng, len(t), 0.6)[:, 0]
+        lick = np.radians(rng.uniform(-30.0, 30.0)) * np.clip(slow_noise(rng, len(t), 1.2)[:, 0], 0.0, 1.0)
+        c[:, 6] += np.radians(rng.uniform(4.0, 10.0)) * strength * np.sin(phase)
+        c[:, 9] += np.radians(rng.uniform(2.0, 11.0)) * strength * np.sin(phase * rng.choice([0.5, 1.0]) + 1.0) + lick
+        c[:, 8] += 0.7 * lick
+        c[:, SPEED] = rng.uniform(0.0, 12.0)
+        return c
+
+    def _pause(self, rng: np.random.Generator) -> Array:
+        t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4), 1.6)
+        c[:, SPEED] = np.abs(rng.uniform(0.0, 32.0) + 10.0 * slow_noise(rng, len(t), 0.4)[:, 0])
+        c[:, TURN] = np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        return c
+
+    def _freeze(self, rng: np.random.Generator) -> Array:
+        _, c = self._blank(rng, self._seconds(rng, 1.2, 5.0), 0.0)
+        c[:, SPEED] = rng.uniform(0.0, 4.0)
+        c[:, _RISE] -= np.radians(rng.uniform(0.0, 4.0))
+        return c
+
+    def _sniff(self, rng: np.random.Generator) -> Array:
+        t, c = self._blank(rng, self._seconds(rng, 0.5, 2.4), 0.6)
+        c[:, 6] += np.radians(-rng.uniform(10.0, 24.0))
+        c[:, 5] += np.radians(-rng.uniform(2.0, 9.0))
+        sweep = 2 * np.pi * self.mouse.tempo * rng.uniform(1.3, 2.8) * t
+        c[:, 9] += np.radians(rng.uniform(9.0, 24.0)) * np.sin(sweep + rng.uniform(0, 6))
+        c[:, 6] += np.radians(rng.uniform(1.0, 3.0)) * np.sin(2 * np.pi * rng.uniform(7.0, 10.0) * t)
+        c[:, SPEED] = rng.uniform(0.0, 90.0)
+        c[:, TURN] = np.radians(10.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        self._gait(c)
+        return c
+
+    def _stretch(self, rng: np.random.Generator) -> Array:
+        t, c = self._blank(rng, self._seconds(rng, 0.7, 2.4), 0.3)
+        up = np.minimum(1.0, np.minimum(t, t[-1] - t) / 0.2)
+        c[:, _STRETCH] += rng.uniform(0.055, 0.12) * up
+        c[:, _RISE] = self.rest * (1.0 - 0.5 * up[:, None]) + 0.5 * (c[:, _RISE] - self.rest)
+        c[:, _BEND] *= 0.5
+        c[:, SPEED] = rng.uniform(3.0, 48.0)
+        return c
+
+    def _between(self, rng: np.random.Generator) -> Array:
+        """What has no name: a nose half up, sitting hunched, backing, bending far to one side."""
+        kind = rng.choice(4, p=[0.25, 0.25, 0.25, 0.25])
+        t, c = self._blank(rng, self._seconds(rng, 0.4, 1.6))
+        shape = bump(t, t[-1])
+        if kind == 0:
+            c[:, _RISE] += np.radians(rng.uniform(9.0, 20.0)) * shape[:, None] ** 0.6 * [0.5, 0.7, 1.0, 1.4]
+            c[:, SPEED] = rng.uniform(0.0, 50.0)
+        elif kind == 1:
+            deep = rng.uniform(0.7, 1.0) * (self._hunch(rng) - self.rest)
+            c[:, _RISE] += deep * np.minimum(1.0, 3.0 * shape[:, None])
+        elif kind == 2:
+            c[:, SPEED] = -rng.uniform(25.0, 90.0)
+            c[:, TURN] = np.radians(rng.normal(0.0, 20.0))
+        else:
+            flank = self.mouse.way(rng) * np.radians(rng.uniform(16.0, 34.0))
+            c[:, _BEND] += flank * shape[:, None] ** 0.6 * [0.7, 1.0, 1.4]
+            c[:, SPEED] = rng.uniform(0.0, 25.0)
+        return c
+
+
+def mouse_poses(
+    rng: np.random.Generator, habits: MouseHabits, motion: Motion, rows: NDArray[np.int64], size: float,
+    shape: BodyShape,
+) -> tuple[Pose, Array]:  # fmt: skip
+    """Poses (n) in the arena frame, at steps `rows` (n,), of a mouse of this size over home, and girths (n,)."""
+    c, n, skeleton = motion.channels[rows], len(rows), habits.skeleton
+    turn = np.zeros((n, skeleton.n_joints))
+    turn[:, 1:-1] = c[:, _BEND]
+    # a body that bends to one side heads between its ends
+    posture = Posture(c[:, _RISE].copy(), turn, c[:, _ROLL].copy(), c[:, _STRETCH].copy())
+    heading = motion.heading[rows] - 0.5 * c[:, _BEND].sum(axis=1)
+    gap = np.full(n, rng.uniform(0.0, 2.0))
+    pose, girth = stand(skeleton, posture, heading, np.full(n, size), shape[0].broadcast(n), gap)
+    middle = pose.joints(skeleton)[:, :4, :2].mean(axis=1)
+    pose.root.translation[:, :2] += motion.position[rows, :2] - middle
+    return pose, girth

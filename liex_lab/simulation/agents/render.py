@@ -1,0 +1,95 @@
+"""An acting animal before a virtual depth camera: the window around it, frame by frame, with the truth.
+
+Whole pictures of a long recording would be far more work than what an action recogniser needs of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.surface import Body, Surface
+from liex_lab.foreground.height_maps import Windows
+from liex_lab.geometry import SE3
+from liex_lab.simulation import _render_kernels as _stage
+from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
+from liex_lab.simulation.objects import PART_FACES, rounded
+from liex_lab.simulation.scene import draw_views
+from liex_lab.simulation.sensors import Sensor
+from liex_lab.simulation.species import Habits
+from liex_lab.simulation.training_patches import inverse_depth_plane, window_origin
+
+Array = NDArray[np.float64]
+
+_BLOCK = 256  # frames rendered at a time
+
+
+@dataclass(frozen=True)
+class Camerawork:
+    """One camera over a place: intrinsics (4,) of the pictures that are looked at, their size (2,) px, T_arena_camera,
+    the unit's sensor parameters (N,), and how far off the floor is taken to be (3,).
+    """
+
+    intrinsics: Array
+    picture: NDArray[np.int64]
+    T_arena_camera: SE3
+    parameters: Array
+    floor_error: Array
+
+    @staticmethod
+    def draw(
+        rng: np.random.Generator, habits: Habits, sensor: Sensor, fur: Array, height_mm: float, stride: int
+    ) -> Camerawork:
+        """A camera of that make, so high above the floor, of whose pictures only every `stride`-th pixel is looked at.
+
+        Its picture is twice as wide and high as the sensor's, so that an animal has room for long stretches of action.
+        """
+        camera = sensor.camera.every(stride)
+        focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
+        T = draw_views(rng, 1, habits.setting)
+        place = SE3(T.rotation[0], np.array([0.0, 0.0, height_mm]))
+        parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))[0]
+        margin = np.array([camera.width, camera.height]) / 2.0
+        picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
+        error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * habits.setting.scale]
+        return Camerawork(
+            np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]), picture, place, parameters, error
+        )
+
+
+def film(
+    rng: np.random.Generator, habits: Habits, camera: Camerawork, shape: Body, pose: Pose, girth: Array,
+    walls: Array | None, window_px: int,
+) -> Iterator[Windows]:  # fmt: skip
+    """Windows around the animal in poses (n) of the arena frame and girths (n,), some hundred at a time.
+
+    walls (n, WALL_COLUMNS): what wall each frame shows, None none.
+    """
+    surface, n = Surface.of(habits.skeleton), len(girth)
+    seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+    bends = habits.bends(rng, 1)
+    for start in range(0, n, _BLOCK):
+        part = slice(start, min(start + _BLOCK, n))
+        m = part.stop - part.start
+        lying = None if bends is None else np.repeat(bends, m, axis=0)
+        vertices = surface.vertices(pose[part], shape[0].broadcast(m), girth[part], lying)
+        T = SE3(np.tile(camera.T_arena_camera.rotation, (m, 1, 1)), np.tile(camera.T_arena_camera.translation, (m, 1)))
+        intrinsics = np.tile(camera.intrinsics, (m, 1))
+        trunk = vertices[:, : surface.n_trunk_vertices]
+        origin = window_origin(trunk, T.inverse(), intrinsics, window_px)
+        depth = np.empty((m, window_px, window_px), np.uint16)
+        background = np.empty_like(depth)
+        nothing = rounded(np.zeros((m, 3)), np.ones((m, 3)), np.zeros(m), np.full(m, 2.0))
+        _stage.draw_windows(
+            vertices, surface.faces, nothing, PART_FACES, np.zeros(m, np.bool_), T.rotation,
+            T.translation[:, 2].copy(), intrinsics, np.tile(camera.picture, (m, 1)), origin,
+            np.zeros((m, _stage.WALL_COLUMNS)) if walls is None else walls[part], np.zeros(m),
+            np.tile(camera.parameters, (m, 1)), seeds[part], NORMAL, depth, background,
+        )  # fmt: skip
+        unit = np.float32(camera.parameters[UNIT])
+        floor = inverse_depth_plane(T, intrinsics, np.tile(camera.floor_error, (m, 1)))
+        yield Windows(depth * unit, background * unit, intrinsics, origin.astype(float), floor, habits.skeleton.view)

@@ -1,0 +1,228 @@
+"""What goes wrong while a real animal is recorded, as a script of events, and how each of them looks in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.optics.camera import Camera
+from liex_lab.simulation.objects import N_PARTS, THING_FACES, draw_thing, rounded
+from liex_lab.simulation.scene import Stage
+
+Array = NDArray[np.float64]
+Beside = Callable[[np.random.Generator, Array, float], Array]  # a second object from joints (n, J, 3) and a length
+
+# kind: (share of the events, shortest and longest in s)
+EVENTS = {
+    "holes": (4, 0.5, 1.2),
+    "occluder": (3, 0.8, 1.6),
+    "object": (2, 1.0, 2.0),
+    "faint": (3, 0.5, 1.4),
+    "fast": (3, 0.4, 1.0),
+    "dropped": (3, 0.1, 0.35),
+}
+_CALM_S = (0.1, 0.5)  # between two events
+_LONE_DROP = 0.02  # of the frames are dropped on their own
+_FAST = (2, 3)  # times as fast as the animal otherwise moves
+_FAINT_MM = (0.2, 0.4)  # of the animal's length: what is lower than this is lost in the floor
+_FAINT_LOST = (0.4, 0.75)  # of the readings of an animal that floats
+_HOLE = (0.1, 0.26)  # radius, of the animal's length
+_CELL = 3  # pixels a side that come and go together
+# an occluder: half its width and how far it comes from, of the animal's length; how long it is
+_BAR_HALF, _BAR_FROM, _BAR_LONG = (0.12, 0.5), 2.0, 2.5
+# a thing held beside a hand: half its sides, and how far from the hand, of the hand's length
+_HELD, _HELD_ASIDE = (0.08, 0.3), (0.1, 0.5)
+_AWAY = np.array([0.0, 0.0, 1e6])  # behind the camera
+
+TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max() + 1)])
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happens in frames start to stop (exclusive); kind: a word of `EVENTS`, or 'hidden', the frames in
+    which less than half of the animal can be seen.
+    """
+
+    kind: str
+    start: int
+    stop: int
+
+
+def draw_script(rng: np.random.Generator, n_frames: int, step_s: float) -> tuple[list[Event], NDArray[np.int64]]:
+    """Events over n frames, and how many steps of the camera's clock lie before each frame (n,), 1 as a rule.
+
+    The events come in shuffled decks, the first with one of each, so that none is long absent. Frames that are dropped
+    are missing afterwards: an event 'dropped' is the one frame after them.
+    """
+    events, steps = [], np.ones(n_frames, np.int64)
+    deck = [str(name) for name in rng.permutation(list(EVENTS))]
+    at = round(1.0 / step_s)  # a second of calm to begin with
+    while at < n_frames:
+        if not deck:
+            names = [name for name, (share, *_) in EVENTS.items() for _ in range(share)]
+            deck = [str(name) for name in rng.permutation(names)]
+        kind = deck.pop()
+        length = max(2, round(rng.uniform(*EVENTS[kind][1:]) / step_s))
+        stop = min(at + (1 if kind == "dropped" else length), n_frames)
+        if kind == "dropped":
+            steps[at] += length
+        events.append(Event(kind, at, stop))
+        at = stop + max(1, round(rng.uniform(*_CALM_S) / step_s))
+    alone = rng.random(n_frames) < _LONE_DROP
+    alone[:2] = False
+    return events, steps + alone
+
+
+def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArray[np.int64]:
+    """How many times as fast (n,) the animal moves."""
+    times = np.ones(n_frames, np.int64)
+    for event in events:
+        if event.kind == "fast":
+            times[event.start : event.stop] = rng.integers(_FAST[0], _FAST[1] + 1)
+    return times
+
+
+def draw_things(
+    rng: np.random.Generator, events: list[Event], eye: Array, joints: Array, length_mm: float, beside: Beside,
+    floats: bool = True,
+) -> Array:  # fmt: skip
+    """Meshes (n, 2 V, 3) mm of the occluder and of a second object in each frame; behind the camera where there is
+    none. joints (n, J, 3) mm: the animal's, arena frame, where eye (3,) is the camera.
+    """
+    one = int(THING_FACES.max()) + 1
+    things = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
+    for event in events:
+        span = slice(event.start, event.stop)
+        if event.kind == "occluder":
+            things[span, :one] = _passing(rng, eye, joints[span], length_mm, floats)
+        elif event.kind == "object":
+            things[span, one:] = beside(rng, joints[span], length_mm)
+    return things
+
+
+def _passing(rng: np.random.Generator, eye: Array, joints: Array, length_mm: float, floats: bool) -> Array:
+    """A bar (n, V, 3) mm that is moved across the view between the camera and the animal."""
+    height = 0.65 * eye[2] if floats else min(3.0 * length_mm, 0.5 * eye[2])
+    target = joints[len(joints) // 2].mean(axis=0)
+    share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the lens to the animal
+    over = eye[:2] + (target[:2] - eye[:2]) * share
+    way = rng.uniform(-np.pi, np.pi)
+    half, s = rng.uniform(*_BAR_HALF) * length_mm * share, np.linspace(-1.0, 1.0, len(joints))
+    centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
+    radii[0] = [half, _BAR_LONG * length_mm * share, 0.1 * length_mm]
+    mesh = rounded(centre, radii, np.full(N_PARTS, way), np.full(N_PARTS, 8.0)).reshape(-1, 3)
+    along = s[:, None] * _BAR_FROM * length_mm * share * np.array([np.cos(way), np.sin(way)])
+    place = np.concatenate([over + along, np.full((len(s), 1), height)], axis=1)
+    return mesh + place[:, None]
+
+
+def beside_animal(
+    rng: np.random.Generator, stage: Stage, joints: Array, length_mm: float, kinds: tuple[str, ...]
+) -> Array:
+    """A thing (n, V, 3) mm that stands beside the animal's way for a while, near it where there is room."""
+    mesh = draw_thing(rng, str(rng.choice(kinds)), length_mm)
+    way = joints[..., :2].reshape(-1, 2)
+    best, best_cost = np.zeros(2), np.inf
+    for _ in range(60):
+        place = joints[rng.integers(len(joints)), 0, :2] + rng.normal(0.0, 1.6, 2) * length_mm
+        reach = np.abs(mesh[:, :2]).max()
+        free = np.linalg.norm(way - place, axis=1).min() - reach
+        cost = abs(free - 0.5 * length_mm) + max(0.0, reach - float(stage.room(place))) + 50.0 * (free < 0)
+        if cost < best_cost:
+            best, best_cost = place, cost
+    return np.broadcast_to(mesh + np.array([*best, 0.0]), (len(joints), *mesh.shape))
+
+
+def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
+    """A block or a ball (n, V, 3) mm that is held beside a hand for a while, at about its depth."""
+    centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
+    radii[0] = rng.uniform(*_HELD, 3) * length_mm
+    power = np.full(N_PARTS, rng.choice([2.0, 8.0]))
+    mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(-1, 3)
+    way = rng.uniform(-np.pi, np.pi)
+    toward = np.array([np.cos(way), np.sin(way)])
+    reach = (joints[..., :2] @ toward).max() + np.hypot(*radii[0, :2]) + rng.uniform(*_HELD_ASIDE) * length_mm
+    middle = joints.mean(axis=(0, 1))
+    place = np.array([*(middle[:2] + (reach - middle[:2] @ toward) * toward), middle[2]])
+    return np.broadcast_to(mesh + place, (len(joints), *mesh.shape))
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Readings that are lost in n frames: discs, u, v and radius px, of frame i in discs[i]; faint_mm (n,): what stands
+    out from the still scene by less is read as the still scene; dropout (n,): this share of the animal's surroundings
+    is not read.
+    """
+
+    discs: tuple[Array, ...]
+    faint_mm: Array
+    dropout: Array
+
+    @staticmethod
+    def draw(
+        rng: np.random.Generator, events: list[Event], camera: Camera, joints: Array, length_mm: float, floats: bool
+    ) -> Loss:
+        """What is lost in n frames of these events; joints (n, J, 3) mm: camera frame."""
+        n = len(joints)
+        discs: list[Array] = [np.zeros((0, 3))] * n
+        faint, dropout = np.zeros(n), np.zeros(n)
+        for event in events:
+            span = slice(event.start, event.stop)
+            if event.kind == "faint" and floats:
+                dropout[span] = rng.uniform(*_FAINT_LOST)
+            elif event.kind == "faint":
+                faint[span] = rng.uniform(*_FAINT_MM) * length_mm
+            elif event.kind == "holes":
+                for i in range(event.start, event.stop):
+                    centres = joints[i, rng.integers(joints.shape[1], size=int(rng.integers(2, 5)))]
+                    centres = centres + rng.normal(0.0, 0.1 * length_mm, centres.shape)
+                    px = camera.fx / centres[:, 2:] * rng.uniform(*_HOLE, (len(centres), 1)) * length_mm
+                    discs[i] = np.concatenate([camera.project(centres), px], axis=1)
+        return Loss(tuple(discs), faint, dropout)
+
+    def apply(self, depths: NDArray[np.float32], still: NDArray[np.float32] | None, first: int,
+              seeds: NDArray[np.uint64], middle_px: Array, reach_px: Array) -> None:  # fmt: skip
+        """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W) mm, where anything is
+        lost in it; middle_px (n, 2) and reach_px (n,): where the animal is in the picture.
+        """
+        height, width = depths.shape[1:]
+        v, u = np.mgrid[:height, :width]
+        for k, depth in enumerate(depths):
+            i = first + k
+            if still is not None and self.faint_mm[i] > 0:
+                lost = (depth > 0) & (still > 0) & (still - depth < self.faint_mm[i])
+                depth[lost] = still[lost]
+            if self.dropout[i] > 0:
+                rng = np.random.default_rng(int(seeds[i]))
+                cells = rng.random((-(-height // _CELL), -(-width // _CELL))) < self.dropout[i]
+                gone = np.repeat(np.repeat(cells, _CELL, axis=0), _CELL, axis=1)[:height, :width]
+                near = np.hypot(u - middle_px[i, 0], v - middle_px[i, 1]) < reach_px[i]
+                depth[gone & near] = 0.0
+            for u0, v0, radius in self.discs[i]:
+                depth[np.hypot(u - u0, v - v0) < radius] = 0.0
+
+
+def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
+    """Share (n,) of the animal's vertices (n, V, 3) that no thing (n, W, 3) hides, 1 in frames other than `rows`.
+
+    Camera frame.
+
+    A vertex is hidden where it projects into the convex outline of an occluder, which lies nearer.
+    """
+    from scipy.spatial import Delaunay
+
+    share = np.ones(len(vertices))
+    for i in rows:
+        shadow, animal = camera.project(things[i]), camera.project(vertices[i])
+        share[i] = 1.0 - float((Delaunay(shadow).find_simplex(animal) >= 0).mean())
+    return share
+
+
+def hidden_spans(share: Array) -> list[Event]:
+    """The stretches in which less than half of the animal is seen."""
+    hidden = np.concatenate([[False], share < 0.5, [False]])
+    edges = np.flatnonzero(hidden[1:] != hidden[:-1])
+    return [Event("hidden", int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,125 @@
+"""A zebrafish in a tank before a light-field camera: its bodies, its bends, and where in the water it hangs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Body
+from liex_lab.body.variation import joint_reaches, vary_body
+from liex_lab.geometry import SE3
+from liex_lab.simulation.pose_prior import root_rotation
+from liex_lab.simulation.scene import Setting
+from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, Sensor
+from liex_lab.simulation.species import Postures
+
+Array = NDArray[np.float64]
+
+TANK = Setting(
+    camera_mm=(230.0, 330.0), tilt_rad=float(np.radians(6.0)), walls_mm=(30.0, 110.0), open_share=0.2,
+    clutter=("pellet", "plant"), scale=0.3,
+)  # fmt: skip
+# at rest or gliding, scooting with waves down the body, J: the hind half bent, C: both halves, S: against each other
+KINDS = ("glide", "scoot", "j", "c", "s")
+SHARES = (0.28, 0.30, 0.14, 0.14, 0.14)
+_NEAREST_MM = 180.0  # to the camera: nearer, a large fish is not in the picture as a whole
+_FLOOR_SHARE = 0.12  # of the fish are just above the floor
+_FRONT = 0.47  # of the body bends as one arc, the rest as another (as in people's annotations)
+
+
+@dataclass(frozen=True)
+class FishHabits:
+    """A zebrafish that swims anywhere in a tank, seen from above by a Raytrix R5."""
+
+    skeleton: Skeleton = field(default_factory=lambda: Skeleton.load("fish"))
+    sensors: tuple[Sensor, ...] = (RAYTRIX_R5_SENSOR,)
+    setting: Setting = TANK
+    things: tuple[str, ...] = ("pellet", "plant", "fish")
+    sizes: tuple[float, float] = (25.0 / 30.0, 40.0 / 30.0)
+    floats: bool = True
+    frame_ns: int = 20_000_000
+
+    def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
+        """N fish."""
+        return vary_body(rng, self.skeleton, family, n)
+
+    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
+        """Fish that glide, scoot and turn, mostly level, at any height over the floor."""
+        n = len(size)
+        kind = rng.choice(len(KINDS), n, p=SHARES)
+        steep = np.where(rng.random(n) < 0.12, 25.0, 8.0)
+        pitch = np.clip(rng.normal(0.0, 1.0, n) * steep, -55.0, 55.0)
+        roll = np.clip(rng.normal(0.0, 8.0, n), -25.0, 25.0)
+        rotation = root_rotation(rng.uniform(-np.pi, np.pi, n), np.radians(pitch), np.radians(roll))
+        pose = hung(self.skeleton, draw_bends(rng, self.skeleton, kind), rotation, size)
+        low, high = clearance(self.skeleton, pose, shape, size)
+        room = np.maximum(camera_mm - _NEAREST_MM - high, low + 1.0)
+        at = np.where(rng.random(n) < _FLOOR_SHARE, rng.uniform(0.0, 0.06, n), rng.random(n))
+        pose.root.translation[:, 2] += low + at * (room - low) + rng.uniform(0.5, 2.0, n)
+        return Postures(pose, size, kind)
+
+    def bends(self, rng: np.random.Generator, n: int) -> Array | None:
+        """Its tail is part of the skeleton."""
+        return None
+
+
+def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.int64]) -> Array:
+    """Yaw (n, J) rad at each joint for kinds (n,) of posture, within the skeleton's limits.
+
+    Two arcs, a wave that travels down the body, and a little of every part's own. Degrees are those of a chain of 20
+    bones; the hind half bends about twice as much as the front half, up to some 7 degrees a joint in a turn.
+    """
+    n = len(kind)
+    way = rng.choice([-1.0, 1.0], n)
+    slight = rng.normal(0.0, 1.0, (2, n)) * [[0.6], [1.2]]
+    strong = rng.uniform(0.0, 1.0, (2, n))
+    front = np.choose(kind, [slight[0], 1.2 * slight[0], 1.2 * slight[0], way * (2 + 7 * strong[0]),
+                             way * (1.5 + 5 * strong[0])])  # fmt: skip
+    hind = np.choose(kind, [slight[1], 1.5 * slight[1], way * (2.5 + 6.5 * strong[1]), way * (1.5 + 9 * strong[1]),
+                            -way * (2 + 6.5 * strong[1])])  # fmt: skip
+    amplitude = np.choose(kind, [0.4, 1.0 + 5.0 * strong[0], 1.5 * strong[0], 1.5 * strong[0], 2.0 * strong[0]])
+    phase, length, middle = rng.uniform(-np.pi, np.pi, n), rng.uniform(0.7, 1.4, n), rng.normal(_FRONT, 0.06, n)
+    own = rng.normal(0.0, 0.5, (n, 4))
+    return bend_profile(skeleton, front, hind, amplitude, phase, length, middle, own)
+
+
+def bend_profile(
+    skeleton: Skeleton, front: Array, hind: Array, amplitude: Array, phase: Array, length: Array, middle: Array,
+    own: Array,
+) -> Array:  # fmt: skip
+    """Yaw (n, J) rad of two arcs with a wave over them.
+
+    front, hind, amplitude (n,): degrees a joint; phase rad, length of the wave and where the arcs meet (n,), of the
+    body's length; own (n, 4): slow waves that stand, degrees.
+    """
+    s = joint_reaches(skeleton)
+    joint = 20.0 / max(1, skeleton.n_joints - 1)
+    share = 1.0 / (1.0 + np.exp(-(s - middle[:, None]) / 0.05))
+    arcs = front[:, None] * (1.0 - share) + hind[:, None] * share
+    wave = amplitude[:, None] * (0.35 + 0.65 * s) * np.sin(2 * np.pi * s / length[:, None] - phase[:, None])
+    stand = np.stack([np.sin(np.pi * (k + 1) * s + k) for k in range(own.shape[1])])
+    yaw = np.radians((arcs + wave + own @ stand) * joint) * skeleton.axes[:, 2]
+    yaw[:, 0] = 0.0
+    return np.clip(yaw, skeleton.limits[:, 2, 0], skeleton.limits[:, 2, 1])
+
+
+def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
+    """Poses (n) with these bends (n, J) and base rotations (n, 3, 3), their joints' mean at the origin."""
+    angles = np.zeros((*yaw.shape, 3))
+    angles[..., 2] = yaw
+    pose = Pose(SE3(rotation, np.zeros((len(yaw), 3))), angles, np.asarray(size, float))
+    pose.root.translation[:] -= pose.joints(skeleton).mean(axis=1)
+    return pose
+
+
+def clearance(skeleton: Skeleton, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
+    """How far (n,) mm the bodies of poses (n) reach below and above the origin, at most."""
+    assert isinstance(shape, BodyShape)
+    z = pose.joints(skeleton)[..., 2]
+    thick = size * shape.half_height.max(axis=-1)
+    return thick - z.min(axis=1), thick + z.max(axis=1)

@@ -1,0 +1,187 @@
+"""Any animal of which nothing but a skeleton and a surface is known: how it may lie, hang and move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import VIEWS, Skeleton
+from liex_lab.body.surface import Body, Surface
+from liex_lab.body.variation import vary_body
+from liex_lab.geometry import SE3
+from liex_lab.simulation.locomotion import smoothed, wander
+from liex_lab.simulation.pose_prior import root_rotation
+from liex_lab.simulation.recording import SyntheticSession, assemble
+from liex_lab.simulation.scene import ARENA, Setting, Stage
+from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, SENSORS, Sensor
+from liex_lab.simulation.species import Postures
+
+Array = NDArray[np.float64]
+
+_SMALL_MM = 35.0  # a shorter animal takes a camera made for the near
+_LIKE_NEXT = 0.75  # correlation of a joint's bend with its parent's
+_UNLIMITED_RAD = np.radians(100.0)  # an axis with a wider range was given no limits
+_USUAL_RAD = np.radians(45.0)  # and is taken to turn by this much
+_TILTS, _TILT_RAD = 8, 0.35  # of an animal that falls onto the floor, some lie lower than others
+_REARED_SHARE = 0.15  # and not all lie as low as they can
+_NEAR_SHARE = 0.55  # of the camera's height: no animal that floats comes nearer
+_CHANGE_S = 0.5  # a posture is held about this long
+
+
+@dataclass(frozen=True)
+class GenericHabits:
+    """An animal that lies on the floor, or (view frame 'camera') hangs above it, in any posture its joints allow."""
+
+    skeleton: Skeleton
+    sizes: tuple[float, float] = (0.9, 1.1)
+    things: tuple[str, ...] = ("block", "ball")
+    frame_ns: int = 33_333_333
+
+    @cached_property
+    def floats(self) -> bool:
+        """Whether it is somewhere above the floor."""
+        return self.skeleton.view.frame != VIEWS[0]
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """Cameras that resolve it."""
+        return (RAYTRIX_R5_SENSOR,) if self.skeleton.length < _SMALL_MM else SENSORS
+
+    @cached_property
+    def setting(self) -> Setting:
+        """A place in which it is seen as a whole from anywhere, and not too small."""
+        length = self.skeleton.length
+        scale = float(np.clip(self.skeleton.relative_size, 0.3, 2.0))
+        # seen across the picture, with room to go about; no camera of this kind reads nearer than its least distance
+        least = ARENA.camera_mm[0] if self.sensors == SENSORS else 230.0
+        near = max(least, 2.2 * length * max(sensor.camera.fx / sensor.camera.height for sensor in self.sensors))
+        walls = (ARENA.walls_mm[0] * scale, ARENA.walls_mm[1] * scale)
+        return Setting(camera_mm=(near, 1.6 * near), walls_mm=walls, scale=scale)
+
+    def window_px(self, length_mm: float) -> int:
+        """Pixels a side that hold an animal of this mean length, wherever it is."""
+        nearest = self.setting.camera_mm[0] * (1.0 - _NEAR_SHARE if self.floats else 0.9)
+        focal = max(sensor.camera.fx / sensor.stride for sensor in self.sensors)
+        px = 1.1 * self.sizes[1] * length_mm * focal / nearest + 32.0
+        return 8 * int(np.ceil(px / 8.0))
+
+    def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
+        """N bodies, varied in girth and proportions."""
+        return vary_body(rng, self.skeleton, family, n)
+
+    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
+        """Postures within the joints' limits, smooth along the chains."""
+        n = len(size)
+        angles = draw_angles(rng, self.skeleton, n)
+        heading = rng.uniform(-np.pi, np.pi, n)
+        if self.floats:
+            tilt = np.clip(rng.normal(0.0, 0.25, (2, n)), -0.9, 0.9)
+            pose = _centred(self.skeleton, angles, root_rotation(heading, tilt[0], 0.6 * tilt[1]), size)
+            low, high = self._extent(pose, shape, size)
+            room = np.maximum(_NEAR_SHARE * camera_mm - high, -low + 1.0)
+            pose.root.translation[:, 2] += -low + rng.random(n) * (room + low)
+            return Postures(pose, size, np.zeros(n, np.int64))
+        pose = self._fallen(rng, angles, heading, size)
+        low, _ = self._extent(pose, shape, size)
+        pose.root.translation[:, 2] += rng.uniform(0.0, 2.0, n) * self.setting.scale - low
+        return Postures(pose, size, np.zeros(n, np.int64))
+
+    def bends(self, rng: np.random.Generator, n: int) -> Array | None:
+        """Its tail, if it has one, is part of the skeleton."""
+        return None
+
+    def _extent(self, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
+        """Lowest and highest points (n,) mm of the bodies."""
+        z = Surface.of(self.skeleton).vertices(pose, shape, size)[..., 2]
+        return z.min(axis=1), z.max(axis=1)
+
+    def _fallen(self, rng: np.random.Generator, angles: Array, heading: Array, size: Array) -> Pose:
+        """Of some ways to lie the lowest one: what gravity would do; now and then any of them."""
+        n = len(size)
+        tilts = rng.normal(0.0, _TILT_RAD, (_TILTS, 2, n))
+        tilts[0] = 0.0
+        poses = [_centred(self.skeleton, angles, root_rotation(heading, t[0], t[1]), size) for t in tilts]
+        height = []
+        for pose in poses:
+            z = pose.joints(self.skeleton)[..., 2]
+            height.append(z.mean(axis=1) - z.min(axis=1))
+        best = np.argmin(height, axis=0)
+        best = np.where(rng.random(n) < _REARED_SHARE, rng.integers(_TILTS, size=n), best)
+        rows = np.arange(n)
+        rotation = np.stack([p.root.rotation for p in poses])[best, rows]
+        translation = np.stack([p.root.translation for p in poses])[best, rows]
+        return Pose(SE3(rotation, translation), angles, size)
+
+
+def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
+    """Angles (n, J, 3) rad about the free axes, within the limits, each like its parent's; some bodies nearly straight.
+
+    A standard normal number goes down every chain; its quantile says where between the limits the joint stands.
+    """
+    from scipy.special import ndtr
+
+    low, high = skeleton.limits[..., 0], skeleton.limits[..., 1]
+    wide = high - low > 2.0 * _UNLIMITED_RAD
+    low, high = np.where(wide, -_USUAL_RAD, low), np.where(wide, _USUAL_RAD, high)
+    bent = rng.beta(1.2, 1.0, (n, 1, 1))  # how far this body leaves its home pose
+    number = rng.standard_normal((n, skeleton.n_joints, 3))
+    for j in range(1, skeleton.n_joints):
+        p = skeleton.parents[j]
+        if p > 0:
+            number[:, j] = _LIKE_NEXT * number[:, p] + np.sqrt(1.0 - _LIKE_NEXT**2) * number[:, j]
+    home = np.clip(0.0, low, high)
+    angles = home + bent * (low + ndtr(number) * (high - low) - home)
+    angles = angles * skeleton.axes
+    angles[:, 0] = 0.0
+    return angles
+
+
+def _centred(skeleton: Skeleton, angles: Array, rotation: Array, size: Array) -> Pose:
+    """Poses (n) with their joints' mean at the origin."""
+    pose = Pose(SE3(rotation, np.zeros((len(angles), 3))), angles, np.asarray(size, float))
+    pose.root.translation[:] -= pose.joints(skeleton).mean(axis=1)
+    return pose
+
+
+def moving_session(
+    seed: int | list[int],
+    n_frames: int,
+    *,
+    habits: GenericHabits,
+    sensor: Sensor | None = None,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    thing_share: float = 0.0,
+    spine_mm: float | None = None,
+    name: str = "moving",
+) -> SyntheticSession:
+    """n_frames of one animal that goes about and changes its posture; arguments as in `SyntheticSession.draw`."""
+    rng = np.random.default_rng(seed)
+    skeleton, sensor = habits.skeleton, sensor or habits.sensors[-1]
+    length = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    stage = Stage.draw(rng, sensor.camera, length, habits.setting)
+    shape = habits.shapes(rng, family, 1)
+    step_s = habits.frame_ns * 1e-9
+    size, slow = np.full(n_frames, length / skeleton.length), _CHANGE_S / step_s
+    change = np.maximum.accumulate(np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0))
+    drawn = draw_angles(rng, skeleton, n_frames)[change].reshape(n_frames, -1)
+    angles = smoothed(drawn, 0.4 * slow).reshape(n_frames, -1, 3)
+    speed = np.maximum(smoothed(rng.normal(0.4, 0.8, (n_frames, 1)), slow)[:, 0], 0.0)
+    turning = smoothed(rng.normal(0.0, 3.0, (n_frames, 1)), slow)[:, 0]
+    level, body = np.zeros(n_frames), shape[0].broadcast(n_frames)
+    flat = _centred(skeleton, angles, root_rotation(level, level, level), size)
+    low, high = habits._extent(flat, body, size)
+    top = _NEAR_SHARE * float(stage.T_arena_camera.translation[2]) - float(high.max()) if habits.floats else 0.0
+    water = (-float(low.min()) + 1.0, max(top, -float(low.min()) + 1.0))
+    position, heading = wander(rng, stage, length, speed, turning, level, water, step_s)
+    pose = _centred(skeleton, angles, root_rotation(heading, level, level), size)
+    pose.root.translation[:] += position
+    if not habits.floats:
+        pose.root.translation[:, 2] -= position[:, 2] + low
+    cast = assemble(rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False)
+    return SyntheticSession(name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns)

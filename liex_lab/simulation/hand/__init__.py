@@ -1,0 +1,1 @@
+"""The virtual hand: its postures, its gestures, the scene around it."""

@@ -1,0 +1,56 @@
+"""How a hand goes from gesture to gesture: along geodesics, as fast as people do, with a rest in each."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import so3
+from liex_lab.simulation.hand.pose_prior import draw_seen
+
+Array = NDArray[np.float64]
+
+# at the fastest moment of a move: the palm's turning and the quickest finger joint's, rad/s, and the palm's way, mm/s
+_TURN, _BEND, _GO = (2.0, 6.0), (5.0, 12.0), (200.0, 700.0)
+_SHORTEST_S, _REST_S = 0.25, (0.0, 0.6)
+_WRIST_RAD = np.radians([0.0, 22.0, 12.0])  # how a wrist is bent
+_NEARER, _ASIDE_MM = (0.93, 1.07), 15.0  # where gestures are made, beside the middle of them all
+
+
+class Gestures(NamedTuple):
+    """N moments: angles (n, J, 3); turns (n, 3, 3): T_view_palm; places (n, 3) mm, camera frame; wrists (n, 3) rad."""
+
+    angles: Array
+    turns: Array
+    places: Array
+    wrists: Array
+
+
+def draw_gestures(rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: float, middle: Array) -> Gestures:
+    """N moments of somebody who goes through postures that were seen, about a point (3,) mm of the camera frame.
+
+    Each move lasts as long as its longest part, turning, bending or going, takes at a speed drawn for it.
+    """
+    keys = 2 + int(n * step_s / _SHORTEST_S)
+    angles, turns = draw_seen(rng, skeleton, keys)
+    places = middle * rng.uniform(*_NEARER, (keys, 1)) + rng.normal(0.0, _ASIDE_MM, (keys, 3))
+    wrists = rng.normal(0.0, 1.0, (keys, 3)) * _WRIST_RAD
+    turning = so3.log(np.swapaxes(turns[:-1], 1, 2) @ turns[1:])
+    bending, going, leaning = (np.diff(values, axis=0) for values in (angles, places, wrists))
+    longest = np.stack([
+        np.linalg.norm(turning, axis=-1) / rng.uniform(*_TURN, keys - 1),
+        np.abs(bending).max(axis=(1, 2)) / rng.uniform(*_BEND, keys - 1),
+        np.linalg.norm(going, axis=-1) / rng.uniform(*_GO, keys - 1),
+    ]).max(axis=0)  # fmt: skip
+    moves = np.maximum(0.5 * np.pi * longest, _SHORTEST_S)  # the fastest moment of a cosine is pi/2 times the mean
+    starts = np.concatenate([[0.0], np.cumsum(moves + rng.uniform(*_REST_S, keys - 1))])
+    now = step_s * np.arange(n)
+    at = np.clip(np.searchsorted(starts, now, side="right") - 1, 0, keys - 2)
+    share = 0.5 - 0.5 * np.cos(np.pi * np.clip((now - starts[at]) / moves[at], 0.0, 1.0))[:, None]
+    return Gestures(
+        angles[at] + share[..., None] * bending[at], turns[at] @ so3.exp(share * turning[at]),
+        places[at] + share * going[at], wrists[at] + share * leaning[at],
+    )  # fmt: skip

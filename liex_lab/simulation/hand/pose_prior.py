@@ -1,0 +1,170 @@
+"""The postures of hands: what people were seen to do with them, as statistics to draw from, and what a hand can do.
+
+`hand_postures.toml` beside this module says where the statistics come from; `distil` makes them.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import so3
+
+Array = NDArray[np.float64]
+
+STATISTICS = Path(__file__).with_name("pose_prior.toml")
+_N_POSTURES, _N_TURNS, _N_AXES = 8, 8, 6
+_FREE_SHARE = 0.45  # of the training postures are what a hand can do, not what was seen
+_FAN_DEG = {"index": 10.0, "middle": 1.0, "ring": -8.0, "little": -19.0}  # how fingers part when a hand is spread
+_BLEND_SHARE = 0.3  # of the seen ones lie between two
+
+
+@dataclass(frozen=True)
+class HandPostures:
+    """A mixture of K kinds of postures and M of orientation. Angles in rad, D free angles in the skeleton's order.
+
+    share (K,); mean (K, D); axes (K, A, D): principal deviations, one standard deviation long; rest (K, D): standard
+    deviation of what they leave. turn_share (M,); turn (M, 3, 3): T_view_palm, the view's z axis pointing at the
+    viewer; turn_axes (M, 3, 3): deviations from it, one standard deviation long, in the palm's frame, as rows.
+    """
+
+    share: Array
+    mean: Array
+    axes: Array
+    rest: Array
+    turn_share: Array
+    turn: Array
+    turn_axes: Array
+
+    @staticmethod
+    @cache
+    def load() -> HandPostures:
+        """The statistics that come with the package."""
+        table = tomllib.loads(STATISTICS.read_text(encoding="utf-8"))
+        postures, turns = table["postures"], table["turns"]
+        return HandPostures(
+            np.array([p["share"] for p in postures]),
+            np.radians([p["mean_deg"] for p in postures]),
+            np.radians([p["axes_deg"] for p in postures]),
+            np.radians([p["rest_deg"] for p in postures]),
+            np.array([t["share"] for t in turns]),
+            so3.exp(np.radians([t["turn_deg"] for t in turns])),
+            np.radians([t["axes_deg"] for t in turns]),
+        )
+
+    def draw_angles(self, rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
+        """Postures (n, J, 3) as they were seen."""
+        k = rng.choice(len(self.share), n, p=self.share / self.share.sum())
+        along = np.einsum("na,nad->nd", rng.standard_normal((n, self.axes.shape[1])), self.axes[k])
+        values = self.mean[k] + along + rng.standard_normal((n, self.mean.shape[1])) * self.rest[k]
+        return _within_limits(skeleton, values)
+
+    def draw_turns(self, rng: np.random.Generator, n: int) -> Array:
+        """Orientations (n, 3, 3) of the palm towards the viewer, as they were seen."""
+        k = rng.choice(len(self.turn_share), n, p=self.turn_share / self.turn_share.sum())
+        return self.turn[k] @ so3.exp(np.einsum("na,nad->nd", rng.standard_normal((n, 3)), self.turn_axes[k]))
+
+
+def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
+    """Angles (n, J, 3) and T_view_palm (n, 3, 3) of hands as they were seen."""
+    postures = HandPostures.load()
+    return postures.draw_angles(rng, skeleton, n), postures.draw_turns(rng, n)
+
+
+def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
+    """Angles (n, J, 3) and T_view_palm (n, 3, 3) of hands as they were seen, between two of these, or quite free."""
+    postures = HandPostures.load()
+    seen, other = postures.draw_angles(rng, skeleton, n), postures.draw_angles(rng, skeleton, n)
+    t = np.where(rng.random(n) < _BLEND_SHARE, rng.random(n), 0.0)[:, None, None]
+    angles, turns = (1.0 - t) * seen + t * other, postures.draw_turns(rng, n)
+    free = rng.random(n) < _FREE_SHARE
+    angles[free] = free_angles(rng, skeleton, int(free.sum()))
+    free = rng.random(n) < _FREE_SHARE
+    turns[free] = free_turns(rng, int(free.sum()))
+    return angles, turns
+
+
+def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
+    """Postures (n, J, 3) in which every finger is bent, stretched or in between on its own, or all alike."""
+    angles = np.zeros((n, skeleton.n_joints, 3))
+    alike, together = rng.random((n, 1)) < 0.35, rng.random((n, 1))
+    each = np.clip(rng.beta(0.5, 0.5, (n, 4)), 0.0, 1.0)
+    bent = np.clip(np.where(alike, together, each) + rng.normal(0.0, 0.05, (n, 4)), 0.0, 1.0)
+    spread = rng.uniform(-0.6, 1.6, n)  # fingers closed up, or fanned out
+    for f, (finger, fan) in enumerate(_FAN_DEG.items()):
+        root, middle, end = (skeleton.names.index(f"{finger}_{part}") for part in ("root", "middle", "end"))
+        curl = bent[:, f]
+        angles[:, root, 1] = np.radians(-8.0 + 80.0 * curl * rng.uniform(0.2, 1.1, n) + rng.normal(0.0, 8.0, n))
+        angles[:, root, 2] = np.radians(fan * spread + rng.normal(0.0, 7.0, n)) * (1.0 - 0.7 * curl)
+        angles[:, middle, 1] = np.radians(100.0 * curl + rng.normal(0.0, 8.0, n))
+        angles[:, end, 1] = angles[:, middle, 1] * rng.uniform(0.4, 0.8, n) + np.radians(rng.normal(0.0, 6.0, n))
+    root, middle, end = (skeleton.names.index(f"thumb_{part}") for part in ("root", "middle", "end"))
+    for joint, axis, low, high in ((root, 1, -28, 50), (root, 2, -25, 25), (middle, 1, -5, 65), (end, 1, -15, 75)):
+        angles[:, joint, axis] = np.radians(rng.uniform(low, high, n))
+    return _clipped(skeleton, angles)
+
+
+def free_turns(rng: np.random.Generator, n: int) -> Array:
+    """Orientations (n, 3, 3): palm or back towards the viewer, tilted any way, turned by any angle in the picture."""
+    spin = np.zeros((n, 3))
+    spin[:, 2] = rng.uniform(-np.pi, np.pi, n)
+    tilt = np.zeros((n, 3))
+    tilt[:, :2] = np.radians(rng.normal(0.0, 35.0, (n, 2)))
+    # the palm's z axis leaves through the back of the hand: turned about its long axis it points away from the viewer
+    over = np.zeros((n, 3))
+    over[:, 0] = np.where(rng.random(n) < 0.7, np.pi, 0.0)
+    return so3.exp(spin) @ so3.exp(tilt) @ so3.exp(over)
+
+
+def _within_limits(skeleton: Skeleton, values: Array) -> Array:
+    """Free angles (n, D) as rotation vectors (n, J, 3) within the joints' limits."""
+    angles = np.zeros((len(values), skeleton.n_joints, 3))
+    angles[:, _free(skeleton)] = values
+    return _clipped(skeleton, angles)
+
+
+def _clipped(skeleton: Skeleton, angles: Array) -> Array:
+    return np.clip(angles, skeleton.limits[..., 0], skeleton.limits[..., 1])
+
+
+def _free(skeleton: Skeleton) -> NDArray[np.bool_]:
+    """(J, 3) the angles that a posture consists of."""
+    free = skeleton.axes.copy()
+    free[0] = False
+    return free
+
+
+def distil(skeleton: Skeleton, angles: Array, turns: Array) -> str:
+    """The content of hand_postures.toml for observed angles (n, J, 3) and T_view_palm (n, 3, 3)."""
+    from sklearn.cluster import KMeans
+
+    values = angles[:, _free(skeleton)]
+    lines = []
+    kind = KMeans(_N_POSTURES, n_init=10, random_state=0).fit_predict(values)
+    for k in range(_N_POSTURES):
+        rows = values[kind == k]
+        mean = rows.mean(axis=0)
+        _, sd, axes = np.linalg.svd(rows - mean, full_matrices=False)
+        axes = axes[:_N_AXES] * (sd[:_N_AXES, None] / np.sqrt(len(rows)))
+        rest = np.sqrt(np.maximum((rows - mean).var(axis=0) - (axes**2).sum(axis=0), 0.0))
+        lines += ["[[postures]]", f"share = {len(rows) / len(values):.4f}", f"mean_deg = {_degrees(mean)}",
+                  f"axes_deg = {_degrees(axes)}", f"rest_deg = {_degrees(rest)}", ""]  # fmt: skip
+    kind = KMeans(_N_TURNS, n_init=10, random_state=0).fit_predict(turns.reshape(-1, 9))
+    for k in range(_N_TURNS):
+        group = turns[kind == k]
+        mean = so3.mean(group)
+        off = so3.log(mean.T @ group)
+        _, sd, axes = np.linalg.svd(off, full_matrices=False)
+        lines += ["[[turns]]", f"share = {len(group) / len(turns):.4f}", f"turn_deg = {_degrees(so3.log(mean))}",
+                  f"axes_deg = {_degrees(axes * (sd[:, None] / np.sqrt(len(group))))}", ""]  # fmt: skip
+    return "\n".join(lines)
+
+
+def _degrees(values: Array) -> list[float]:
+    return np.degrees(values).round(1).tolist()

@@ -1,0 +1,269 @@
+"""The world of the hand: training windows, test splits and gestures, rendered before an NYU camera, with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.arena.floor import Floor
+from liex_lab.body.hand_shape import HandShape, draw_hands
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Surface
+from liex_lab.errors import LiexError
+from liex_lab.foreground.hand_segmenter import sight_rotations
+from liex_lab.geometry import SE3
+from liex_lab.recordings.formats.images.nyu_labels import (
+    N_FIRST_PERSON,
+    NYU_CAMERA,
+    REFERENCE_FILE,
+    NyuReference,
+    fit_hands,
+)
+from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
+from liex_lab.simulation.hand import scene as stage
+from liex_lab.simulation.hand.gestures import draw_gestures
+from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
+from liex_lab.simulation.pose_prior import SIZE_RANGE
+from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
+from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingWindows, _degrade
+
+Array = NDArray[np.float64]
+
+NYU_SENSOR = Sensor("NYU Kinect", NYU_CAMERA, PRIMESENSE_KIND)
+FRAME_NS = 33_333_333
+N_SESSIONS, N_FRAMES = 40, 50
+# name: (own seed, shape family, noise, eroded pixels, share of frames with another object beside the hand)
+SPLITS = {
+    "clean": (81_001, "train", 1.0, 0, 0.0),
+    "hard": (82_001, "train", 2.0, 1, 0.5),
+    "other-body": (84_001, "other", 1.0, 0, 0.0),
+}
+# training pictures: (sensor, pixels of it that one pixel stands for, nearest and farthest hand, share)
+_KINDS = (
+    (NYU_SENSOR, 1, 620.0, 1200.0, 0.55),
+    (NYU_SENSOR, 2, 400.0, 700.0, 0.20),
+    (KINECT_V2_SENSOR, 1, 400.0, 1000.0, 0.25),
+)
+_THING_SHARE = 0.15
+_LEAST_PX = 320  # a side of the pictures that windows are cut from
+_FLAT = np.array([0.0, 0.0, 1.0])
+_FLOOR_MM = 1300.0  # where the plane stands that is taken for the arena's floor
+
+
+class HandSession(TrueRecording):
+    """A virtual recording of one person's hand; the joints are the person's own."""
+
+    def __init__(
+        self, name: str, skeleton: Skeleton, sensor: Sensor, cast: stage.HandCast,
+        times_ns: NDArray[np.int64] | None = None,
+    ) -> None:  # fmt: skip
+        n = len(cast.seeds)
+        times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
+        super().__init__(name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth)
+        self.skeleton, self.sensor, self.cast, self.surface = skeleton, sensor, cast, Surface.of(skeleton)
+        self.spine_mm = float(cast.spine_mm[0])
+        self.floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
+        self.T_arena_camera = self.floor.T_arena_camera
+        self.pose, self.joints_camera = cast.pose, cast.joints
+        self.joints_arena = self.T_arena_camera @ cast.joints
+
+    def _depth(self, index: int) -> Depth:
+        return self.depths(index, index + 1)[0]
+
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        c, part = self.camera, self.cast[slice(start, stop)]
+        n = len(part.seeds)
+        intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n, 4)).copy()
+        size = np.broadcast_to(np.array([c.width, c.height]), (n, 2)).copy()
+        faces = stage.hand_faces(self.skeleton)
+        return part.pictures(faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)).astype(
+            np.float32
+        )
+
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        for start in range(first, len(self), n_frames):
+            stop = min(start + n_frames, len(self))
+            depths = self.depths(start, stop)
+            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+
+
+@dataclass(frozen=True)
+class HandWorld:
+    """Somebody's right hand before a depth camera.
+
+    reference: the folder with labelled hands from which the test postures come, the second person's; None draws them
+    from the statistics of the first.
+    """
+
+    skeleton: Skeleton
+    reference: Path | None = None
+    splits: tuple[str, ...] = tuple(SPLITS)
+
+    @property
+    def protocol(self) -> str:
+        """What to say of the test splits beside figures measured on them."""
+        how = (
+            "each of another person's right hand before an NYU camera; the hand and its size are found by the product, "
+            "nothing is handed over; flips are told by the direction from the palm to the wrist. "
+        )
+        if self.reference is None:
+            return f"{how}Postures: drawn from statistics of one person's hand, as part of the training pictures are. "
+        return (
+            f"{how}Postures: fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on, a person after "
+            "whom no training picture is drawn. "
+        )
+
+    @property
+    def sources(self) -> str:
+        """What the training images were made from."""
+        return (
+            "rendered from a seed; postures partly drawn from statistics of labelled points of the NYU Hand Pose test "
+            f"frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
+        )
+
+    def training_blocks(
+        self, seed: int, n_blocks: int, *, first: int = 0, family: str = "train", noise: float = 1.0,
+        erosion_px: int = 0, degraded_share: float = 0.0, spine_mm: float | None = None, window_px: int = 320,
+        parallel: bool = True,
+    ) -> Iterator[TrainingWindows]:  # fmt: skip
+        """Blocks of training images; see `windows.training_blocks`."""
+        for number in range(first, first + n_blocks):
+            rng = np.random.default_rng([seed, number, 1])
+            yield self._block(rng, number, family, noise, erosion_px, degraded_share, spine_mm, window_px, parallel)
+
+    def _block(
+        self, rng: np.random.Generator, number: int, family: str, noise: float, erosion_px: int, degraded_share: float,
+        spine_mm: float | None, window_px: int, parallel: bool,
+    ) -> TrainingWindows:  # fmt: skip
+        """The images of one block."""
+        skeleton, n, m = self.skeleton, BLOCK, BLOCK // PER_SESSION
+        each = np.repeat(np.arange(m), PER_SESSION)
+        kind, intrinsics, picture, parameters = _draw_cameras(rng, m, noise, erosion_px)
+        _degrade(rng, parameters, degraded_share)
+        shape = draw_hands(rng, skeleton, family, m)[each]
+        nominal = 1.0 if spine_mm is None else spine_mm / skeleton.length
+        size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
+        low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind[each]]
+        angles, turns = draw_wide(rng, skeleton, n)
+        places = stage.draw_places(rng, intrinsics[each], picture[each].astype(float), low, high)
+        pose = stage.hold_out(rng, skeleton, angles, turns, size, places)
+        cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics[each], parameters[each], _THING_SHARE,
+                              PER_SESSION)  # fmt: skip
+        uv = cast.hand[..., :2] / cast.hand[..., 2:] * intrinsics[each][:, None, :2] + intrinsics[each][:, None, 2:]
+        shift = rng.uniform(-0.08, 0.08, (n, 2)) * window_px
+        origin = np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + shift).astype(np.int64)
+        origin = np.clip(origin, 0, np.maximum(picture[each] - window_px, 0))  # an arm leaves a window as a picture
+        depth = cast.pictures(stage.hand_faces(skeleton), intrinsics[each], picture[each], origin,
+                              (window_px, window_px), parallel)  # fmt: skip
+        flat = np.zeros((n, 3))
+        return TrainingWindows(
+            depth, np.broadcast_to(np.zeros(1, np.uint16), depth.shape), origin.astype(np.int32), intrinsics[each],
+            flat, flat, SE3.identity(n), pose.root, pose.angles, pose.scale, cast.joints, cast.spine_mm,
+            number * m + each, kind[each], np.zeros(n, np.int64), own_bones=True,
+        )  # fmt: skip
+
+    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS) -> list[HandSession]:
+        """The recordings of a split, 40 of 50 independent frames, each of another person."""
+        if name not in SPLITS:
+            raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
+        seed, family, noise, erosion_px, thing_share = SPLITS[name]
+        return [
+            self._session([seed, k], f"{name}-{k:02d}", family, noise, erosion_px, thing_share, spine_mm)
+            for k in range(n_sessions)
+        ]
+
+    def _session(
+        self, seed: list[int], name: str, family: str, noise: float, erosion_px: int, thing_share: float,
+        spine_mm: float | None,
+    ) -> HandSession:  # fmt: skip
+        """Independent frames of one person."""
+        rng = np.random.default_rng(seed)
+        n, camera = N_FRAMES, NYU_SENSOR.camera
+        drawn = float(rng.uniform(*SIZE_RANGE))
+        size = np.full(n, drawn if spine_mm is None else spine_mm / self.skeleton.length)
+        shape = _same(draw_hands(rng, self.skeleton, family, 1), n)
+        angles, turns = self._test_postures(rng, n)
+        intrinsics = np.broadcast_to(np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (n, 4)).copy()
+        picture = np.broadcast_to(np.array([camera.width, camera.height]), (n, 2)).copy()
+        low, high = np.full((2, n), np.array(stage.DISTANCE_MM)[:, None])
+        pose = stage.hold_out(rng, self.skeleton, angles, turns, size,
+                              stage.draw_places(rng, intrinsics, picture.astype(float), low, high))  # fmt: skip
+        parameters = np.repeat(NYU_SENSOR.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
+        cast = stage.assemble(rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1)
+        return HandSession(name, self.skeleton, NYU_SENSOR, cast)
+
+    def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
+        """Angles (n, J, 3) and T_view_palm (n, 3, 3) that no training picture was drawn after, where there are any."""
+        if self.reference is None:
+            return draw_seen(rng, self.skeleton, n)
+        truth = NyuReference.load(self.reference).truth
+        rows = N_FIRST_PERSON + rng.choice(len(truth) - N_FIRST_PERSON, n, replace=False)
+        pose = fit_hands(self.skeleton, truth[rows]).pose
+        return pose.angles, sight_rotations(pose.root.translation) @ pose.root.rotation
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
+        """A hand that goes from one gesture to the next; settings: sensor, family, noise, erosion_px, thing_share,
+        spine_mm and name as in `walking.walking_session`.
+        """
+        return gesture_session(self.skeleton, seed, n_frames, **settings)
+
+
+def find_reference() -> Path | None:
+    """The folder of labelled hands beside the repository or the current folder, where there is one."""
+    for base in (Path.cwd(), Path(__file__).resolve().parents[3]):
+        folder = base.parent / "shared" / "data" / "hand_nyu"
+        if (folder / REFERENCE_FILE).is_file():
+            return folder
+    return None
+
+
+def gesture_session(
+    skeleton: Skeleton, seed: int | list[int], n_frames: int, *, sensor: Sensor = NYU_SENSOR, family: str = "train",
+    noise: float = 1.0, erosion_px: int = 0, thing_share: float = 0.0, spine_mm: float | None = None,
+    name: str = "gestures",
+) -> HandSession:  # fmt: skip
+    """N frames at 30 a second of one person who goes from gesture to gesture, holding each for a moment."""
+    rng = np.random.default_rng(seed)
+    drawn = float(rng.uniform(*SIZE_RANGE))
+    size = np.full(n_frames, drawn if spine_mm is None else spine_mm / skeleton.length)
+    shape = _same(draw_hands(rng, skeleton, family, 1), n_frames)
+    c = sensor.camera
+    intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n_frames, 4)).copy()
+    picture = np.array([[c.width, c.height]], float)
+    (middle,) = stage.draw_places(rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0]))
+    moving = draw_gestures(rng, skeleton, n_frames, FRAME_NS * 1e-9, middle)
+    pose = stage.hold_out(rng, skeleton, moving.angles, moving.turns, size, moving.places)
+    parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0)
+    cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics, parameters, thing_share, n_frames,
+                          moving.wrists)  # fmt: skip
+    return HandSession(name, skeleton, sensor, cast)
+
+
+def _same(shape: HandShape, n: int) -> HandShape:
+    """One person's hand in n pictures."""
+    return shape[np.zeros(n, np.int64)]
+
+
+def _draw_cameras(
+    rng: np.random.Generator, m: int, noise: float, erosion_px: int
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
+    """Kind (m,), intrinsics (m, 4), picture size (m, 2) and sensor parameters (m, N_PARAMETERS) of m cameras."""
+    kind = rng.choice(len(_KINDS), m, p=[k[4] for k in _KINDS])
+    focal, axis = rng.uniform(0.97, 1.03, (m, 1)), rng.normal(0.0, 4.0, (m, 2))
+    intrinsics, picture, parameters = np.empty((m, 4)), np.empty((m, 2), np.int64), np.empty((m, 0))
+    for k, (sensor, coarse, *_) in enumerate(_KINDS):
+        rows, c = kind == k, sensor.camera
+        drawn = sensor.draw(rng, m, np.zeros(m), noise, erosion_px)
+        parameters = np.where(rows[:, None], drawn, parameters) if parameters.size else drawn
+        whole = np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
+        intrinsics[rows], picture[rows] = whole[rows], (c.width // coarse, max(c.height // coarse, _LEAST_PX))
+    return kind, intrinsics, picture, parameters

@@ -1,0 +1,243 @@
+"""Synthetic recordings in which an animal moves as one: a mouse walks, turns, pauses, rears, hunches and curls; a fish
+scoots, glides, turns, rises, dives and rests; any animal wanders through its place and stays within the picture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.simulation.fish import FishHabits, bend_profile, clearance, hung
+from liex_lab.simulation.pose_prior import KINDS, Posture, draw_postures, root_rotation, stand
+from liex_lab.simulation.recording import SyntheticSession, assemble
+from liex_lab.simulation.scene import Stage, floor_point
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, RAYTRIX_R5_SENSOR, Sensor
+from liex_lab.simulation.species import MouseHabits
+
+Array = NDArray[np.float64]
+
+_RATE_HZ = 30.0
+# the stretches of a walk: how many in a shuffled deck, shortest and longest duration in s, speed in spines a second
+_WALK, _CURL, _REAR, _HUNCH, _REACH = range(len(KINDS))
+_STRETCHES = {
+    _WALK: (4, 0.7, 3.0, (0.6, 2.8)),
+    _CURL: (1, 0.5, 1.5, (0.0, 0.6)),
+    _REAR: (2, 0.7, 2.0, (0.0, 0.0)),
+    _HUNCH: (1, 1.0, 3.0, (0.0, 0.0)),
+    _REACH: (2, 0.4, 1.2, (0.0, 0.4)),
+}
+_BLEND_S = 0.12  # postures flow into one another over about this long
+_STRIDE_HZ_PER_SPINE = 1.6
+
+_NEAREST_MM = 180.0  # to the camera
+_BOUT_S, _REST_S = (0.15, 0.6), (0.1, 1.2)  # of beating, and of gliding or hanging still between
+_GLIDE_S = 0.35  # a glide has slowed down by a factor e after this long
+_LENGTHS_S = (1.0, 5.0)  # speed that a bout reaches
+_BEAT_HZ = (4.0, 9.0)
+_TURN_SHARE, _TURN_RAD_S = 0.35, (4.0, 16.0)  # of the bouts begin with a turn, which lasts _TURN_S
+_TURN_S = 0.14
+_BEND_PER_TURN = 0.55  # degrees a joint for each rad/s of turning
+_CLIMB_RAD = np.radians(25.0)
+
+
+def walking_session(
+    seed: int | list[int],
+    n_frames: int,
+    *,
+    sensor: Sensor = KINECT_V2_SENSOR,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    thing_share: float = 0.0,
+    spine_mm: float | None = None,
+    habits: MouseHabits | None = None,
+    name: str = "walking",
+) -> SyntheticSession:
+    """n_frames of one animal at 30 frames/s, drawn from the seed; arguments as in `SyntheticSession.draw`."""
+    rng = np.random.default_rng(seed)
+    habits = MouseHabits() if habits is None else habits
+    skeleton = habits.skeleton
+    spine = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    stage = Stage.draw(rng, sensor.camera, spine)
+    shape = habits.shapes(rng, family, 1)
+    kinds, spines_per_s = _walk_script(rng, n_frames)
+    posture = _flow(rng, skeleton, shape[0].broadcast(n_frames), kinds)
+    position, heading = _path(rng, stage, spine, spines_per_s * spine)
+    # the trunk sways with the stride
+    phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
+    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [1.0, -0.5, -0.5]
+    pose, girth = stand(
+        skeleton, posture, heading, np.full(n_frames, spine / skeleton.length), shape[0].broadcast(n_frames),
+        _smooth(rng.uniform(0.0, 3.0, n_frames)[:, None])[:, 0],
+    )  # fmt: skip
+    middle = pose.joints(skeleton)[..., :2].mean(axis=1)
+    pose.root.translation[:, :2] += position - middle
+    cast = assemble(rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, False)
+    assert cast.bends is not None  # mice have tails
+    cast.bends[:] = cast.bends[:1] + 4.0 * _smooth(rng.normal(0.0, 0.05, cast.bends.shape))
+    return SyntheticSession(name, stage, cast)
+
+
+def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
+    """What the animal does in each frame (n,), and how fast it goes (n,) spines/s."""
+    kinds, speed = np.empty(n, np.int64), np.empty(n)
+    deck: list[int] = []
+    at = 0
+    while at < n:
+        if not deck:  # dealt out before it is shuffled again, so that nothing is long absent
+            deck = [int(k) for k in rng.permutation(np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(5)]))]
+        kind = deck.pop()
+        _, shortest, longest, (slow, fast) = _STRETCHES[kind]
+        stop = at + int(_RATE_HZ * rng.uniform(shortest, longest))
+        kinds[at:stop], speed[at:stop] = kind, rng.uniform(slow, fast)
+        at = stop
+    return kinds, np.maximum(_smooth(speed[:, None])[:, 0], 0.0)
+
+
+def _flow(rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]) -> Posture:
+    """One posture a stretch, held with slow changes within it, and blended where the next begins."""
+    drawn = draw_postures(rng, skeleton, kinds, shape)
+    n = len(kinds)
+    change = np.concatenate([[True], (kinds[1:] != kinds[:-1]) | (rng.random(n - 1) < 0.04)])
+    keep = np.maximum.accumulate(np.where(change, np.arange(n), 0))
+    rows = [drawn.elevation, drawn.turn, drawn.roll[:, None], drawn.stretch[:, None]]
+    elevation, turn, roll, stretch = (_smooth(row[keep]) for row in rows)
+    return Posture(elevation, turn, roll[:, 0], stretch[:, 0])
+
+
+def _smooth(rows: Array) -> Array:
+    """Columns of (n, k) passed through a bell of _BLEND_S, ends held."""
+    reach = int(4 * _BLEND_S * _RATE_HZ)
+    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_BLEND_S * _RATE_HZ)) ** 2)
+    padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
+    return np.stack([np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1)
+
+
+def _path(rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array) -> tuple[Array, Array]:
+    """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back before a wall."""
+    n, camera = len(speed), stage.camera
+    middle = floor_point(camera, stage.T_arena_camera, np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]))
+    home = stage.centre if stage.freedom(stage.centre) > stage.freedom(middle) else middle
+    margin = min(0.85 * spine_mm, 0.7 * stage.freedom(home))
+    position, heading = np.empty((n, 2)), np.empty(n)
+    at, way, rate = home + rng.normal(0.0, 0.2 * margin, 2), rng.uniform(-np.pi, np.pi), 0.0
+    for i in range(n):
+        rate = 0.93 * rate + rng.normal(0.0, 0.25)
+        back = np.arctan2(home[1] - at[1], home[0] - at[0])
+        away = (back - way + np.pi) % (2 * np.pi) - np.pi
+        close = np.clip(1.0 - (stage.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
+        # it turns back faster the faster it goes, and stays within a mouse's turning rate
+        pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
+        way += np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
+        step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
+        if stage.freedom(at + step) > margin or stage.freedom(at + step) > stage.freedom(at):
+            at = at + step
+        position[i], heading[i] = at, way
+    return position, heading
+
+
+def swimming_session(
+    seed: int | list[int],
+    n_frames: int,
+    *,
+    sensor: Sensor = RAYTRIX_R5_SENSOR,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    thing_share: float = 0.0,
+    spine_mm: float | None = None,
+    habits: FishHabits | None = None,
+    name: str = "swimming",
+) -> SyntheticSession:
+    """n_frames of one fish at 50 frames/s, drawn from the seed; arguments as in `SyntheticSession.draw`."""
+    rng = np.random.default_rng(seed)
+    habits = FishHabits() if habits is None else habits
+    skeleton = habits.skeleton
+    length = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    stage = Stage.draw(rng, sensor.camera, length, habits.setting)
+    shape = habits.shapes(rng, family, 1)
+    step_s = habits.frame_ns * 1e-9
+    speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
+    middle = np.full(n_frames, 0.47)
+    # a turn begins in front and leaves the body at the tail; the wave runs from head to tail
+    hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
+    yaw = bend_profile(
+        skeleton, _BEND_PER_TURN * turning, 1.3 * _BEND_PER_TURN * hind, amplitude, beat, np.ones(n_frames), middle,
+        smoothed(rng.normal(0.0, 0.8, (n_frames, 4)), 6.0),
+    )  # fmt: skip
+    size = np.full(n_frames, length / skeleton.length)
+    pitch = _CLIMB_RAD * np.tanh(smoothed(rng.normal(0.0, 6.0, (n_frames, 1)), 25.0)[:, 0])
+    roll = np.radians(smoothed(rng.normal(0.0, 12.0, (n_frames, 1)), 8.0)[:, 0])
+    level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
+    low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
+    top = max(float(stage.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
+    position, heading = wander(rng, stage, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s)
+    pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
+    pose.root.translation[:] += position
+    cast = assemble(rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False)
+    return SyntheticSession(name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns)
+
+
+def _swim_script(rng: np.random.Generator, n: int, step_s: float) -> tuple[Array, Array, Array, Array]:
+    """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,) rad of the tail."""
+    speed, turning, amplitude, rate = np.zeros((4, n))
+    at, pace = 0, 0.0
+    while at < n:
+        reached, beats = rng.uniform(*_LENGTHS_S), rng.uniform(*_BEAT_HZ)
+        beating, resting = (max(2, int(rng.uniform(*span) / step_s)) for span in (_BOUT_S, _REST_S))
+        stop = min(at + beating, n)
+        pace = max(reached, pace)
+        speed[at:stop] = pace
+        amplitude[at:stop], rate[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1]), beats
+        if rng.random() < _TURN_SHARE:
+            brief = min(at + max(2, int(_TURN_S / step_s)), n)
+            turning[at:brief] = rng.choice([-1.0, 1.0]) * rng.uniform(*_TURN_RAD_S)
+        glide = np.arange(max(0, min(resting, n - stop)))
+        speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / _GLIDE_S)
+        pace *= float(np.exp(-resting * step_s / _GLIDE_S))
+        at = stop + resting
+    turning = smoothed(turning[:, None], 1.2)[:, 0] + smoothed(rng.normal(0.0, 3.0, (n, 1)), 12.0)[:, 0]
+    amplitude = smoothed(amplitude[:, None], 2.0)[:, 0]
+    return smoothed(speed[:, None], 1.5)[:, 0], turning, amplitude, 2 * np.pi * np.cumsum(rate) * step_s
+
+
+def wander(
+    rng: np.random.Generator, stage: Stage, length: float, speed: Array, turning: Array, pitch: Array,
+    water: tuple[float, float], step_s: float,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Positions (n, 3) mm of the body's middle between two heights of the water, and headings (n,) rad.
+
+    The fish turns away from walls and from the border of the picture; where there is no way on it stays.
+    """
+    n = len(speed)
+    centre = stage.camera.unproject([(stage.camera.width - 1) / 2, (stage.camera.height - 1) / 2], 1.0)
+    ray = stage.T_arena_camera.rotation @ centre
+    low, high = water
+    z = rng.uniform(low, high)
+    home = (stage.T_arena_camera.translation + ray * (stage.T_arena_camera.translation[2] - z) / -ray[2])[:2]
+    margin = 0.6 * length
+    position, headings = np.empty((n, 3)), np.empty(n)
+    xy, way = home + rng.normal(0.0, 0.1 * length, 2), rng.uniform(-np.pi, np.pi)
+    for i in range(n):
+        back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
+        away = (back - way + np.pi) % (2 * np.pi) - np.pi
+        close = np.clip(1.0 - (stage.freedom(xy, z) - margin) / (0.8 * length), 0.0, 1.0)
+        way += (turning[i] + 8.0 * close * np.clip(away, -1.0, 1.0)) * step_s
+        run = speed[i] * length * step_s
+        step = run * np.cos(pitch[i]) * np.array([np.cos(way), np.sin(way)])
+        free = stage.freedom(xy + step, z)
+        if free > margin or free > stage.freedom(xy, z):
+            xy = xy + step
+        z = float(np.clip(z + run * np.sin(pitch[i]), low, high))
+        position[i], headings[i] = [*xy, z], way
+    return position, headings
+
+
+def smoothed(rows: Array, frames: float) -> Array:
+    """Columns of (n, k) passed through a bell of that many frames, ends held."""
+    reach = int(4 * frames)
+    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
+    padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
+    return np.stack([np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1)

@@ -1,0 +1,171 @@
+"""The postures a mouse-like animal takes: a prior to draw from, every one of them standing on the floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from liex_lab.body._skinning_kernels import chain_arc, spine_frame
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import SE3, so3
+
+Array = NDArray[np.float64]
+
+# share of frames: going about, curled up, reared up, hunched (grooming, eating), reaching with the head
+KINDS = ("walk", "curl", "rear", "hunch", "reach")
+SHARES = (0.42, 0.17, 0.17, 0.10, 0.14)
+STRETCH = (0.93, 1.07)  # of the spine, from frame to frame
+SIZE_RANGE = (0.9, 1.1)  # of animals, over the skeleton's own size
+_REAR_PART = 0.35  # of the tube, from the tail: what carries a reared animal
+_MAX_GAP_MM = 3.0  # between the floor and the lowest point of the body
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Bone elevations (n, J - 1) rad above the floor, turns (n, J) rad to the left at each joint, roll (n,) rad and
+    stretch (n,): what a posture is before it stands anywhere.
+    """
+
+    elevation: Array
+    turn: Array
+    roll: Array
+    stretch: Array
+
+
+def sample_postures(
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    n: int,
+    size: Array | float = 1.0,
+    shape: BodyShape | None = None,
+    kinds: NDArray[np.int64] | None = None,
+) -> tuple[Pose, Array]:
+    """N poses in the arena frame, rump above the origin, heading uniform; and the girth (n,) of their bodies.
+
+    size (n,) of the animals over home size, shape (n) their bodies, kinds (n,) indices into `KINDS` (None draws them
+    by `SHARES`). A stretched animal is thinner, a compressed one fatter.
+    """
+    bodies = (BodyShape.default(skeleton) if shape is None else shape).broadcast(n)
+    size = np.broadcast_to(np.asarray(size, float), (n,))
+    if kinds is None:
+        kinds = rng.choice(len(KINDS), n, p=SHARES)
+    posture = draw_postures(rng, skeleton, kinds, bodies)
+    heading = rng.uniform(-np.pi, np.pi, n)
+    return stand(skeleton, posture, heading, size, bodies, rng.uniform(0.0, _MAX_GAP_MM, n))
+
+
+def draw_postures(rng: np.random.Generator, skeleton: Skeleton, kinds: NDArray[np.int64], shape: BodyShape) -> Posture:
+    """Postures of the given kinds (n,), for bodies of the given shapes (n)."""
+    n, n_bones = len(kinds), skeleton.n_joints - 1
+    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
+    rest = resting_heights(skeleton, shape)
+
+    def is_kind(name: str) -> NDArray[np.bool_]:
+        return (kinds == KINDS.index(name))[:, None]
+
+    # going about: the mid-axis lies as high as the body is thick, a little more towards the front; the nose is low
+    height = rest + np.linspace(0.5, 4.0, n_bones + 1) * rng.random((n, n_bones + 1))
+    height[:, -1] = rng.uniform(4.0, 15.0, n)
+    low = np.arcsin(np.clip(np.diff(height, axis=1) / bones, -0.9, 0.9))
+    steep = np.radians(rng.uniform(12.0, 82.0, (n, 1)))
+    tower = steep + np.radians(rng.normal(0.0, 12.0, (n, n_bones)))
+    tower[:, -1:] = steep + np.radians(rng.uniform(-75.0, 25.0, (n, 1)))
+    arch = low + np.radians(
+        np.interp(np.linspace(0, 1, n_bones), [0.0, 0.35, 0.7, 1.0], [32.0, 12.0, -25.0, -40.0])
+        * rng.uniform(0.3, 1.2, (n, 1))
+        + rng.normal(0.0, 6.0, (n, n_bones))
+    )
+    reach = low.copy()
+    reach[:, -1] = np.radians(rng.uniform(-40.0, 40.0, n))
+    reach[:, -2] += np.radians(rng.uniform(-10.0, 25.0, n))
+    elevation = np.where(is_kind("rear"), tower, low)
+    elevation = np.where(is_kind("hunch"), arch, elevation)
+    elevation = np.where(is_kind("reach"), reach, elevation)
+    return Posture(
+        elevation,
+        _draw_turns(rng, skeleton, is_kind("curl") | (rng.random((n, 1)) < 0.1), is_kind("reach")),
+        np.clip(rng.normal(0.0, np.radians(5.0), n), -np.radians(15.0), np.radians(15.0)),
+        rng.uniform(*STRETCH, n),
+    )
+
+
+def _draw_turns(
+    rng: np.random.Generator, skeleton: Skeleton, curled: NDArray[np.bool_], reaching: NDArray[np.bool_]
+) -> Array:
+    """Turns (n, J) rad to the left at the joints: slight, or up to 100 degrees in all, and the head's own."""
+    n, inner = len(curled), skeleton.n_joints - 2
+    turn = np.zeros((n, skeleton.n_joints))
+    slight = np.radians(rng.normal(0.0, 8.0, (n, inner)))
+    total = np.radians(rng.uniform(30.0, 100.0, (n, 1))) * rng.choice([-1.0, 1.0], (n, 1))
+    curl = total * rng.dirichlet(np.full(inner, 3.0), n) + 0.5 * slight
+    turn[:, 1:-1] = np.where(curled, curl, slight)
+    head = np.radians(np.where(reaching[:, 0], rng.uniform(-60.0, 60.0, n), rng.normal(0.0, 10.0, n)))
+    turn[:, -2] += head
+    return turn
+
+
+def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
+    """Heights (n, J) mm at scale 1 at which the joints lie when the trunk just touches the floor under each."""
+    stations = np.asarray(skeleton.surface["stations"], float)
+    reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
+    return np.stack([np.interp(reach / reach[-1], stations, high) for high in shape.half_height])
+
+
+def stand(
+    skeleton: Skeleton, posture: Posture, heading: Array, size: Array, shape: BodyShape, gap: Array
+) -> tuple[Pose, Array]:
+    """Put postures (n) on the floor z = 0, rump above the origin: poses in the arena frame and girths (n,).
+
+    The rear part of the trunk comes to lie `gap` (n,) mm above the floor; where the front would go below it, the whole
+    animal tips up around the rump.
+    """
+    angles = np.zeros((len(size), skeleton.n_joints, 3))
+    angles[:, 1:-1, 1] = -np.diff(posture.elevation, axis=1)
+    angles[..., 2] = posture.turn
+    angles = np.clip(angles, skeleton.limits[..., 0], skeleton.limits[..., 1])
+    angles[:, 0] = 0.0
+    scale, girth = size * posture.stretch, size / np.sqrt(posture.stretch)
+    stations = np.asarray(skeleton.surface["stations"], float)
+    elevation = posture.elevation[:, 0].copy()
+    rear, pose = stations <= _REAR_PART, Pose.home(skeleton, len(size))
+    for _ in range(6):
+        rotation = root_rotation(heading, elevation, posture.roll)
+        pose = Pose(SE3(rotation, np.zeros((len(size), 3))), angles, scale)
+        frames = pose.frames(skeleton)
+        lowest = np.empty((len(size), len(stations)))
+        _lowest_points(
+            frames.translation, frames.rotation, girth, stations, shape.half_width, shape.half_height, lowest
+        )
+        height = gap - lowest[:, rear].min(axis=1)
+        deficit = np.maximum(gap - (lowest[:, ~rear].min(axis=1) + height), 0.0)
+        if deficit.max() < 0.2:
+            break
+        elevation = elevation + np.where(deficit > 0.2, deficit / (0.5 * scale * skeleton.length), 0.0)
+    sunk = np.maximum(-(lowest.min(axis=1) + height), 0.0)
+    pose.root.translation[:, 2] = height + sunk
+    return pose, girth
+
+
+def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
+    """Rotations (n, 3, 3) of a base that heads, then rises, then rolls."""
+    zero = np.zeros_like(heading)
+    turn = so3.exp(np.stack([zero, zero, heading], axis=-1))
+    rise = so3.exp(np.stack([zero, -elevation, zero], axis=-1))
+    return turn @ rise @ so3.exp(np.stack([roll, zero, zero], axis=-1))
+
+
+@njit(cache=True, parallel=True)
+def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out):
+    """Fill out (n, R) mm with the lowest point of the trunk's ellipse at every station."""
+    for i in prange(len(joints)):
+        arc, frame = np.empty(joints.shape[1]), np.empty((4, 3))
+        chain_arc(joints[i], arc)
+        for r in range(len(stations)):
+            spine_frame(joints[i], rotations[i], arc, stations[r], frame)
+            side, rise = girth[i] * half_width[i, r] * frame[2, 2], girth[i] * half_height[i, r] * frame[3, 2]
+            out[i, r] = frame[0, 2] - np.sqrt(side * side + rise * rise)

@@ -1,0 +1,250 @@
+"""Synthetic recordings: a virtual animal in a virtual arena before an imitated sensor, with the exact truth.
+
+Frames are made when asked for, from a seed, in any order. `test_split` holds the splits on which accuracy is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.arena.floor import Floor
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Body, Surface
+from liex_lab.errors import LiexError
+from liex_lab.geometry import SE3
+from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.recording import Recording
+from liex_lab.simulation import _render_kernels as _stage
+from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
+from liex_lab.simulation.objects import THING_FACES, draw_thing
+from liex_lab.simulation.scene import Stage, outline_of
+from liex_lab.simulation.sensors import Sensor
+from liex_lab.simulation.species import Habits, MouseHabits
+
+Array = NDArray[np.float64]
+
+FRAME_NS = MouseHabits.frame_ns
+N_SESSIONS, N_FRAMES = 40, 50
+# name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
+SPLITS = {
+    "clean": (71_001, "train", 1.0, 0, 0.0),
+    "hard": (72_001, "train", 2.0, 1, 0.5),
+    "other-body": (74_001, "other", 1.0, 0, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Cast:
+    """Everything in front of a virtual camera that moves, and the camera's own errors.
+
+    pose (n), arena frame; girth (n,); shape: one animal; bends (n, TAIL_RINGS) rad: its tail. things (n, V, 3) mm:
+    other objects, shown where `shown` (n,). parameters (n, N_PARAMETERS) of the sensor, seeds (n,) of its noise.
+    thing_faces (F, 3): of the other objects' meshes.
+    """
+
+    skeleton: Skeleton
+    spine_mm: float
+    pose: Pose
+    girth: Array
+    shape: Body
+    bends: Array | None
+    things: Array
+    shown: NDArray[np.bool_]
+    parameters: Array
+    seeds: NDArray[np.uint64]
+    thing_faces: NDArray[np.int32] = field(default_factory=lambda: THING_FACES)
+
+
+class TrueRecording(Recording):
+    """A virtual recording and its truth.
+
+    spine_mm: the animal's size over the session; pose (n): root T_camera_root, angles, scale; joints_camera (n, J, 3)
+    and joints_arena (n, J, 3) mm; T_arena_camera: exact; floor: the exact plane, or what stands for it.
+    """
+
+    skeleton: Skeleton
+    surface: Surface
+    spine_mm: float
+    pose: Pose
+    joints_camera: Array
+    joints_arena: Array
+    T_arena_camera: SE3
+    floor: Floor
+
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        raise NotImplementedError
+
+
+class SyntheticSession(TrueRecording):
+    """A virtual animal in a virtual arena; shape: its body."""
+
+    def __init__(self, name: str, stage: Stage, cast: Cast, times_ns: NDArray[np.int64] | None = None) -> None:
+        n = len(cast.seeds)
+        times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
+        super().__init__(name=name, format="synthetic", camera=stage.camera, times_ns=times, read=self._depth)
+        self.stage, self.cast, self.skeleton = stage, cast, cast.skeleton
+        self.surface, self.shape, self.spine_mm = Surface.of(cast.skeleton), cast.shape, cast.spine_mm
+        self.T_arena_camera = stage.T_arena_camera
+        normal = -self.T_arena_camera.rotation[2]
+        self.floor = Floor.from_plane(normal, float(self.T_arena_camera.translation[2]), stage.camera)
+        self.pose = cast.pose.moved(self.T_arena_camera.inverse())
+        self.joints_camera = self.pose.joints(self.skeleton)
+        self.joints_arena = cast.pose.joints(self.skeleton)
+
+    def _depth(self, index: int) -> Depth:
+        return self.depths(index, index + 1)[0]
+
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        cast, part, camera = self.cast, slice(start, stop), self.stage.camera
+        pose = Pose(SE3(cast.pose.root.rotation[part], cast.pose.root.translation[part]), cast.pose.angles[part],
+                    cast.pose.scale[part])  # fmt: skip
+        bends = None if cast.bends is None else cast.bends[part]
+        vertices = self.surface.vertices(pose, cast.shape, cast.girth[part], bends)
+        out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
+        T_camera_arena = self.T_arena_camera.inverse()
+        _stage.frames_parallel(
+            self.stage.still, vertices, self.surface.faces, cast.things[part], cast.thing_faces, cast.shown[part],
+            np.ascontiguousarray(T_camera_arena.rotation), T_camera_arena.translation,
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), cast.parameters[part], cast.seeds[part],
+            NORMAL, out,
+        )  # fmt: skip
+        unit = float(cast.parameters[0, UNIT])
+        return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
+
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        for start in range(first, len(self), n_frames):
+            stop = min(start + n_frames, len(self))
+            depths = self.depths(start, stop)
+            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+
+    @staticmethod
+    def draw(
+        seed: int | list[int],
+        n_frames: int = N_FRAMES,
+        *,
+        sensor: Sensor | None = None,
+        family: str = "train",
+        noise: float = 1.0,
+        erosion_px: int = 0,
+        thing_share: float = 0.0,
+        spine_mm: float | None = None,
+        habits: Habits | None = None,
+        name: str | None = None,
+    ) -> SyntheticSession:
+        """A session of independent postures and places: one camera, arena and animal, all drawn from the seed.
+
+        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws it. thing_share: of frames with
+        another object in view. See `Sensor.draw` for noise and erosion_px, `draw_shapes` for family.
+        """
+        rng = np.random.default_rng(seed)
+        habits = MouseHabits() if habits is None else habits
+        home = habits.skeleton.length
+        sensor = habits.sensors[int(rng.integers(len(habits.sensors)))] if sensor is None else sensor
+        drawn = home * float(rng.uniform(*habits.sizes))
+        spine = drawn if spine_mm is None else float(spine_mm)
+        stage = Stage.draw(rng, sensor.camera, spine, habits.setting)
+        shape = habits.shapes(rng, family, 1)
+        size, camera_mm = np.full(n_frames, spine / home), np.full(n_frames, stage.T_arena_camera.translation[2])
+        pose, girth, _ = habits.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
+        cast = assemble(rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, True)
+        times = np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+        return SyntheticSession(name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", stage, cast, times)
+
+
+def assemble(
+    rng: np.random.Generator, stage: Stage, sensor: Sensor, habits: Habits, spine_mm: float, shape: Body,
+    pose: Pose, girth: Array, noise: float, erosion_px: int, thing_share: float, scatter: bool,
+) -> Cast:  # fmt: skip
+    """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things beside it."""
+    n = len(girth)
+    surface = Surface.of(habits.skeleton)
+    bends = habits.bends(rng, n)
+    vertices = surface.vertices(pose, shape[0], girth, bends)
+    trunk = vertices[:, : surface.n_trunk_vertices]
+    if scatter:
+        bottoms = trunk[..., 2].min(axis=1) if habits.floats else None
+        shift = stage.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
+        pose.root.translation[:, :2] += shift
+        trunk[..., :2] += shift[:, None]
+    things, shown = _beside(rng, stage, trunk, spine_mm, thing_share, habits, sensor.stride)
+    parameters = np.repeat(sensor.draw(rng, 1, shape.fur, noise, erosion_px), n, axis=0)
+    seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+    return Cast(habits.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds)
+
+
+def _beside(
+    rng: np.random.Generator, stage: Stage, trunk: Array, spine_mm: float, share: float, habits: Habits, stride: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    """One thing for a session, at a free place of its own in every frame: (n, V, 3) mm and where it is shown (n,)."""
+    mesh = draw_thing(rng, str(rng.choice(habits.things)), spine_mm)
+    n = len(trunk)
+    things, shown = np.repeat(mesh[None], n, axis=0), rng.random(n) < share
+    reach = 1.1 * stage.half
+    for i in np.flatnonzero(shown):
+        own = trunk[i, ::3, :2]
+        for _ in range(40):
+            shift = stage.centre + rng.uniform(-1.0, 1.0, 2) * reach
+            outline = mesh[::3, :2] + shift
+            gap = np.linalg.norm(outline[:, None] - own, axis=-1).min()
+            # a hand reaches over the wall; anything else stands within
+            within = mesh[:, 2].max() > 0.6 * spine_mm or stage.room(shift) > 0
+            free = bool(gap > 8.0 * habits.setting.scale and within)
+            if free and not _covers(stage, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
+                things[i, :, :2] += shift
+                break
+        else:
+            shown[i] = False
+    return things, shown
+
+
+def _covers(stage: Stage, thing: Array, trunk: Array, margin_px: float) -> bool:
+    """Whether the thing and the animal overlap in the picture or nearly so."""
+    T_camera_arena = stage.T_arena_camera.inverse()
+    a, b = stage.camera.project(T_camera_arena @ thing), stage.camera.project(T_camera_arena @ trunk)
+    gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
+    middle = b.mean(axis=0)
+    around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()
+    return bool(gap < margin_px or around)
+
+
+def test_split(
+    name: str,
+    spine_mm: float | None = None,  # noqa: PT028
+    n_sessions: int = N_SESSIONS,  # noqa: PT028
+    habits: Habits | None = None,  # noqa: PT028
+    seed: int | None = None,  # noqa: PT028
+) -> list[SyntheticSession]:
+    """The sessions of a fixed split: 'clean', 'hard' or 'other-body', 40 of 50 frames, as many from each sensor.
+
+    spine_mm sets the animals' size instead of drawing it; n_sessions takes only the first ones; habits: of the animal,
+    None a mouse; seed: another one makes recordings like those of the split, to develop on.
+    """
+    if name not in SPLITS:
+        raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
+    frozen, family, noise, erosion_px, thing_share = SPLITS[name]
+    habits = MouseHabits() if habits is None else habits
+    return [
+        SyntheticSession.draw(
+            [frozen if seed is None else seed, k],
+            sensor=(sensor := habits.sensors[k % len(habits.sensors)]),
+            family=family,
+            noise=noise,
+            erosion_px=erosion_px * sensor.stride,
+            thing_share=thing_share,
+            spine_mm=spine_mm,
+            habits=habits,
+            name=f"{name}-{k:02d}",
+        )
+        for k in range(n_sessions)
+    ]
+
+
+test_split.__test__ = False  # type: ignore[attr-defined]  # its name is not a test's

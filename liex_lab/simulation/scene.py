@@ -1,0 +1,224 @@
+"""A virtual arena in front of a virtual camera: floor, walls, clutter, and where in it an animal can be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.surface import render_mesh
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
+from liex_lab.simulation.objects import THING_FACES, draw_thing
+
+Array = NDArray[np.float64]
+
+ROUND, BOX = "round", "box"
+_EDGE_PX = 6.0  # an animal stays this far inside the picture
+_WALL_MM = 3.0  # and its trunk this far from walls
+_CLUTTER_MM = 12.0  # and from what stands around
+_TRIES = 64
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What surrounds an animal, as a rule: lengths in mm.
+
+    camera_mm: heights of cameras above the floor, tilted by up to tilt_rad; walls_mm: heights of walls, and a share
+    `open_share` of the places has none; clutter: what stands around; scale: of corners, unevenness, distances and
+    estimation errors, over those of a mouse's arena.
+    """
+
+    camera_mm: tuple[float, float] = (500.0, 1000.0)
+    tilt_rad: float = float(np.radians(10.0))
+    walls_mm: tuple[float, float] = (80.0, 400.0)
+    open_share: float = 0.1
+    clutter: tuple[str, ...] = ("block", "ball")
+    scale: float = 1.0
+
+
+ARENA = Setting()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a virtual camera looks at.
+
+    still (H, W) float32 mm: the ideal depth without the animal, 0 = nothing in range; T_arena_camera: exact; kind:
+    round or box; centre (2,) mm and half (2,) mm extents (or radii) of the walls in the arena frame, turned by yaw rad;
+    clutter (n, 2) mm: outline points of what stands around.
+    """
+
+    camera: Camera
+    T_arena_camera: SE3
+    kind: str
+    centre: Array
+    half: Array
+    yaw: float
+    wall_mm: float
+    clutter: Array
+    still: NDArray[np.float32]
+
+    @staticmethod
+    def draw(rng: np.random.Generator, camera: Camera, spine_mm: float, setting: Setting = ARENA) -> Stage:
+        """A random arena, large enough for the animal, its floor's centre in view."""
+        T = draw_views(rng, 1, setting)
+        T_arena_camera = SE3(T.rotation[0], T.translation[0])
+        height = float(T_arena_camera.translation[2])
+        view = height * np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2.0
+        kind = str(rng.choice([ROUND, BOX]))
+        least, most = 1.6 * spine_mm, 420.0 * max(setting.scale, 1.0)
+        if kind == ROUND:
+            half = np.full(2, max(least, rng.uniform(0.75, 1.15) * min(view[1], most)))
+        else:
+            half = np.maximum(least, rng.uniform(0.7, 1.1, 2) * np.minimum(view, most))
+        middle = np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0])
+        centre = floor_point(camera, T_arena_camera, middle) + rng.uniform(-0.15, 0.15, 2) * half
+        low, high = setting.walls_mm
+        yaw, wall_mm = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(low, min(high, 0.7 * height)))
+        if rng.random() < setting.open_share:
+            wall_mm = 0.0  # an open table
+        stage = Stage(
+            camera, T_arena_camera, kind, centre, half, yaw, wall_mm, np.zeros((0, 2)), np.zeros((0, 0), np.float32)
+        )
+        return stage._furnished(rng, spine_mm, setting)
+
+    def _furnished(self, rng: np.random.Generator, spine_mm: float, setting: Setting) -> Stage:
+        """The same with its still picture, and in a third of them a thing or two near the wall."""
+        still = self._ideal_depth(rng, setting.scale)
+        T_camera_arena, outline = self.T_arena_camera.inverse(), []
+        for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
+            mesh = draw_thing(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
+            way = rng.uniform(-np.pi, np.pi)
+            local = 0.8 * self.half * [np.cos(way), np.sin(way)]
+            mesh[:, :2] += self.centre + self._turned(local, self.yaw)
+            thing = render_mesh(mesh, THING_FACES, self.camera, T_camera_mesh=T_camera_arena)
+            still = np.where((thing > 0) & ((still == 0) | (thing < still)), thing, still)
+            outline.append(mesh[:, :2])
+        clutter = np.concatenate(outline) if outline else np.zeros((0, 2))
+        return Stage(self.camera, self.T_arena_camera, self.kind, self.centre, self.half, self.yaw, self.wall_mm,
+                     clutter, still)  # fmt: skip
+
+    @staticmethod
+    def _turned(xy: Array, yaw: float) -> Array:
+        """Points (..., 2) turned by yaw rad."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
+
+    def room(self, xy: Array) -> Array:
+        """How far (...) mm points (..., 2) of the floor are inside the walls; negative outside."""
+        local = self._turned(xy - self.centre, -self.yaw)
+        if self.kind == ROUND:
+            return self.half[0] - np.hypot(local[..., 0], local[..., 1])
+        return np.min(self.half - np.abs(local), axis=-1)
+
+    def freedom(self, xy: Array, z: float = 0.0) -> float:
+        """How far (mm) a point of the floor, or z mm above it, is from walls, clutter and the border of the picture."""
+        c = self.camera
+        p = self.T_arena_camera.inverse() @ np.array([xy[0], xy[1], z])
+        uv = c.project(p)
+        border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min() * p[2] / c.fx
+        free = min(float(self.room(xy)), float(border))
+        if len(self.clutter):
+            free = min(free, float(np.linalg.norm(self.clutter - xy, axis=1).min()))
+        return free
+
+    def _ideal_depth(self, rng: np.random.Generator, scale: float) -> NDArray[np.float32]:
+        """Depth (H, W) mm along every ray: floor within the walls, walls up to their height, beyond them little."""
+        T, camera = self.T_arena_camera, self.camera
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        d = camera.unproject(np.stack([u, v], axis=-1), np.ones(u.shape)) @ T.rotation.T
+        height = T.translation[2]
+        fall = np.where(d[..., 2] < -1e-3, -d[..., 2], 1e-3)
+        floor = height / fall
+        ground = floor[..., None] * d[..., :2]
+        raised = _unevenness(rng, ground, scale)
+        room = self.room(ground)
+        # multiple reflections fill the corner between floor and wall
+        corner, spread = rng.uniform(0.0, 12.0) * scale, rng.uniform(6.0, 25.0) * scale
+        raised += corner * np.exp(-np.maximum(room, 0.0) / spread) * (self.wall_mm > 0)
+        inside = (room > 0) & (d[..., 2] < -1e-3)
+        depth = np.where(inside, floor - raised / fall, 0.0)
+        wall = self._wall_distance(d)
+        on_wall = ~inside & (wall > 0) & (height + wall * d[..., 2] < self.wall_mm)
+        depth = np.where(on_wall, wall, depth)
+        beyond = ~inside & ~on_wall
+        if self.wall_mm == 0.0:
+            depth = np.where(beyond, floor - raised / fall, depth)
+        elif rng.random() < 0.4:  # the untidy room around the arena
+            around = height + rng.uniform(0.0, 700.0) * scale - 60.0 * _unevenness(rng, ground, scale)
+            depth = np.where(beyond & (d[..., 2] < -0.2), around / fall, depth)
+        return np.where((depth > 100.0) & (depth < 4500.0), depth, 0.0).astype(np.float32)
+
+    def _wall_distance(self, direction: Array) -> Array:
+        """Depth (H, W) mm at which rays from the camera leave the walls' outline; 0 when they never do."""
+        start = self._turned(-self.centre, -self.yaw)
+        d = self._turned(direction[..., :2], -self.yaw)
+        if self.kind == ROUND:
+            a, b = np.sum(d * d, axis=-1), d @ start
+            c = start @ start - self.half[0] ** 2
+            root = b * b - a * c
+            return np.where((root > 0) & (a > 1e-12), (-b + np.sqrt(np.maximum(root, 0))) / np.maximum(a, 1e-12), 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            leave = (np.sign(d) * self.half - start) / d
+        return np.maximum(np.nanmin(np.where(np.isfinite(leave), leave, np.inf), axis=-1), 0.0)
+
+    def places(self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None) -> Array:
+        """Shifts (n, 2) mm that bring each of n bodies to a random free place on the floor, whole and in the picture.
+
+        outline (n, K, 2) mm: outermost points of the bodies on the floor; tops, bottoms (n,) mm: how high they reach
+        and begin, None on the floor.
+        """
+        n = len(outline)
+        middle = outline.mean(axis=1)
+        reach = float(self.half.max()) if self.wall_mm > 0 else 0.9 * float(self.half.max())
+        aim = self.centre + rng.uniform(-reach, reach, (n, _TRIES, 2))
+        points = outline[:, None] - middle[:, None, None] + aim[:, :, None]
+        room = self.room(points).min(axis=2) - _WALL_MM
+        T_camera_arena, c = self.T_arena_camera.inverse(), self.camera
+        for height in (np.zeros(n) if bottoms is None else bottoms, tops):
+            above = np.broadcast_to(height[:, None, None, None], (*points.shape[:-1], 1))
+            uv = c.project(T_camera_arena @ np.concatenate([points, above], axis=-1))
+            border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3)) - _EDGE_PX
+            room = np.minimum(room, border)
+        if len(self.clutter):
+            gap = np.linalg.norm(points[:, :, :, None] - self.clutter[::7], axis=-1).min(axis=(2, 3)) - _CLUTTER_MM
+            room = np.minimum(room, gap)
+        # the first place with room enough, else the roomiest
+        chosen = np.where((room > 0).any(axis=1), np.argmax(room > 0, axis=1), np.argmax(room, axis=1))
+        return aim[np.arange(n), chosen] - middle
+
+
+def draw_views(rng: np.random.Generator, m: int, setting: Setting = ARENA) -> SE3:
+    """T_arena_camera (m) of cameras that look down on a setting, tilted in any direction."""
+    tilt, toward = setting.tilt_rad * np.sqrt(rng.random(m)), rng.uniform(-np.pi, np.pi, m)
+    up = -np.stack([np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)], axis=-1)
+    x = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    height = rng.uniform(*setting.camera_mm, m)
+    translation = np.stack([np.zeros(m), np.zeros(m), height], axis=-1)
+    return SE3(np.stack([x, np.cross(up, x), up], axis=-2), translation)
+
+
+def floor_point(camera: Camera, T_arena_camera: SE3, uv: Array) -> Array:
+    """Where (..., 2) mm on the floor pixels (..., 2) look."""
+    ray = camera.unproject(uv, np.ones(np.shape(uv)[:-1])) @ T_arena_camera.rotation.T
+    return T_arena_camera.translation[2] / -ray[..., 2:] * ray[..., :2]
+
+
+def outline_of(vertices: Array, n_directions: int = 24) -> Array:
+    """The outermost points (n, n_directions, 2) of bodies (n, V, 3) seen from above."""
+    angle = 2 * np.pi * np.arange(n_directions) / n_directions
+    extent = vertices[..., :2] @ np.stack([np.cos(angle), np.sin(angle)])
+    return np.take_along_axis(vertices[..., :2], extent.argmax(axis=1)[..., None], axis=1)
+
+
+def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
+    """Heights (H, W) mm of a floor that is not quite flat: a few long waves over points (H, W, 2) mm."""
+    waves = np.zeros(ground.shape[:-1])
+    for _ in range(4):
+        way, length = rng.uniform(-np.pi, np.pi), rng.uniform(70.0, 350.0) * scale
+        along = ground @ np.array([np.cos(way), np.sin(way)])
+        waves += rng.uniform(0.0, 0.7) * scale * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
+    return waves

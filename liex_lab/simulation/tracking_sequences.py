@@ -1,0 +1,169 @@
+"""Sequences to measure tracking on: one animal that moves, as a sensor sees it or as on a bad day, with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.surface import Surface
+from liex_lab.errors import RecordingError
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.simulation import corruptions as hazards
+from liex_lab.simulation.corruptions import Event, Loss
+from liex_lab.simulation.hand.simulator import FRAME_NS, NYU_SENSOR, HandSession, HandWorld
+from liex_lab.simulation.recording import Cast, SyntheticSession, TrueRecording
+from liex_lab.simulation.sensors import Sensor
+from liex_lab.simulation.simulator import RenderedWorld, World
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A fixed test sequence: frames, seed, and how bad the day is. The lengths are those of the paper's."""
+
+    n_frames: int
+    seed: int
+    noise: float
+    erosion_px: int
+    hazards: bool
+
+
+SEQUENCES = {
+    "easy": Sequence(511, 75_001, 1.0, 0, False),
+    "hard": Sequence(300, 76_001, 2.0, 1, True),
+}
+
+
+class TestSequence(TrueRecording):
+    """A recording with its truth and what happens in it: events, in order of their start; scene: without the losses."""
+
+    __test__ = False
+
+    def __init__(self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str) -> None:
+        super().__init__(name=name, format="synthetic", camera=scene.camera, times_ns=scene.times_ns.copy(),
+                         read=lambda index: self.depths(index, index + 1)[0])  # fmt: skip
+        for fact in _TRUTH:
+            setattr(self, fact, getattr(scene, fact))
+        self.scene, self.events, self._loss = scene, events, loss
+
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth (n, H, W) mm of frames start to stop."""
+        depths = self.scene.depths(start, stop)
+        camera, middle = self.camera, self.joints_camera.mean(axis=1)
+        reach = 1.2 * self.spine_mm * camera.fx / middle[:, 2]
+        still = self.scene.stage.still if isinstance(self.scene, SyntheticSession) else None
+        self._loss.apply(depths, still, start, self.scene.cast.seeds, camera.project(middle), reach)
+        return depths
+
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        for start in range(first, len(self), n_frames):
+            stop = min(start + n_frames, len(self))
+            depths = self.depths(start, stop)
+            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+
+
+_TRUTH = ("skeleton", "surface", "spine_mm", "pose", "joints_camera", "joints_arena", "T_arena_camera", "floor")
+
+
+def tracking_sequence(
+    world: World, name: str, *, seed: int | None = None, n_frames: int | None = None, sensor: Sensor | None = None,
+    spine_mm: float | None = None,
+) -> TestSequence:  # fmt: skip
+    """The fixed sequence 'easy' or 'hard' of an animal's world; other seeds make sequences of its kind, to develop on.
+
+    hard: bursts of holes, frames dropped, a bar passing between camera and animal, a second object, an animal that is
+    lost in the floor or in glare, and stretches at several times the speed.
+    """
+    if name not in SEQUENCES:
+        raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
+    sensor, step_ns, floats = _setting(world, sensor)
+    kind = SEQUENCES[name]
+    n, own_seed = n_frames or kind.n_frames, [kind.seed if seed is None else seed]
+    rng = np.random.default_rng([*own_seed, 1])
+    events: list[Event] = []
+    steps, pace = np.ones(n, np.int64), np.ones(n, np.int64)
+    if kind.hazards:
+        events, steps = hazards.draw_script(rng, n, step_ns * 1e-9)
+        pace = hazards.pace(rng, events, n)
+    rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
+    base = world.motion(own_seed, int(rows[-1]) + 1, sensor=sensor, noise=kind.noise,
+                        erosion_px=kind.erosion_px * sensor.stride, spine_mm=spine_mm)  # fmt: skip
+    times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(step_ns)
+    loss = Loss.draw(rng, events, base.camera, base.joints_camera[rows], base.spine_mm, floats)
+    title = f"track-{name}-{base.skeleton.name}-{own_seed[0]}"
+    place = _hands if isinstance(base, HandSession) else _animals
+    scene, hidden = place(rng, world, base, rows, times, events, title)
+    return TestSequence(scene, sorted([*events, *hidden], key=lambda event: (event.start, event.stop)), loss, title)
+
+
+def _setting(world: World, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
+    """The camera, the nanoseconds between its frames, and whether the animal floats."""
+    if isinstance(world, HandWorld):
+        return sensor or NYU_SENSOR, FRAME_NS, True
+    if isinstance(world, RenderedWorld):
+        return sensor or world.habits.sensors[0], world.habits.frame_ns, world.habits.floats
+    raise RecordingError(f"there are no test sequences of a {world.skeleton.name}; mouse, fish and hand have them")
+
+
+def _hands(
+    rng: np.random.Generator, world: World, base: TrueRecording, rows: NDArray[np.int64], times: NDArray[np.int64],
+    events: list[Event], title: str,
+) -> tuple[HandSession, list[Event]]:  # fmt: skip
+    """Some moments of a hand, with things before and beside it, and when it is hidden."""
+    assert isinstance(base, HandSession)
+    cast, hidden = base.cast[rows], list[Event]()
+    if events:
+        arena = hazards.draw_things(rng, events, base.T_arena_camera.translation, base.joints_arena[rows],
+                                    base.spine_mm, hazards.beside_hand)  # fmt: skip
+        things = base.T_arena_camera.inverse() @ arena
+        cast = replace(cast, thing=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES)
+        hidden = _hidden(base.camera, cast.hand, things, events)
+    return HandSession(title, base.skeleton, base.sensor, cast, times), hidden
+
+
+def _animals(
+    rng: np.random.Generator, world: World, base: TrueRecording, rows: NDArray[np.int64], times: NDArray[np.int64],
+    events: list[Event], title: str,
+) -> tuple[SyntheticSession, list[Event]]:  # fmt: skip
+    """As `_hands` of an animal."""
+    assert isinstance(base, SyntheticSession)
+    assert isinstance(world, RenderedWorld)
+    cast, stage, habits, hidden = _taken(base.cast, rows), base.stage, world.habits, list[Event]()
+
+    def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
+        return hazards.beside_animal(rng, stage, joints, length_mm, habits.things)
+
+    if events:
+        things = hazards.draw_things(rng, events, base.T_arena_camera.translation, base.joints_arena[rows],
+                                     base.spine_mm, beside, habits.floats)  # fmt: skip
+        cast = replace(cast, things=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES)
+        surface, T_camera_arena = Surface.of(base.skeleton), base.T_arena_camera.inverse()
+        body = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[:, : surface.n_trunk_vertices]
+        hidden = _hidden(base.camera, T_camera_arena @ body, T_camera_arena @ things, events)
+    return SyntheticSession(title, stage, cast, times), hidden
+
+
+def _taken(cast: Cast, rows: NDArray[np.int64]) -> Cast:
+    """Some moments of what moves, in another order of time."""
+    pose = Pose(SE3(cast.pose.root.rotation[rows], cast.pose.root.translation[rows]), cast.pose.angles[rows],
+                cast.pose.scale[rows])  # fmt: skip
+    return replace(
+        cast, pose=pose, girth=cast.girth[rows], bends=None if cast.bends is None else cast.bends[rows],
+        things=cast.things[rows], shown=cast.shown[rows], parameters=cast.parameters[rows], seeds=cast.seeds[rows],
+    )  # fmt: skip
+
+
+def _hidden(camera: Camera, body: Array, things: Array, events: list[Event]) -> list[Event]:
+    """The stretches in which the occluder hides the animal; meshes (n, V, 3) mm in the camera frame."""
+    spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
+    rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
+    one = things.shape[1] // 2
+    return hazards.hidden_spans(hazards.visible_share(body[:, ::4], things[:, :one], camera, rows))

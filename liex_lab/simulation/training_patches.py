@@ -1,0 +1,302 @@
+"""Training images by the thousand: a window of depth around an animal, with the truth, from a seed.
+
+Images come in mini-sessions of `PER_SESSION` that share camera, floor, animal and sensor, as a recording's frames do.
+They are made in blocks; a block depends on the seed and its own number alone, so any part of a set can be made again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.surface import Body, Surface
+from liex_lab.geometry import SE3
+from liex_lab.runtime.threads import threads
+from liex_lab.simulation import _render_kernels as _stage
+from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
+from liex_lab.simulation.objects import PART_FACES, rounded
+from liex_lab.simulation.scene import Setting, draw_views
+from liex_lab.simulation.species import Habits, MouseHabits
+
+Array = NDArray[np.float64]
+
+PER_SESSION = 8
+BLOCK = 512  # images made from one generator
+_THING_SHARE, _WALL_SHARE = 0.10, 0.35
+
+
+@dataclass(frozen=True)
+class TrainingWindows:
+    """n windows of S x S pixels around an animal, and the truth behind each.
+
+    depth, background (n, S, S) uint16, steps of unit_mm, 0 = unread: the picture, and the still scene as a recording
+    would have taught it. origin (n, 2) int32: the full picture's pixel (u, v) of window pixel (0, 0); intrinsics (n,
+    4): fx, fy, cx, cy of the full picture. floor, floor_true (n, 3): 1 / z = a u + b v + c in its pixels, as estimated
+    and exact.
+    T_arena_camera (n), exact. root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones;
+    joints_mm (n, J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
+    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture. spread_mm
+    (n,): standard deviation of the floor's readings, where it matters. own_bones: `joints_mm` are those of each
+    body's own proportions, from which the skeleton's differ.
+    """
+
+    depth: NDArray[np.uint16]
+    background: NDArray[np.uint16]
+    origin: NDArray[np.int32]
+    intrinsics: Array
+    floor: Array
+    floor_true: Array
+    T_arena_camera: SE3
+    root: SE3
+    angles: Array
+    scale: Array
+    joints_mm: Array
+    spine_mm: Array
+    session: NDArray[np.int64]
+    sensor: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    unit_mm: float = 1.0
+    spread_mm: Array | float = 0.0
+    own_bones: bool = False
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> TrainingWindows:
+        """Some of the images."""
+        picked: list[Any] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, SE3):
+                value = SE3(value.rotation[index], value.translation[index])
+            picked.append(value[index] if isinstance(value, np.ndarray) else value)
+        return TrainingWindows(*picked)
+
+    @staticmethod
+    def joined(parts: list[TrainingWindows]) -> TrainingWindows:
+        """The images of several sets, one after the other."""
+        columns: list[Any] = []
+        for field in fields(TrainingWindows):
+            values: list[Any] = [getattr(part, field.name) for part in parts]
+            if isinstance(values[0], SE3):
+                columns.append(
+                    SE3(np.concatenate([v.rotation for v in values]), np.concatenate([v.translation for v in values]))
+                )
+            elif isinstance(values[0], float | bool):  # of all images alike
+                columns.append(values[0])
+            else:
+                columns.append(np.concatenate(values))
+        return TrainingWindows(*columns)
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """Who looks at whom, one row an image (n): camera, floor, sensor, animal; constant within a mini-session."""
+
+    sensor: NDArray[np.int64]
+    intrinsics: Array
+    picture: NDArray[np.int64]
+    T_arena_camera: SE3
+    parameters: Array
+    size: Array
+    shape: Body
+    rough: Array
+    floor_error: Array
+
+
+def training_windows(
+    seed: int,
+    n: int,
+    habits: Habits | None = None,
+    *,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    degraded_share: float = 0.0,
+    spine_mm: float | None = None,
+    window_px: int = 144,
+    parallel: bool = True,
+) -> TrainingWindows:
+    """N training images; the first n of `training_blocks`, which explains the arguments."""
+    parts, left = [], n
+    for block in training_blocks(
+        seed, -(-n // BLOCK), habits, family=family, noise=noise, erosion_px=erosion_px,
+        degraded_share=degraded_share, spine_mm=spine_mm, window_px=window_px, parallel=parallel,
+    ):  # fmt: skip
+        parts.append(block if left >= BLOCK else block[:left])
+        left -= BLOCK
+    return TrainingWindows.joined(parts)
+
+
+def training_blocks(
+    seed: int,
+    n_blocks: int,
+    habits: Habits | None = None,
+    *,
+    first: int = 0,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    degraded_share: float = 0.0,
+    spine_mm: float | None = None,
+    window_px: int = 144,
+    parallel: bool = True,
+) -> Iterator[TrainingWindows]:
+    """Blocks of `BLOCK` training images from block `first` on, bit for bit the same for a seed, whatever the threads.
+
+    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see `Sensor.draw`; a share
+    `degraded_share` of the mini-sessions has 1 to 2.5 times the noise and half of those an outline eroded by a pixel.
+    spine_mm: the animals' mean size, None the skeleton's own; window_px must hold the animal with a margin: 144 does up
+    to mice of 70 mm.
+    """
+    habits = MouseHabits() if habits is None else habits
+    surface = Surface.of(habits.skeleton)
+    for number in range(first, first + n_blocks):
+        rng = np.random.default_rng([seed, number])
+        looks = _draw_looks(rng, habits, family, noise, erosion_px, degraded_share, spine_mm)
+        yield _draw_block(rng, habits, surface, looks, window_px, number * (BLOCK // PER_SESSION), parallel)
+
+
+def _draw_looks(
+    rng: np.random.Generator, habits: Habits, family: str, noise: float, erosion_px: int, degraded_share: float,
+    spine_mm: float | None,
+) -> _Looks:  # fmt: skip
+    """Cameras, floors and animals of one block's mini-sessions, repeated for each of their images."""
+    m, skeleton = BLOCK // PER_SESSION, habits.skeleton
+    sensor = np.arange(m) % len(habits.sensors)
+    shape = habits.shapes(rng, family, m)
+    intrinsics, picture = np.empty((m, 4)), np.empty((m, 2), np.int64)
+    parameters = np.empty((m, 0))
+    for k, kind in enumerate(habits.sensors):
+        rows, camera = sensor == k, kind.camera.every(kind.stride)
+        # units of one make differ by a few per cent in focal length, and by some pixels in the optical axis
+        focal = rng.uniform(0.97, 1.03, (m, 1)) * [camera.fx, camera.fy]
+        axis = rng.normal(0.0, 4.0, (m, 2)) + np.array([camera.cx, camera.cy])
+        intrinsics[rows] = np.concatenate([focal, axis], axis=1)[rows]
+        picture[rows] = camera.width, camera.height
+        drawn = kind.coarse(kind.draw(rng, m, shape.fur, noise, erosion_px))
+        parameters = drawn if not parameters.size else np.where(rows[:, None], drawn, parameters)
+    _degrade(rng, parameters, degraded_share)
+    nominal = skeleton.length if spine_mm is None else spine_mm
+    each = np.repeat(np.arange(m), PER_SESSION)
+    T_arena_camera = draw_views(rng, m, habits.setting)
+    scale = habits.setting.scale
+    return _Looks(
+        sensor[each], intrinsics[each], picture[each],
+        SE3(T_arena_camera.rotation[each], T_arena_camera.translation[each]), parameters[each],
+        (nominal / skeleton.length * rng.uniform(*habits.sizes, m))[each], shape[each],
+        scale * rng.uniform(0.0, 1.0, m)[each], (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale])[each],
+    )  # fmt: skip
+
+
+def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
+    """Give a share of the sensors more noise and holes, and half of those an eroded outline."""
+    m = len(parameters)
+    worse, factor, eroded = rng.random(m) < share, rng.uniform(1.0, 2.5, m), rng.random(m) < 0.5
+    parameters[worse, NOISE] *= factor[worse]
+    parameters[worse & eroded, EROSION] += 1
+
+
+def inverse_depth_plane(T_arena_camera: SE3, intrinsics: Array, tilt_and_lift: Array | None = None) -> Array:
+    """Coefficients (n, 3) of the floor: 1 / z = a u + b v + c. Optionally of one wrongly estimated.
+
+    tilt_and_lift (n, 3): slopes of the wrong floor along the arena's x and y, rad, and its height below the camera, mm.
+    """
+    wrong = np.zeros((len(intrinsics), 3)) if tilt_and_lift is None else tilt_and_lift
+    slope = np.stack([wrong[:, 0], wrong[:, 1], -np.ones(len(wrong))], axis=-1)
+    normal = np.einsum("nji,nj->ni", T_arena_camera.rotation, slope / np.linalg.norm(slope, axis=-1, keepdims=True))
+    distance = T_arena_camera.translation[:, 2] + wrong[:, 2]
+    a, b = normal[:, 0] / intrinsics[:, 0] / distance, normal[:, 1] / intrinsics[:, 1] / distance
+    return np.stack([a, b, normal[:, 2] / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]], axis=-1)
+
+
+def _draw_block(
+    rng: np.random.Generator, habits: Habits, surface: Surface, looks: _Looks, window_px: int, first_session: int,
+    parallel: bool,
+) -> TrainingWindows:  # fmt: skip
+    """The images of one block."""
+    n, skeleton, scale = len(looks.size), habits.skeleton, habits.setting.scale
+    pose, girth, kinds = habits.postures(rng, looks.size, looks.shape, looks.T_arena_camera.translation[:, 2])
+    _place(rng, habits, pose, looks)
+    vertices = surface.vertices(pose, looks.shape, girth, habits.bends(rng, n), parallel)
+    trunk = vertices[:, : surface.n_trunk_vertices]
+    T_camera_arena = looks.T_arena_camera.inverse()
+    origin = window_origin(trunk, T_camera_arena, looks.intrinsics, window_px)
+    thing, has_thing = _draw_neighbours(rng, trunk, looks.size * skeleton.length, scale, habits.floats)
+    walls, seeds = _draw_walls(rng, trunk, habits.setting), rng.integers(1, 2**63, n).astype(np.uint64)
+    depth = np.empty((n, window_px, window_px), np.uint16)
+    background = np.empty_like(depth)
+    with threads(parallel):
+        _stage.draw_windows(
+            vertices, surface.faces, thing, PART_FACES, has_thing, looks.T_arena_camera.rotation,
+            looks.T_arena_camera.translation[:, 2].copy(), looks.intrinsics, looks.picture, origin, walls, looks.rough,
+            looks.parameters, seeds, NORMAL, depth, background,
+        )  # fmt: skip
+    seen = pose.moved(T_camera_arena)
+    return TrainingWindows(
+        depth, background, origin.astype(np.int32), looks.intrinsics,
+        inverse_depth_plane(looks.T_arena_camera, looks.intrinsics, looks.floor_error),
+        inverse_depth_plane(looks.T_arena_camera, looks.intrinsics), looks.T_arena_camera, seen.root, seen.angles,
+        seen.scale, seen.joints(skeleton), looks.size * skeleton.length,
+        first_session + np.arange(n) // PER_SESSION, looks.sensor, kinds, habits.sensors[0].unit_mm,
+        habits.sensors[0].spread_mm(looks.parameters, looks.T_arena_camera.translation[:, 2]),
+    )  # fmt: skip
+
+
+def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) -> None:
+    """Move the poses over the floor so that each animal is somewhere in its picture, whole."""
+    n, T, skeleton = len(pose.scale), looks.T_arena_camera, habits.skeleton
+    middle = pose.joints(skeleton).mean(axis=1)
+    height = T.translation[:, 2] - (middle[:, 2] if habits.floats else 0.0)
+    margin = 0.85 * pose.scale * skeleton.length * looks.intrinsics[:, 0] / height + 6.0
+    uv = np.stack([margin + rng.random(n) * (looks.picture[:, k] - 2.0 * margin) for k in range(2)], axis=-1)
+    ray = np.concatenate([(uv - looks.intrinsics[:, 2:]) / looks.intrinsics[:, :2], np.ones((n, 1))], axis=1)
+    direction = np.einsum("nij,nj->ni", T.rotation, ray)
+    spot = (height / -direction[:, 2])[:, None] * direction[:, :2]
+    pose.root.translation[:, :2] += spot - middle[:, :2]
+
+
+def window_origin(trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int) -> NDArray[np.int64]:
+    """Where (n, 2) a window must start for the trunk (n, V, 3) to lie in its middle."""
+    p = np.einsum("nij,nvj->nvi", T_camera_arena.rotation, trunk) + T_camera_arena.translation[:, None]
+    uv = p[..., :2] / p[..., 2:] * intrinsics[:, None, :2] + intrinsics[:, None, 2:]
+    return np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + 0.5).astype(np.int64)
+
+
+def _draw_neighbours(
+    rng: np.random.Generator, trunk: Array, spine_mm: Array, scale: float, floats: bool
+) -> tuple[Array, NDArray[np.bool_]]:
+    """A block or ball (n, V, 3) beside each trunk, never touching it, and which images show theirs (n,).
+
+    Beside an animal that floats it is anywhere between the floor and the animal's back.
+    """
+    n = len(trunk)
+    radii = spine_mm[:, None] * rng.uniform(0.12, 0.5, (n, 3))
+    way = rng.uniform(-np.pi, np.pi, n)
+    toward = np.stack([np.cos(way), np.sin(way)], axis=-1)
+    reach = np.einsum("nvk,nk->nv", trunk[..., :2], toward).max(axis=1)
+    middle = trunk[..., :2].mean(axis=1)
+    clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1])
+    clear = clear + scale * rng.uniform(5.0, 40.0, n)
+    lift = rng.uniform(0.0, 1.0, n) * np.maximum(trunk[..., 2].max(axis=1) - radii[:, 2], 0.0) if floats else 0.0
+    centre = np.concatenate([middle + clear[:, None] * toward, (radii[:, 2] + lift)[:, None]], axis=-1)
+    power = np.where(rng.random(n) < 0.5, 2.0, 10.0)
+    return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < _THING_SHARE
+
+
+def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Array:
+    """A straight wall (n, WALL_COLUMNS) beyond some of the trunks, seen from the arena's inside."""
+    n, scale = len(trunk), setting.scale
+    middle = trunk[..., :2].mean(axis=1)
+    way = np.arctan2(middle[:, 1], middle[:, 0]) + rng.normal(0.0, 0.7, n)
+    outward = np.stack([np.cos(way), np.sin(way)], axis=-1)
+    distance = np.einsum("nvk,nk->nv", trunk[..., :2], outward).max(axis=1) + scale * rng.uniform(1.0, 60.0, n)
+    there = (rng.random(n) < _WALL_SHARE) & (distance > 40.0 * scale)
+    low, high = setting.walls_mm
+    height, rounding, spread = rng.uniform(0.75 * low, high, n), rng.uniform(0, 12, n), rng.uniform(6, 25, n)
+    return np.column_stack([outward, np.where(there, distance, 0.0), height, scale * rounding, scale * spread])

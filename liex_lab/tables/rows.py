@@ -1,0 +1,277 @@
+"""From a track to the rows of the tables: times, gaps, and one block of columns per table."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.actions.ethogram import Ethogram, runs_of
+from liex_lab.arena.outline import UNKNOWN, Arena
+from liex_lab.arena.zones import Zone, zone_names
+from liex_lab.geometry import so3
+from liex_lab.runtime.memory import blocks, give_back
+from liex_lab.tables.schema import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
+from liex_lab.tracking.track import Flip, Track
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from liex_lab.recordings.timestamps import Gap
+
+Array = NDArray[np.float64]
+
+GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.timestamps)
+_Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
+LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
+_ALL = frozenset(column.name for column in FRAMES)
+_NEAR = 0.1  # of the spine: how near a joint must be to count in its score
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A track, the camera's frame count of its rows, the names that every row carries, and where the animal can be."""
+
+    track: Track
+    frame_index: NDArray[np.int64]
+    session_id: str
+    individual: str
+    camera_gaps: Sequence[Gap] = ()
+    arena: Arena = UNKNOWN
+    zones: Sequence[Zone] = ()
+
+    @property
+    def time_s(self) -> Array:
+        """(n,) seconds since the first frame."""
+        return seconds(self.track.times_ns)
+
+    def frames(self) -> Iterator[Block]:
+        """The table `frames`, some hundred thousand rows at a time."""
+        missing = self.missing_before()
+        return (self._frame_rows(part, missing[part]) for part in self._parts(1))
+
+    def frames_table(self, names: Container[str] = _ALL) -> pd.DataFrame:
+        """The table `frames`, or those columns of it."""
+        import pandas as pd
+
+        schema = [column for column in FRAMES if column.name in names]
+        table = pd.concat([to_pandas(schema, block) for block in self.frames()], ignore_index=True)
+        give_back()
+        return table
+
+    def poses(self) -> Iterator[Block]:
+        """The table `poses`, some hundred thousand rows at a time."""
+        return (self._pose_rows(part) for part in self._parts(self.track.skeleton.n_joints))
+
+    def rotations(self) -> Iterator[Block]:
+        """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
+        return (self._rotation_rows(part) for part in self._parts(self.track.skeleton.n_joints + 1))
+
+    def _frame_rows(self, part: slice, missing: NDArray[np.int64]) -> Block:
+        track = self.track[part]
+        return {
+            **self._who, **self._when(part, 1),
+            "time_ns": track.times_ns, "gap_before": missing,
+            "predicted_error_mm": track.predicted_error_mm, "residual_mm": track.residual_mm,
+            "n_foreground_px": track.n_foreground_px,
+            **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
+            **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
+            "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
+            "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
+            "spine_mm": track.spine_mm, "scale": track.scale,
+            "p_flip": track.p_flip, "bridged": track.bridged, "flag": track.flag,
+        }  # fmt: skip
+
+    def _pose_rows(self, part: slice) -> Block:
+        track, n_joints = self.track[part], self.track.skeleton.n_joints
+        return {
+            **self._who, **self._when(part, n_joints),
+            "joint": Words(np.tile(np.arange(n_joints), track.n_frames), tuple(track.skeleton.names)),
+            **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
+            **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
+            "score": nearness(track.sd_mm, _NEAR * track.spine_mm[:, None]).ravel(), "sd_mm": track.sd_mm.ravel(),
+        }  # fmt: skip
+
+    def _rotation_rows(self, part: slice) -> Block:
+        track, n_rows = self.track[part], self.track.skeleton.n_joints + 1
+        turn = np.concatenate([_log(track.root_rotation)[:, None], track.angles_rad], axis=1)
+        sd_root = track.sd_root
+        spread = np.concatenate([sd_root[:, None, :3], track.sd_angles_rad], axis=1)
+        shift, sd_shift = np.full(turn.shape, np.nan), np.full(turn.shape, np.nan)
+        shift[:, 0], sd_shift[:, 0] = track.root_mm, sd_root[:, 3:]
+        together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
+        together[:, 0] = track.cov_root[:, *np.triu_indices(6, 1)]
+        return {
+            **self._who, **self._when(part, n_rows),
+            "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
+            **_xyz("w{}_rad", turn), **_xyz("sd_w{}_rad", spread), **_xyz("t{}_mm", shift),
+            **_xyz("sd_t{}_mm", sd_shift),
+            **{name: together[..., k].ravel() for k, name in enumerate(ROOT_COVARIANCES)},
+        }  # fmt: skip
+
+    def missing_before(self) -> NDArray[np.int64]:
+        """(n,) frames that the camera did not deliver just before each frame."""
+        missing = np.zeros(self.track.n_frames, np.int64)
+        for gap in self.camera_gaps:
+            after = int(np.searchsorted(self.track.times_ns, gap.stop_ns))
+            if gap.n_frames_missing and after < len(missing):
+                missing[after] += gap.n_frames_missing
+        return missing
+
+    def gaps(self) -> Block:
+        """The table `gaps`, in order of time.
+
+        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames without a pose.
+        """
+        time = self.time_s
+        count = frame_count(self.frame_index)
+        found = self._camera_gaps()
+        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", *LOST))
+        stops = stop_times(time)
+        for start, stop, reason in stretches(lost):
+            if reason:
+                span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
+                found.append((*span, stop - start, str(reason)))
+        found.sort()
+        names = ("start_s", "stop_s", "start_frame", "stop_frame", "n_frames_missing", "reason")
+        values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
+        kinds = (float, float, np.int64, np.int64, np.int64, str)
+        return {**self._who, **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)}}
+
+    def flips(self, flips: Sequence[Flip]) -> Block:
+        """The table `flips`, in order of time."""
+        time, count = self.time_s, frame_count(self.frame_index)
+        stops = stop_times(time)
+        return {
+            **self._who,
+            "start_s": np.array([time[flip.start] for flip in flips]),
+            "stop_s": np.array([stops[flip.stop - 1] for flip in flips]),
+            "start_frame": np.array([count[flip.start] for flip in flips], np.int64),
+            "stop_frame": np.array([count[flip.stop] for flip in flips], np.int64),
+            "p_flip": np.array([flip.p_flip for flip in flips], float),
+            "applied": np.array([flip.applied for flip in flips], bool),
+            "source": np.array([flip.source for flip in flips], str),
+            "undone_at": np.array([flip.undone_at for flip in flips], str),
+        }
+
+    def _camera_gaps(self) -> list[_Found]:
+        """Where the recording's time is not a steady camera's, as rows of the table `gaps`."""
+        time, found = self.time_s, []
+        stops = stop_times(time)
+        for gap in self.camera_gaps:
+            row = int(np.searchsorted(self.track.times_ns, gap.stop_ns if gap.n_frames_missing else gap.start_ns))
+            if row == len(time):
+                continue
+            frame = int(self.frame_index[row])
+            if gap.n_frames_missing:
+                span = (float(stops[row - 1]) if row else float(time[row]), float(time[row]), frame, frame)
+            else:
+                span = (float(time[row]), float(stops[row]), frame, frame + 1)
+            found.append((*span, gap.n_frames_missing, gap.reason))
+        return found
+
+    @property
+    def _who(self) -> dict[str, str]:
+        return {"session_id": self.session_id, "individual": self.individual}
+
+    def _when(self, part: slice, repeat: int) -> dict[str, Any]:
+        times = self.track.times_ns
+        since = np.diff(times[max(part.start - 1, 0) : part.stop]) * 1e-9
+        columns = {
+            "frame_index": self.frame_index[part], "time_s": (times[part] - times[:1]).astype(np.float64) * 1e-9,
+            "dt_s": since if part.start else np.concatenate([[np.nan], since])[: len(times[part])],
+        }  # fmt: skip
+        return {name: np.repeat(column, repeat) for name, column in columns.items()}
+
+    def _parts(self, rows_per_frame: int) -> Iterator[slice]:
+        for part in blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame)):
+            yield part
+            self.track.rest()
+
+
+def _xyz(name: str, values: Array) -> dict[str, Array]:
+    return {name.format(axis): values[:, :, k].ravel() for k, axis in enumerate("xyz")}
+
+
+def _log(rotation: Array) -> Array:
+    """Rotation vectors (n, 3) of rotations (n, 3, 3), NaN where the rotation is."""
+    known = np.isfinite(rotation).all(axis=(1, 2))
+    omega = np.full((len(rotation), 3), np.nan)
+    omega[known] = so3.log(rotation[known])
+    return omega
+
+
+def nearness(sd: Array, radius: Array) -> Array:
+    """Probability that a Gaussian point in space with `sd` along each axis lies within `radius` of its mean."""
+    from scipy.special import erf
+
+    r = radius / np.maximum(sd, 1e-9)
+    return np.asarray(erf(r / np.sqrt(2.0)) - np.sqrt(2.0 / np.pi) * r * np.exp(-0.5 * r * r))
+
+
+def seconds(times_ns: NDArray[np.int64]) -> Array:
+    """(n,) seconds since the first of integer nanoseconds (n,)."""
+    return (times_ns - times_ns[:1]).astype(np.float64) * 1e-9
+
+
+def median_step(time_s: Array) -> float:
+    """The usual time from one frame to the next, s; 0 for a single frame."""
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def gap_follows(time_s: Array) -> NDArray[np.bool_]:
+    """(n,) True where frames are missing after this one, and at the last frame."""
+    step = np.diff(time_s)
+    return np.append(step > GAP_FACTOR * median_step(time_s), True)[: len(time_s)]
+
+
+def stop_times(time_s: Array) -> Array:
+    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median step later."""
+    stops: Array = np.append(time_s[1:], np.nan)[: len(time_s)]
+    alone = gap_follows(time_s)
+    stops[alone] = time_s[alone] + median_step(time_s)
+    return stops
+
+
+def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n + 1,) the camera's count of every row and of the row after the last."""
+    return np.append(frame_index, frame_index[-1:] + 1)
+
+
+def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
+    """Runs of equal labels (n,) as (start, stop, label), stop exclusive."""
+    if len(labels) == 0:
+        return []
+    return [(int(a), int(b), label) for a, b, label in zip(*runs_of(labels), strict=True)]
+
+
+def rows_only(rows: Rows) -> pd.DataFrame:
+    """A kinematics table without any measure."""
+    return rows.frames_table([column.name for column in FRAMES[:5]])
+
+
+def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.DataFrame:
+    """The columns that every table `bouts` has, from the table `frames` of the ethogram's times."""
+    import pandas as pd
+
+    times_ns, index = frames["time_ns"].to_numpy(np.int64), frames["frame_index"].to_numpy(np.int64)
+    first = int(times_ns[0]) if len(times_ns) else 0
+    start_ns = np.array([bout.start_ns for bout in ethogram], np.int64)
+    stop_ns = np.array([bout.stop_ns for bout in ethogram], np.int64)
+    count = np.append(index, index[-1:] + 1)
+    n = len(ethogram)
+    return pd.DataFrame({
+        "session_id": pd.Series([frames["session_id"].iloc[0]] * n, dtype="str"),
+        "individual": pd.Series([frames["individual"].iloc[0]] * n, dtype="str"),
+        "action": pd.Series([bout.action for bout in ethogram], dtype="str"),
+        "start_s": (start_ns - first) * 1e-9, "stop_s": (stop_ns - first) * 1e-9,
+        "duration_s": (stop_ns - start_ns) * 1e-9,
+        "start_frame": count[np.searchsorted(times_ns, start_ns)],
+        "stop_frame": count[np.searchsorted(times_ns, stop_ns)],
+        "score": np.array([bout.score for bout in ethogram], float),
+        "source": pd.Series([ethogram.source] * n, dtype="str"),
+        "model_hash": pd.Series([model_hash] * n, dtype="str"),
+    })  # fmt: skip

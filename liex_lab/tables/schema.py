@@ -1,0 +1,334 @@
+"""The tables of a session: every column listed once, and the one way a table gets to disk and back.
+
+The schema, the writer, the reader, columns.json and the report's glossary all read `TABLES`. Tables that other rooms
+make (behaviour) bring their own `Column` entries; a column without an entry is refused by `write_table`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import SessionError
+from liex_lab.runtime.memory import blocks, give_back, let_go
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+_BEGINS_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
+ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
+Block = Mapping[str, Any]  # column -> one value for all rows, or an array
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table, and what a reader has to know about it. An empty unit means a number without one."""
+
+    table: str
+    name: str
+    dtype: str
+    unit: str
+    meaning: str
+    formula: str = ""
+    source: str = ""
+    unreliable_below_fps: float | None = None
+    since: str = "0.1"
+
+
+def columns(table: str, *rows: tuple[str, ...]) -> tuple[Column, ...]:
+    """The columns of one table from rows of (name, dtype, unit, meaning[, formula[, source]])."""
+    made = []
+    for row in rows:
+        name, dtype, unit, meaning, formula, source = (*row, "", "")[:6]
+        made.append(Column(table, name, dtype, unit, meaning, formula, source))
+    return tuple(made)
+
+
+_WHO = (
+    ("session_id", "string", "", "name of the session: one recording's results"),
+    ("individual", "string", "", "name of the animal within the session; the sessions table maps it to subject_id"),
+)
+_WHEN = (
+    ("frame_index", "int64", "", "the camera's own count of the frame", "", "recording"),
+    ("time_s", "float64", "s", "time of the frame since the recording's first frame", "", "the recording's clock"),
+    ("dt_s", "float64", "s", "time since the previous recorded frame; empty at the first", "", "the recording's clock"),
+)
+_SPAN = (
+    ("start_s", "float64", "s", "onset, since the first frame", "", ""),
+    ("stop_s", "float64", "s", "time of the first frame outside; at a gap or the end, last frame + median dt", "", ""),
+    ("start_frame", "int64", "", "frame_index of the first frame inside"),
+    ("stop_frame", "int64", "", "frame_index of the first frame outside; at the end of the recording, last + 1"),
+)
+_AXES = "arena frame: z up from the floor, origin below the camera, x along the picture's rows"
+_MID = "joints lie on the body's mid-axis, not on the skin"
+
+FRAMES = columns(
+    "frames", *_WHO, *_WHEN,
+    ("time_ns", "int64", "ns", "time stamp of the frame as recorded", "", "the recording's clock"),
+    ("gap_before", "int64", "", "frames that the camera did not deliver just before this one", "", "recording"),
+    ("predicted_error_mm", "float64", "mm", "joint error to be expected in this frame, mean over the joints", "",
+     "learned metric of the model, and the smoother"),
+    ("residual_mm", "float64", "mm", "distance between the body's surface and the depth seen, within the animal, with "
+     "the pose that the frame says by itself", "median of |rendered - observed|", "fit"),
+    ("n_foreground_px", "int64", "px", "pixels taken for the animal", "", "foreground"),
+    *((f"centroid_{a}_mm", "float64", "mm", f"centre of the animal's outline as seen from above; {_AXES}",
+       "mean over its pixels, weighted by the area they cover", "foreground") for a in "xy"),
+    ("centroid_z_mm", "float64", "mm", "mean height of the animal's back above the floor", "", "foreground"),
+    ("centroid_u_px", "float64", "px", "column of the centroid in the depth picture", "", "foreground"),
+    ("centroid_v_px", "float64", "px", "row of the centroid in the depth picture", "", "foreground"),
+    ("wall_distance_mm", "float64", "mm", "distance of the centroid from the nearest wall, negative beyond it; empty "
+     "where the arena's shape is not known", "to the circle or rectangle in session.json, arena", "arena"),
+    ("zone", "string", "", "the zones that the centroid lies in, in the order of the zones' file, with ; between them; "
+     "empty outside all of them and where there is no centroid", "", "arena.zones of the plan"),
+    ("spine_mm", "float64", "mm", "length of the fitted chain of joints, all bones added up",
+     "scale x length of the skeleton at home", "fit"),
+    ("scale", "float64", "", "size of the animal relative to the skeleton's file", "", "fit"),
+    ("p_flip", "float64", "", "probability that head and tail are exchanged in this pose", "two states over the whole "
+     "recording: what each frame says of either, and how fast animals turn", "tracker"),
+    ("bridged", "bool", "", "nothing was measured; the pose is what lies between two measured ones, of which the "
+     "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour leave it out", "",
+     "tracker"),
+    ("flag", "string", "", "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
+     "person placed joints of it; not_found or no_depth: nothing was measured, and there is no pose where it is not "
+     "bridged", "", "tracker"),
+)  # fmt: skip
+
+POSES = columns(
+    "poses", *_WHO, *_WHEN,
+    ("joint", "string", "", f"name of the joint in the skeleton; {_MID}"),
+    ("x_mm", "float64", "mm", f"position of the joint; {_AXES}; {_MID}", "", "fit"),
+    ("y_mm", "float64", "mm", f"position of the joint; {_AXES}; {_MID}", "", "fit"),
+    ("z_mm", "float64", "mm", f"height of the joint above the floor; {_AXES}; {_MID}", "", "fit"),
+    ("u_px", "float64", "px", "column of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
+     "pinhole projection", "fit"),
+    ("v_px", "float64", "px", "row of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
+     "pinhole projection", "fit"),
+    ("score", "float64", "", "probability that the joint lies within 10 % of the spine's length of the truth",
+     "chi distribution with 3 degrees of freedom at 0.1 spine_mm / sd_mm", "sd_mm"),
+    ("sd_mm", "float64", "mm", "standard deviation of the joint along one axis", "sqrt(trace of covariance / 3)",
+     "posterior of the smoother"),
+)  # fmt: skip
+
+_TURN = "rotation vector relative to the parent joint; row 'root': the body's base relative to the arena"
+_SHIFT = "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
+_SPREAD = "posterior of the smoother"
+_OF_ROOT = ("wx_rad", "wy_rad", "wz_rad", "tx_mm", "ty_mm", "tz_mm")
+# of each pair of them, row by row of the upper triangle: name and unit
+ROOT_COVARIANCES = {
+    f"cov_{a[:2]}_{b[:2]}_{unit}": unit.replace("2", "²").replace("_", " ")
+    for k, a in enumerate(_OF_ROOT) for b in _OF_ROOT[k + 1 :]
+    for unit in [a[3:] + "2" if a[3:] == b[3:] else f"{a[3:]}_{b[3:]}"]
+}  # fmt: skip
+ROTATIONS = columns(
+    "rotations", *_WHO, *_WHEN,
+    ("joint", "string", "", "name of the joint; 'root' is the rigid transform of the body's base, T_arena_root"),
+    *((f"w{axis}_rad", "float64", "rad", f"{axis} of the {_TURN}", "logarithm of the rotation", "fit")
+      for axis in "xyz"),
+    *((f"sd_w{axis}_rad", "float64", "rad", f"standard deviation of w{axis}_rad, in the joint's own frame", "", _SPREAD)
+      for axis in "xyz"),
+    *((f"t{axis}_mm", "float64", "mm", f"{axis}; {_SHIFT}", "", "fit") for axis in "xyz"),
+    *((f"sd_t{axis}_mm", "float64", "mm", f"standard deviation of t{axis}_mm, in the root's own frame", "", _SPREAD)
+      for axis in "xyz"),
+    *((name, "float64", unit, f"row 'root' only: covariance of the root's {name[4:6]} and {name[7:9]}, in its own "
+       "frame; the variances are the squares of their sd_", "", _SPREAD) for name, unit in ROOT_COVARIANCES.items()),
+)  # fmt: skip
+
+BOUTS = columns(
+    "bouts", *_WHO,
+    ("action", "string", "", "a word of the ethogram's vocabulary"),
+    *_SPAN[:2],
+    ("duration_s", "float64", "s", "length of the bout", "stop_s - start_s"),
+    *_SPAN[2:],
+    ("score", "float64", "", "how well the bout fits its action, 0 to 1; for rules, the share of its frames that "
+     "satisfy the rule"),
+    ("source", "string", "", "who named it: rule, model or human"),
+    ("model_hash", "string", "", "hash of the model that named it; empty for a rule"),
+)  # fmt: skip
+
+GAPS = columns(
+    "gaps", *_WHO, *_SPAN,
+    ("n_frames_missing", "int64", "", "frames without a pose, or never delivered by the camera; 0 where only a time "
+     "stamp was moved, 1 where the clock jumped, for how many it were nobody knows"),
+    ("reason", "string", "", "camera_dropped: never recorded, start_frame = stop_frame = the next frame; clock_jumped: "
+     "the camera was stopped, or its clock set, before the frame; stamp_repeated, stamp_out_of_order: this frame's own "
+     "time stamp could not be true and was moved; no_depth: recorded without any depth; tracker_lost: nothing in the "
+     "frame looks like the animal"),
+)  # fmt: skip
+
+FLIPS = columns(
+    "flips", *_WHO, *_SPAN,
+    ("p_flip", "float64", "", "probability that head and tail were exchanged: where applied, in what the single frames "
+     "said, else in the tables", "mean over the span", "tracker"),
+    ("applied", "bool", "", "whether the exchange was undone in the tables"),
+    ("source", "string", "", "who found it: model or human"),
+    ("undone_at", "string", "", "when a human took the correction back, ISO 8601; empty otherwise"),
+)  # fmt: skip
+
+SESSIONS = columns(
+    "sessions", *_WHO,
+    ("subject_id", "string", "", "the animal across the study; empty when the recording does not say"),
+    ("group", "string", "", "experimental group; empty until stated"),
+    ("cage", "string", "", "home cage or tank; empty until stated"),
+    ("sex", "string", "", "sex; empty until stated"),
+    ("batch", "string", "", "batch of the experiment; empty until stated"),
+    ("session_start_time", "string", "", "when the recording began, ISO 8601 with zone; empty when unknown"),
+    ("n_frames", "int64", "", "recorded frames"),
+    ("n_frames_observed", "int64", "", "recorded frames with a pose"),
+    ("observed_s", "float64", "s", "time with a pose",
+     "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt"),
+    ("fps_median", "float64", "1/s", "frames per second", "1 / median dt"),
+    ("calibration_hash", "string", "", "hash of the camera's numbers and its place in the arena"),
+    ("software_version", "string", "", "version of liex_lab"),
+)  # fmt: skip
+
+TABLES: dict[str, tuple[Column, ...]] = {
+    rows[0].table: rows for rows in (FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS)
+}
+
+
+def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
+    """The content of columns.json: every column of `TABLES`, then those of other rooms, each as a plain dict."""
+    entries = [column for rows in TABLES.values() for column in rows] + [column for rows in extra for column in rows]
+    seen: dict[tuple[str, str], Column] = {}
+    for column in entries:
+        if seen.setdefault((column.table, column.name), column) != column:
+            raise SessionError(f"column {column.table}.{column.name} is described twice and differently; keep one")
+    return [asdict(column) for column in seen.values()]
+
+
+def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Schema:
+    """The Arrow schema of a table, with `metadata` as JSON under the key `liex_lab`."""
+    import pyarrow as pa
+
+    kinds = {"string": pa.string(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}
+    fields = [pa.field(column.name, kinds[column.dtype]) for column in schema]
+    described = {**metadata, "columns": {column.name: asdict(column) for column in schema}}
+    return pa.schema(fields, metadata={"liex_lab": json.dumps(described, sort_keys=True)})
+
+
+def write_table(path: Path, schema: Sequence[Column], blocks: Iterable[Block], metadata: Mapping[str, Any]) -> int:
+    """Write a parquet table block by block (row groups of about `ROWS_PER_GROUP` rows) and return its rows.
+
+    Equal blocks give equal bytes: zstd, strings as dictionaries, no time stamps.
+    """
+    import pyarrow.parquet as pq
+
+    arrow = arrow_schema(schema, metadata)
+    texts = [column.name for column in schema if column.dtype == "string"]
+    n_rows = 0
+    with pq.ParquetWriter(path, arrow, compression="zstd", use_dictionary=texts, write_statistics=True) as writer:
+        for block in blocks:
+            batch = _arrow_block(block, schema, arrow)
+            n_rows += batch.num_rows
+            writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
+            del block, batch  # before the next one is made
+    give_back()
+    return n_rows
+
+
+def _arrow_block(block: Block, schema: Sequence[Column], arrow: pa.Schema) -> pa.Table:
+    """One block as Arrow columns in the schema's order."""
+    import pyarrow as pa
+
+    check_described(block, schema)
+    n = max((len(v) for v in block.values() if _is_array(v)), default=1)
+    return pa.Table.from_arrays([_arrow_column(block[f.name], f.type, n) for f in arrow], schema=arrow)
+
+
+def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:
+    """Refuse a table whose columns are not exactly those of its schema."""
+    written, described = list(names), [column.name for column in schema]
+    undescribed = [name for name in written if name not in described]
+    absent = [name for name in described if name not in written]
+    if undescribed or absent:
+        raise SessionError(
+            f"table {table or schema[0].table} has columns without a description {undescribed} and lacks {absent}; "
+            "every column is listed once, with its meaning, in the table's schema"
+        )
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, str)
+
+
+def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
+    """One column: a scalar stands for all rows, a `Words` for repeated names."""
+    import pyarrow as pa
+
+    if isinstance(value, Words):
+        return pa.DictionaryArray.from_arrays(value.codes.astype(np.int32), list(value.words)).cast(kind)
+    if not _is_array(value):
+        return pa.repeat(pa.scalar(value, kind), n)
+    if kind == pa.string():
+        return pa.array([str(word) for word in value], kind)
+    return pa.array(np.asarray(value), kind)
+
+
+@dataclass(frozen=True)
+class Words:
+    """A column of few different names: `words[codes]`, without a Python string per row."""
+
+    codes: NDArray[np.int64]
+    words: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+
+def harmless(value: Any) -> Any:
+    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe before it."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
+
+
+def as_it_was(value: Any) -> Any:
+    """What `harmless` was given."""
+    return value[1:] if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA else value
+
+
+def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:
+    """A block as a data frame of the schema's dtypes, as reading the table back would give it.
+
+    copy: False where the block's arrays may go on as the table's columns, wherever they lie.
+    """
+    import pandas as pd
+
+    n = max((len(v) for v in block.values() if _is_array(v)), default=1)
+    data: dict[str, Any] = {}
+    for column in schema:
+        if column.name not in block:
+            continue
+        value = block[column.name]
+        if isinstance(value, Words):
+            value = np.array(value.words, dtype=object)[value.codes]
+        elif not _is_array(value):
+            value = [value] * n
+        data[column.name] = pd.Series(value, dtype=_pandas_dtype(column), copy=copy)
+    return pd.DataFrame(data, copy=False)
+
+
+def empty_table(schema: Sequence[Column]) -> pd.DataFrame:
+    """A data frame without rows, of the right dtypes."""
+    return to_pandas(schema, {column.name: [] for column in schema})
+
+
+def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
+    """A data frame's columns as blocks for `write_table`."""
+    for part in blocks(max(len(table), 1), ROWS_PER_GROUP):
+        yield {str(name): table[name].iloc[part].to_numpy() for name in table.columns}
+        let_table_go(table)
+
+
+def let_table_go(table: pd.DataFrame) -> None:
+    """Let go of the memory of a table's columns that lie on disk, until they are looked at again."""
+    let_go(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
+
+
+def _pandas_dtype(column: Column) -> str:
+    return "str" if column.dtype == "string" else column.dtype

@@ -1,0 +1,175 @@
+"""Kernel of the smoother: all coordinates of a pose at once, outliers weighed down in a few passes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from liex_lab.body._kernels import place_joints
+from liex_lab.tracking._kalman_kernels import gains, run_place, run_rotations, run_vector
+
+_PASSES = 4
+
+
+class Body(NamedTuple):
+    """A skeleton for the kernels, see `place_joints`; free (m, 2): joint and axis of each angle; length_mm; tip."""
+
+    parents: NDArray[np.int64]
+    offsets: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    moves: NDArray[np.bool_]
+    free: NDArray[np.int64]
+    length_mm: float
+    tip: int
+
+
+class Moves(NamedTuple):
+    """A `Motion` for the kernels: rows of error, drive and fade; place_error (3,), place_drive (3,) lengths^2/s^3."""
+
+    place_error: NDArray[np.float64]
+    place_drive: NDArray[np.float64]
+    place_fade: float
+    turn: NDArray[np.float64]
+    bend: NDArray[np.float64]
+    size: NDArray[np.float64]
+    freedom: float
+    reject: float
+    lasting: float
+
+
+class Poses(NamedTuple):
+    """Of n frames: rotation (n, 3, 3), place (n, 3) mm, angles (n, J, 3), log_scale (n,), joints (n, J, 3) mm."""
+
+    rotation: NDArray[np.float64]
+    place: NDArray[np.float64]
+    angles: NDArray[np.float64]
+    log_scale: NDArray[np.float64]
+    joints: NDArray[np.float64]
+
+
+class Spread(NamedTuple):
+    """Of n frames: covariance of the joints' middle (n, 3, 3) mm^2; variances of the base's rotation about its own axes
+    and of the other joints' angles (n, 3) rad^2.
+    """
+
+    middle: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    bend: NDArray[np.float64]
+
+
+@njit(cache=True)
+def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
+    """Fill `made` and `spread` with the curve through `seen`, and used (n,) with the frames that it goes by."""
+    n, n_joints = error.size, body.parents.size
+    weight, middle = np.ones(n), np.empty((n, 3))
+    frame = np.empty((n, 3, 3))
+    for t in range(n):
+        used[t] = known[t]
+        for k in range(3):
+            total = 0.0
+            for j in range(n_joints):
+                total += seen.joints[t, j, k]
+            middle[t, k] = total / n_joints
+        if known[t]:
+            _own_frame(seen.joints[t, body.tip] - seen.joints[t, 0], frame[t])
+    for again in range(_PASSES):
+        if again:
+            n_used = 0
+            for t in range(n):
+                if known[t]:
+                    off = 0.0
+                    for j in range(n_joints):
+                        apart = 0.0
+                        for k in range(3):
+                            apart += (seen.joints[t, j, k] - made.joints[t, j, k]) ** 2
+                        off += np.sqrt(apart) / n_joints
+                    off /= error[t]
+                    weight[t] = (moves.freedom + 1.0) / (moves.freedom + off * off)
+                    used[t] = off <= moves.reject
+                    n_used += used[t]
+            if n_used == 0:
+                used[:] = known
+        _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, used)
+
+
+@njit(cache=True)
+def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, used):
+    """One way forward and back, with each measurement's variance divided by its weight."""
+    n, m = error.size, body.free.shape[0]
+    start = 0
+    while not used[start]:
+        start += 1
+    variance, r = np.full(n, np.inf), np.zeros((n, 3, 3))
+    for t in range(n):
+        if used[t]:
+            variance[t] = (1.0 - moves.lasting**2) * error[t] ** 2 / weight[t]
+            for i in range(3):
+                for k in range(3):
+                    for a in range(3):
+                        r[t, i, k] += frame[t, i, a] * frame[t, k, a] * variance[t] * moves.place_error[a] ** 2
+    out, drive = np.empty((n, 3)), moves.place_drive * body.length_mm**2
+    run_place(times, middle, r, used, start, drive, moves.place_fade, out, spread.middle)
+    keep, go, forward = np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2))
+    back, filtered, predicted = np.zeros((3, n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
+    smoothed, rate, value = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n)
+    for a in range(3):
+        _gains_of(times, variance, moves.turn[a], body.length_mm, start, keep[a], go[a], forward[a], back[a], filtered,
+                  predicted, smoothed, spread.turn[:, a])  # fmt: skip
+    run_rotations(seen.rotation, used, start, keep, go, forward, back, made.rotation, np.zeros((n, 3)))
+    for a in range(3):
+        _gains_of(times, variance, moves.bend[a], body.length_mm, start, keep[a], go[a], forward[a], back[a], filtered,
+                  predicted, smoothed, spread.bend[:, a])  # fmt: skip
+    for i in range(m):
+        j, a = body.free[i]
+        run_vector(seen.angles[:, j, a].copy(), used, start, keep[a], go[a], forward[a], back[a], value, rate)
+        made.angles[:, j, a] = value
+    _gains_of(times, variance, moves.size, body.length_mm, start, keep[0], go[0], forward[0], back[0], filtered,
+              predicted, smoothed, rate)  # fmt: skip
+    run_vector(seen.log_scale, used, start, keep[0], go[0], forward[0], back[0], made.log_scale, rate)
+    _place(body, out, made)
+
+
+@njit(cache=True)
+def _gains_of(times, variance, moves, length, start, keep, go, forward, back, filtered, predicted, smoothed, left):
+    """The gains of a group with this error, drive and fade, and the variance (n,) that is left."""
+    gains(times, (moves[0] / length) ** 2 * variance, moves[1], moves[2], start, keep, go, forward, back, filtered,
+          predicted, smoothed)  # fmt: skip
+    for t in range(times.size):
+        left[t] = smoothed[max(t, start), 0, 0]
+
+
+@njit(cache=True)
+def _place(body, middle, made):
+    """Put the poses where their joints' middles (n, 3) are."""
+    n_joints = body.parents.size
+    made.place[:] = 0.0
+    place_joints(body.parents, body.offsets, body.rest, body.moves, made.rotation, made.place, made.angles,
+                 np.exp(made.log_scale), made.joints)  # fmt: skip
+    for t in range(middle.shape[0]):
+        for k in range(3):
+            mean = 0.0
+            for j in range(n_joints):
+                mean += made.joints[t, j, k] / n_joints
+            made.place[t, k] = middle[t, k] - mean
+            for j in range(n_joints):
+                made.joints[t, j, k] += made.place[t, k]
+
+
+@njit(cache=True)
+def _own_frame(along, out):
+    """A frame (3, 3), as columns: along the animal, to its side, and as far up as that leaves."""
+    length = np.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2)
+    a = along / max(length, 1e-9)
+    side = np.array([-a[1], a[0], 0.0])
+    level = np.sqrt(side[0] ** 2 + side[1] ** 2)
+    if level < 1e-6:
+        side[0], side[1], level = 0.0, 1.0, 1.0
+        a[0], a[1], a[2] = 0.0, 0.0, 1.0 if a[2] >= 0 else -1.0
+    side /= level
+    out[:, 0], out[:, 1] = a, side
+    out[0, 2] = a[1] * side[2] - a[2] * side[1]
+    out[1, 2] = a[2] * side[0] - a[0] * side[2]
+    out[2, 2] = a[0] * side[1] - a[1] * side[0]

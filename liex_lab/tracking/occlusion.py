@@ -1,0 +1,119 @@
+"""An animal of which something hides one end: where the rest of it lies is told by the end that is seen.
+
+A pose that was found in what is seen of an animal lies in the middle of it. Which end is hidden is told by where things
+lie before the animal; the other end is where it is seen to end, less what is usually seen of it beyond or short of the
+chain's end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.foreground.height_maps import Crops, Foreground
+from liex_lab.geometry import SE3
+from liex_lab.tracking.observations import joints_of
+
+Array = NDArray[np.float64]
+
+_BEFORE = 2.0  # roots of the animal's area: what is so much nearer lies before it
+_WHOLE = 0.95  # of the animal's usual area: it is all there
+_ASIDE = 0.25  # of half of what is seen: where nothing lies so far to one end, no one knows which end is hidden
+_SLIDE = 0.45  # of the share that is hidden: a chain that was fitted to the rest slides no farther
+_REACH_PX = 3  # crop pixels from the animal: what lies before it is looked for
+
+
+@dataclass(frozen=True)
+class FreeEnds:
+    """Slides poses along their axes to where the end that is seen says.
+
+    begins, ends: where what is seen of a whole animal begins and ends along the line from its base (0) to its tip (1).
+    """
+
+    skeleton: Skeleton
+    scene: Foreground
+    begins: float = 0.0
+    ends: float = 1.0
+
+    @staticmethod
+    def fit(
+        skeleton: Skeleton, scene: Foreground, pose: Pose, crops: Crops, depths: NDArray[np.float32]
+    ) -> FreeEnds:  # fmt: skip
+        """From poses (n), camera frame, of frames (n, H, W) mm; crops: cut along the optical axis."""
+        ends = FreeEnds(skeleton, scene)
+        sight = ends._sight(pose, crops, depths)
+        whole = (sight[:, 0] > _WHOLE) & (sight[:, 1] == 0)
+        if not whole.any():
+            return ends
+        begins, stops = np.median(sight[whole, 3:], axis=0)
+        return replace(ends, begins=float(begins), ends=float(stops))
+
+    def slid(self, pose: Pose, crops: Crops, depths: NDArray[np.float32]) -> Pose:
+        """The poses (n), camera frame, of frames (n, H, W) mm, each where its free end says."""
+        sight = self._sight(pose, crops, depths)
+        shown, covered, aside, begins, ends = sight.T
+        most = _SLIDE * np.clip(1.0 - shown, 0.0, 1.0)
+        way = np.where(aside > 0, np.clip(begins - self.begins, 0.0, most), np.clip(ends - self.ends, -most, 0.0))
+        way[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
+        joints = joints_of(self.skeleton, pose)
+        along = joints[:, self.skeleton.tip] - joints[:, 0]
+        return replace(pose, root=SE3(pose.root.rotation, pose.root.translation + way[:, None] * along))
+
+    def _sight(self, pose: Pose, crops: Crops, depths: NDArray[np.float32]) -> Array:
+        """What is seen (n, 5) of each animal, see `_look`, its area over the usual one."""
+        joints = joints_of(self.skeleton, pose)
+        ends = self.scene.camera.project(joints[:, [0, self.skeleton.tip]])
+        out = np.zeros((len(ends), 5))
+        before = _BEFORE * float(np.sqrt(self.scene.area_mm2))
+        _look(crops.heights, crops.origin, crops.step, crops.distance, depths, ends, before, out)
+        camera = self.scene.camera
+        out[:, 0] /= camera.fx * camera.fy * self.scene.area_mm2
+        return out
+
+
+@njit(cache=True, parallel=True)
+def _look(heights, origin, step, distance, depths, ends, before, out):
+    """Along the line from base to tip, ends (n, 2, 2) px, into out (n, 5): pixels seen times their squared depth, how
+    many of them lie beside a thing that is nearer by `before` mm or beside the picture's edge, how far these are from
+    the middle of all over half of what is seen, and where that begins and ends.
+    """
+    for i in prange(heights.shape[0]):
+        size, depth = heights.shape[1], depths[i]
+        line = ends[i, 1] - ends[i, 0]
+        squared = max(line[0] ** 2 + line[1] ** 2, 1.0)
+        n, covered, aside, middle, first, last = 0, 0, 0.0, 0.0, np.inf, -np.inf
+        for r in range(size):
+            for c in range(size):
+                v, u = origin[i, 1] + step[i] * r, origin[i, 0] + step[i] * c
+                if heights[i, r, c] <= 0 or not (0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]):
+                    continue
+                z = distance[i] - heights[i, r, c] / 16.0
+                if depth[v, u] > 0 and abs(depth[v, u] - z) > 0.5 * before:
+                    continue  # a hole in the height map, filled from beside it
+                at = ((u - ends[i, 0, 0]) * line[0] + (v - ends[i, 0, 1]) * line[1]) / squared
+                n, middle, first, last = n + 1, middle + at, min(first, at), max(last, at)
+                out[i, 0] += (step[i] * z) ** 2
+                if _beside(depth, v, u, step[i], z - before):
+                    covered, aside = covered + 1, aside + at
+        if n > 0:
+            out[i, 1], out[i, 3], out[i, 4] = covered, first, last
+        if covered > 0:
+            out[i, 2] = (aside / covered - middle / n) / max(0.5 * (last - first), 1e-6)
+
+
+@njit(cache=True)
+def _beside(depth, v, u, step, nearer):
+    """Whether a pixel lies beside one that is nearer than this, or beside the picture's edge."""
+    for k in range(1, _REACH_PX + 1):
+        for dv, du in ((k, 0), (-k, 0), (0, k), (0, -k)):
+            row, column = v + dv * step, u + du * step
+            if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
+                return True
+            if 0 < depth[row, column] < nearer:
+                return True
+    return False

@@ -1,0 +1,296 @@
+"""From what single frames say to the track: the whole recording at once, head and tail told apart over all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.geometry import SE3, so3
+from liex_lab.optics.camera import Camera
+from liex_lab.runtime.memory import Room, blocks
+from liex_lab.tracking.association import NONE, Chain
+from liex_lab.tracking.motion_model import Tuning
+from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
+from liex_lab.tracking.smoother import Curve, smooth
+from liex_lab.tracking.track import Flip, Track, Tracked
+
+Array = NDArray[np.float64]
+
+_BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
+# nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was passed by is a
+# measurement after all, unless it shows less than this share of what the animal usually shows, or more than that many
+# times as much; of half an animal beside a bar the pose errs by this share of the length that is not seen. Each time
+# that some are taken, the curve comes nearer to others.
+_ADMIT, _LEAST, _MOST, _UNSEEN, _TIMES = 1.0, 0.5, 1.5, 0.4, 2
+_TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Whom a track is of, and before which camera.
+
+    length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long a
+    stretch without a measurement is bridged, and half as far into a longer one from both its ends; joint_share (J,):
+    each joint's error over the mean. stretch_sd: by which share all distances from the base may be off throughout, for
+    an animal whose ends a sensor eats is taken for a smaller one; None where nothing is known of it.
+    """
+
+    skeleton: Skeleton
+    camera: Camera
+    T_arena_camera: SE3
+    length_mm: float
+    doubtful_mm: float
+    bridge_s: float
+    joint_share: tuple[float, ...]
+    stretch_sd: float | None = None
+
+
+def track_whole(
+    subject: Subject, seen: Observations, corrections: Sequence[Flip] = (), tuning: Tuning | None = None,
+    room: Room = np.empty,
+) -> Tracked:  # fmt: skip
+    """The track of a recording from what was seen in all of its frames; corrections: what a human says of flips.
+
+    tuning: None takes the animal's own. room: where the track is to lie; of everything else no more than a block of
+    frames is in memory.
+    """
+    tuning = tuning or Tuning.of(subject.skeleton.name)
+    chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
+    joints = chain.joints(seen, room)
+    path = chain.path(seen, joints=joints, room=room)
+    doubt = chain.doubt(seen, path, joints, room)
+    del joints
+    error = seen.along(seen.error_mm, path)
+    turned = _turn_round(seen, path, doubt, corrections)
+    track = Track.empty(subject.skeleton, seen.times_ns, room=room)
+    used, seconds = np.zeros(len(seen), np.bool_), seen.seconds
+
+    def draw(rows: slice) -> None:
+        first, last = max(0, rows.start - MARGIN), min(len(seen), rows.stop + MARGIN)
+        around = slice(first, last)
+        pose = seen[around].pose(path[around])
+        _reverse(subject.skeleton, pose, turned[around])
+        curve = smooth(subject.skeleton, seconds[around], pose, error[around], subject.length_mm, tuning.motion)
+        curve = curve[rows.start - first : rows.stop - first]
+        _write(subject, track[rows], curve, tuning)
+        used[rows] = curve.used
+
+    shown = seen.along(seen.n_px, path)
+    usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
+    for rows in blocks(len(seen), _BLOCK):
+        draw(rows)
+        _rest(track, seen)
+    for _ in range(_TIMES):
+        taken = path == NONE
+        for rows in blocks(len(seen), _BLOCK):
+            _admit(subject, seen[rows], path[rows], error[rows], track[rows], usual_px)
+        taken &= path != NONE
+        for rows in blocks(len(seen), _BLOCK):
+            if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
+                draw(rows)
+            _rest(track, seen)
+    measured = used & (path >= 0)
+    bridged = short_gaps(seconds, measured, subject.bridge_s)
+    for rows in blocks(len(seen), _BLOCK):
+        _settle(subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows])
+        _rest(track, seen)
+    flips = _flips(seen, track)
+    return Tracked(track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))))
+
+
+def _rest(track: Track, seen: Observations) -> None:
+    track.rest()
+    seen.rest()
+
+
+def _turn_round(
+    seen: Observations, path: NDArray[np.int64], doubt: Array, corrections: Sequence[Flip]
+) -> NDArray[np.int64]:  # fmt: skip
+    """Exchange head and tail in the spans that a human says, of which there is no doubt then: in the path where a frame
+    has that hypothesis. Returns how often (n,) the pose itself is to be turned round elsewhere.
+    """
+    turned = np.zeros(len(seen), np.int64)
+    for span in corrections:
+        if span.undone_at:
+            continue
+        for t in range(span.start, min(span.stop, len(seen))):
+            if path[t] == NONE:
+                continue
+            if seen.known[t, path[t] ^ 1]:
+                path[t] ^= 1
+            else:
+                turned[t] += 1
+        doubt[span.start : span.stop] = 0.0
+    return turned
+
+
+def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
+    """Turn poses (n) round so many times (n,) each, in place."""
+    for t in np.repeat(np.arange(len(turned)), turned):
+        other = reversed_pose(skeleton, pose[t : t + 1])
+        pose.root.rotation[t], pose.root.translation[t] = other.root.rotation[0], other.root.translation[0]
+        pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
+
+
+def _admit(
+    subject: Subject, seen: Observations, path: NDArray[np.int64], error: Array, track: Track, usual_px: float
+) -> None:  # fmt: skip
+    """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames that were passed by.
+
+    It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an animal how it lies.
+    """
+    best = np.full(len(seen), _ADMIT)
+    passed = (path == NONE) & np.isfinite(track.predicted_error_mm)
+    for h in range(seen.score.shape[1]):
+        shown = seen.n_px[:, h] / max(usual_px, 1.0)
+        rows = np.flatnonzero(passed & seen.known[:, h] & (shown >= _LEAST) & (shown <= _MOST))
+        if not len(rows):
+            continue
+        joints = joints_of(subject.skeleton, seen.pose(np.full(len(seen), h))[rows])
+        unseen = _UNSEEN * subject.length_mm * np.maximum(1.0 - shown[rows], 0.0)
+        said = np.hypot(seen.error_mm[rows, h], unseen)
+        off = np.linalg.norm(joints - track.joints_mm[rows], axis=-1).mean(axis=1)
+        off /= np.hypot(said, track.predicted_error_mm[rows])
+        better = off < best[rows]
+        path[rows[better]], best[rows[better]], error[rows[better]] = h, off[better], said[better]
+
+
+def to_track(
+    subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array, ahead: bool = False,
+    told: slice = slice(None), tuning: Tuning | None = None,
+) -> Track:  # fmt: skip
+    """A curve as rows of a track: measured, bridged over a short time, or missing.
+
+    ahead: the curve also goes on for a short time after the last measurement; told: only these rows.
+    """
+    tuning = tuning or Tuning.of(subject.skeleton.name)
+    measured = curve.used & (path >= 0)
+    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
+    track = Track.empty(subject.skeleton, seen.times_ns[told])
+    _write(subject, track, curve[told], tuning)
+    _settle(subject, track, seen[told], path[told], doubt[told], measured[told], bridged[told])
+    return track
+
+
+def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None:
+    """A curve into the rows (n) of a track, whether anything was measured there or not."""
+    pose, motion = curve.pose, tuning.motion
+    track.joints_mm[:] = curve.joints
+    track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
+    track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
+    stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
+    away = stretch_of(stretch, curve.joints)
+    track.sd_mm[:] = np.hypot((curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away)
+    track.predicted_error_mm[:] = np.hypot(curve.error_mm, ERROR_PER_SD * away.mean(axis=1))
+    honest = np.array(motion.honest_root)
+    track.cov_root[:] = covariance_of_root(curve) * (honest[:, None] * honest)
+    track.sd_angles_rad[:] = (curve.sd_bend * motion.honest_bend)[:, None] * subject.skeleton.axes
+    track.sd_angles_rad[:, 0] = 0.0
+
+
+def _settle(
+    subject: Subject, track: Track, seen: Observations, path: NDArray[np.int64], doubt: Array,
+    measured: NDArray[np.bool_], bridged: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Keep of the curve in the rows (n) of a track what was measured or is bridged, and add what was seen."""
+    there = measured | bridged
+    for column in (
+        track.joints_mm, track.predicted_error_mm, track.root_rotation, track.root_mm, track.angles_rad, track.scale,
+        track.sd_mm, track.cov_root, track.sd_angles_rad,
+    ):  # fmt: skip
+        column[~there] = np.nan
+    track.uv_px[there] = subject.camera.project(subject.T_arena_camera.inverse() @ track.joints_mm[there])
+    track.p_flip[there] = doubt[there]
+    _add_sight(track, seen, path, measured)
+    track.bridged[:] = bridged
+    track.flag[measured] = np.where(track.predicted_error_mm > subject.doubtful_mm, "doubtful", "")[measured]
+    track.flag[~measured & ~seen.has_depth] = "no_depth"
+
+
+def covariance_of_root(curve: Curve) -> Array:
+    """Covariance (n, 6, 6) of the root's turn, rad, and shift, mm, about and along its own axes: what the joints'
+    middle may be off, and what a turn about the middle moves the root.
+    """
+    root, out = curve.pose.root, np.zeros((len(curve.joints), 6, 6))
+    lever = np.einsum("nij,ni->nj", root.rotation, curve.joints[:, 0] - curve.joints.mean(axis=1))
+    moved = -so3.hat(lever)  # of a small turn: the shift is its cross product with the lever
+    turn = curve.sd_turn[:, :, None] ** 2 * np.eye(3)
+    out[:, :3, :3], out[:, 3:, :3] = turn, moved @ turn
+    out[:, :3, 3:] = np.swapaxes(out[:, 3:, :3], 1, 2)
+    middle = np.swapaxes(root.rotation, 1, 2) @ curve.cov_middle_mm2 @ root.rotation
+    out[:, 3:, 3:] = middle + moved @ turn @ np.swapaxes(moved, 1, 2)
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
+
+
+def stretch_of(stretch_sd: float, joints: Array) -> Array:
+    """Standard deviations (n, J) mm along one axis of joints (n, J, 3) mm whose distances from the base are all off by
+    about this share.
+    """
+    return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
+
+
+# a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
+ERROR_PER_SD = 1.4
+
+
+def _add_sight(track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]) -> None:
+    """What was seen of the animal where it was measured."""
+    rows, taken = np.flatnonzero(measured), path[measured]
+    track.n_foreground_px[rows] = seen.n_px[rows, taken]
+    track.centroid_mm[rows], track.centroid_px[rows] = seen.centroid_mm[rows, taken], seen.centroid_px[rows, taken]
+    track.residual_mm[rows] = seen.residual_mm[rows, taken]
+
+
+def single_frames(subject: Subject, seen: Observations) -> Track:
+    """What each frame says by itself, without its neighbours."""
+    path = np.where(seen.known[:, 0], 0, NONE)
+    pose, error = seen.pose(path), seen.along(seen.error_mm, path)
+    moves = Tuning.of(subject.skeleton.name).motion.packed
+    turn, bend = (group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend))
+    middle = (moves.place_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
+    curve = Curve(pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0)
+    return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
+
+
+def short_gaps(
+    seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
+) -> NDArray[np.bool_]:  # fmt: skip
+    """(n,) True in frames between two measured ones of which the nearer is no farther than half of bridge_s, so that a
+    gap no longer than bridge_s is bridged whole; ahead: and so long after the last one.
+    """
+    rows = np.flatnonzero(measured)
+    if not len(rows):
+        return np.zeros(len(measured), np.bool_)
+    t = np.arange(len(measured))
+    after = np.searchsorted(rows, t)
+    inside = (after > 0) & (after < len(rows))
+    before, after = rows[np.maximum(after - 1, 0)], rows[np.minimum(after, len(rows) - 1)]
+    away = np.minimum(seconds - seconds[before], seconds[after] - seconds)
+    short = inside & (away <= 0.5 * bridge_s)
+    if ahead:
+        short[rows[-1] + 1 :] = seconds[rows[-1] + 1 :] - seconds[rows[-1]] <= bridge_s
+    return short & ~measured
+
+
+def _flips(seen: Observations, track: Track) -> list[Flip]:
+    """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
+    tip, exchanged = track.skeleton.tip, np.zeros(len(seen), np.bool_)
+    for rows in blocks(len(seen), _BLOCK):
+        ends = seen[rows].joints([0, tip])[:, 0]
+        along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]
+        exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
+        _rest(track, seen)
+    found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
+    unsure = ~exchanged & (track.p_flip > _TOLD)
+    return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]
+
+
+def spans(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """The stretches of True in (n,), as (start, stop), stop exclusive."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

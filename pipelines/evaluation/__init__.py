@@ -1,0 +1,1 @@
+"""The jobs of `liex evaluate`: one benchmark a module."""

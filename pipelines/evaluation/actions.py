@@ -1,0 +1,235 @@
+"""The job `liex evaluate actions`: the paper's recogniser and ours, on cut-out actions and on uncut recordings."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.runtime.progress import Progress, silent
+
+from ..training.action_model import train_actions
+from ..training.agent_data import (
+    FAST_HZ,
+    RATE_HZ,
+    by_usual_camera,
+    cut_sequences,
+    test_recordings,
+    training_recordings,
+)
+from ..training.agent_tracks import Acted, acted, acted_tracks
+from ..training.pose_model import cache_folder
+from .pose import estimator_of
+
+if TYPE_CHECKING:
+    from liex_lab.actions.labels import LabelledTrack
+    from liex_lab.actions.timeline import TimelineModel
+
+Array = NDArray[np.float64]
+
+_SEEDS = 5
+_SLOWER_HZ = (15.0, 30.0)
+_LEAST_FRAMES = 7  # of a cut-out sequence
+_LEARNERS = 3  # every so many-th recording of fish teaches the tree that knows the speed alone
+_MAIN = ("macro_f1", "segment_f1_50")
+
+PROTOCOL = (
+    "Virtual animals act by kinematic definitions, are rendered in depth, measured frame by frame and tracked as `liex "
+    "run` tracks; every feature comes from these tracks, whose mean joint error is track_error_mm. Cut-out sequences: "
+    "{n_train} to learn from and {n_test} to test on, of different individuals; tangent_accuracy and joint_accuracy: "
+    "forests of 50 trees, depth 20, mean of {seeds} seeds, with Wilson's 95 % interval. default_accuracy: the "
+    "timeline's recogniser on the same sequences. timeline: {minutes:.0f} minutes of uncut recordings of {animals} "
+    "individuals whose traits lie outside those it learned from; macro_f1: mean over the actions of the frame-wise F1; "
+    "segment_f1_50: bouts that share at least half of what either covers. by_fps: a slower camera has of the same "
+    "recordings the frames nearest to its times, and the tracker nothing else; at {fast:g} frames per second the first "
+    "{fast_minutes:.0f} minutes of the same ones are rendered again, frame by frame. lost_by_fps: what that is less "
+    "than at the usual rate over the same time. speed_only_macro_f1: a decision tree on speed alone, to show that the "
+    "task is not told by speed. one_hour: the time that features and recognition of an hour's track take; "
+    "core_seconds: of the machine's cores, whatever else they did."
+)
+
+
+def evaluate_actions(
+    animal: str = "fish", *, model: str | Path | None = None, pose_model: str | Path | None = None,
+    minutes: float = 30.0, draw: Callable[[dict[str, Any]], object] | None = None, progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """The figures of `liex evaluate actions`. model: an action model other than the bundled one or, where there is
+    none, one trained now; pose_model: that measures the frames, other than the animal's own; minutes: of uncut
+    test recordings; draw: is given the result, for a picture.
+    """
+    if animal not in RATE_HZ:
+        raise LiexError(f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of these")
+    estimator = estimator_of(animal, "default", progress, pose_model)
+    recogniser = _recogniser(animal, model, pose_model, progress)
+    learners = by_usual_camera(training_recordings(animal))
+    if animal == "fish":  # others' cut-out sequences come out of these, too
+        learners = learners[::_LEARNERS]
+    learned = acted_tracks(learners, estimator, progress)
+    recordings = acted(test_recordings(animal, False, minutes), estimator, progress)
+    fast = acted(test_recordings(animal, True, minutes), estimator, progress)
+    progress(0, None, "tracking and naming")
+    tracks = [one.tracked() for one in recordings]
+    if animal == "fish":
+        train, test = (acted_tracks(cut_sequences(animal, side), estimator, progress) for side in (False, True))
+    else:
+        train, test = cut_out(learned), cut_out(tracks)
+    timeline, by_fps, lost = _timelines(recogniser, recordings, tracks, fast, RATE_HZ[animal])
+    result = {
+        "animal": animal, **sequence_scores(train, test, recogniser), "timeline": timeline, "by_fps": by_fps,
+        "lost_by_fps": lost,
+        "speed_only_macro_f1": speed_only(learned, tracks, recogniser),
+        "track_error_mm": track_error_mm(tracks), "one_hour": one_hour(recogniser, tracks[0]),
+        "unresolved": {f"{rate:g}": recogniser.unresolved((np.arange(9) / rate * 1e9).astype(np.int64))
+                       for rate in (*_SLOWER_HZ, RATE_HZ[animal])},
+        "protocol": PROTOCOL.format(
+            n_train=len(train), n_test=len(test), seeds=_SEEDS, minutes=_minutes(tracks), animals=len(tracks),
+            fast=FAST_HZ, fast_minutes=sum(one.seen.seconds[-1] for one in fast) / 60.0,
+        ),
+    }  # fmt: skip
+    if draw is not None:
+        draw(result)
+    return result
+
+
+def sequence_scores(
+    train: Sequence[LabelledTrack], test: Sequence[LabelledTrack], recogniser: TimelineModel
+) -> dict[str, Any]:
+    """How many cut-out actions are named rightly: by the paper's recogniser with either descriptor, and by ours."""
+    from liex_lab.actions.scores import confusion, interval95
+
+    true, n = [str(one.words[0]) for one in test], len(test)
+    words = sorted(set(true))
+    found = paper_names(train, test)
+    shares = {kind: float(np.mean([_share(true, names) for names in all_of])) for kind, all_of in found.items()}
+    own = [recogniser.name(one.track, one.wall_mm) for one in test]
+    shares["default"] = _share(true, own)
+    return {
+        "tangent_accuracy": shares["tangent"], "joint_accuracy": shares["joints"],
+        "default_accuracy": shares["default"],
+        "accuracy_interval95": {kind: interval95(share * n, n) for kind, share in shares.items()},
+        "accuracy_by_seed": {kind: [_share(true, names) for names in all_of] for kind, all_of in found.items()},
+        "confusion": {
+            "words": words, "tangent": confusion(true, found["tangent"][0], words),
+            "joints": confusion(true, found["joints"][0], words), "default": confusion(true, own, words),
+        },
+    }  # fmt: skip
+
+
+def _recogniser(
+    animal: str, model: str | Path | None, pose_model: str | Path | None, progress: Progress
+) -> TimelineModel:
+    """The named model, the bundled one, or one that is trained now."""
+    from liex_lab.actions.storage import bundled_action_models, load_action_model
+
+    if model is not None or animal in bundled_action_models():
+        return load_action_model(model or animal)
+    out = cache_folder() / f"{animal}-actions"
+    return load_action_model(train_actions(out, animal=animal, pose_model=pose_model, progress=progress)[0])
+
+
+def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
+    """Every named bout of at least seven frames by itself."""
+    from liex_lab.actions.ethogram import runs_of
+
+    found = []
+    for one in tracks:
+        for start, stop, word in zip(*runs_of(one.words), strict=True):
+            if word and stop - start >= _LEAST_FRAMES:
+                found.append(one[slice(start, stop)])
+    return found
+
+
+def paper_names(train: Sequence[LabelledTrack], test: Sequence[LabelledTrack]) -> dict[str, list[list[str]]]:
+    """Per descriptor, the words that the forests of every seed give the test sequences."""
+    from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
+
+    words, found = [str(one.words[0]) for one in train], {}
+    for kind in DESCRIPTORS:
+        rows, asked = (describe(kind, [one.track for one in some]) for some in (train, test))
+        found[kind] = [SequenceForest.learn(kind, rows, words, seed).name(asked) for seed in range(_SEEDS)]
+    return found
+
+
+def _timelines(
+    recogniser: TimelineModel, recordings: Sequence[Acted], tracks: Sequence[LabelledTrack], fast: Sequence[Acted],
+    rate_hz: float,
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:  # fmt: skip
+    """Scores on uncut recordings, the two main ones at other frame rates, and what is lost at each."""
+    usual = _scores(recogniser, tracks)
+    alike = _scores(recogniser, [one[: int(np.searchsorted(one.track.times_ns, other.seen.times_ns[-1], "right"))]
+                                 for one, other in zip(tracks, fast, strict=True)])  # fmt: skip
+    at = {rate: _scores(recogniser, [one.tracked(rate) for one in recordings])
+          for rate in _SLOWER_HZ if rate < rate_hz}  # fmt: skip
+    at[FAST_HZ] = _scores(recogniser, [one.tracked() for one in fast])
+    by_fps = {f"{rate:g}": {name: row[name] for name in _MAIN} for rate, row in sorted({**at, rate_hz: usual}.items())}
+    lost = {f"{rate:g}": {name: (alike if rate == FAST_HZ else usual)[name] - row[name] for name in _MAIN}
+            for rate, row in at.items()}  # fmt: skip
+    return usual, by_fps, lost
+
+
+def track_error_mm(tracks: Sequence[LabelledTrack]) -> float:
+    """Mean distance of the tracked joints from the true ones."""
+    off = [np.linalg.norm(one.track.joints_mm - np.asarray(one.truth), axis=-1)[one.track.observed] for one in tracks]
+    return float(np.concatenate(off).mean())
+
+
+def one_hour(recogniser: TimelineModel, one: LabelledTrack, hour_s: float = 3600.0) -> dict[str, float]:
+    """Seconds for features and recognition of an hour's track: this one, over and over."""
+    usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
+    n = round(hour_s / usual)
+    again = one[np.arange(n) % len(one)].track
+    hour = replace(again, times_ns=np.round(np.arange(n) * usual * 1e9).astype(np.int64))
+    wall = None if one.wall_mm is None else one.wall_mm[np.arange(n) % len(one)]
+    recogniser.recognise(one.track, one.wall_mm)  # compiles
+    began, worked = time.perf_counter(), time.process_time()
+    recogniser.recognise(hour, wall)
+    return {"frames": n, "seconds": time.perf_counter() - began, "core_seconds": time.process_time() - worked,
+            "cores": float(os.cpu_count() or 1)}  # fmt: skip
+
+
+def _minutes(tracks: Sequence[LabelledTrack]) -> float:
+    return sum(float(one.track.times_ns[-1] - one.track.times_ns[0]) for one in tracks) / 60e9
+
+
+def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[str, Any]:
+    from liex_lab.actions.scores import timeline_scores
+
+    return timeline_scores(
+        ((one, recogniser.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns)) for one in tracks),
+        recogniser.words,
+    )
+
+
+def speed_only(train: Sequence[LabelledTrack], test: Sequence[LabelledTrack], recogniser: TimelineModel) -> float:
+    """Macro F1 of a decision tree that knows nothing but the speed of the moment."""
+    from sklearn.metrics import f1_score
+    from sklearn.tree import DecisionTreeClassifier
+
+    (x, y), (asked, true) = (_speeds(some, recogniser.clock_hz) for some in (train, test))
+    tree = DecisionTreeClassifier(max_depth=8, class_weight="balanced", min_samples_leaf=50, random_state=0).fit(x, y)
+    named = [word for word in recogniser.words if word]
+    return float(f1_score(true, tree.predict(asked), labels=named, average="macro", zero_division=0.0))
+
+
+def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, NDArray[np.str_]]:
+    from liex_lab.actions.channels import channel_names, stretches_of
+
+    speeds, words = [], []
+    for one in tracks:
+        time_s, column = one.track.times_ns * 1e-9, channel_names(one.track.skeleton).index("speed")
+        for stretch in stretches_of(one.track, clock_hz):
+            row = np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz).clip(0, len(time_s) - 1)
+            speeds.append(stretch.values[:, [column]])
+            words.append(one.words[row])
+    return np.concatenate(speeds), np.concatenate(words)
+
+
+def _share(true: Sequence[str], found: Sequence[str]) -> float:
+    return float(np.mean([a == b for a, b in zip(true, found, strict=True)]))

@@ -1,0 +1,92 @@
+"""The job `liex evaluate nyu`: published answers on the NYU hand data, and what our hand does on its frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liex_lab.errors import LiexError
+from liex_lab.plan import Plan
+from liex_lab.runtime.progress import Progress, silent
+
+_CHUNK = 32  # frames in memory at a time
+_PUBLISHED = {
+    "liex": "Lie-X (Xu et al. 2017), palm placed on the true palm",
+    "v2v_posenet": "V2V-PoseNet (Moon et al. 2018)",
+    "deepprior": "DeepPrior (Oberweger et al. 2015)",
+    "generalized_feedback": "Generalized Feedback (Oberweger et al. 2019)",
+}
+
+
+def evaluate_nyu(reference: str | Path, *, model: str | None = None, progress: Progress = silent) -> dict[str, Any]:
+    """Errors by the NYU protocol, with both root protocols, of the published answers in a folder and of our own on the
+    frames that lie there.
+
+    reference: a folder with nyu_test_14joints.npz (labels and answers) or joint_data.mat (labels), and any of the
+    frames depth_1_NNNNNNN.png. model: of the hand, the bundled one where none is named.
+    """
+    from liex_lab.evaluation.nyu import NYU_PROTOCOL, nyu_errors
+    from liex_lab.recordings.formats.images.nyu_labels import NyuReference
+
+    folder = Path(reference)
+    labels = NyuReference.load(folder)
+    rows = {name: {"method": _PUBLISHED.get(name, name), **nyu_errors(points, labels.truth)}
+            for name, points in labels.answers.items()}  # fmt: skip
+    return {"reference": str(folder), "n_labelled": len(labels.truth), "published": rows,
+            "ours": _ours(folder, labels.truth, model, progress), "protocol": NYU_PROTOCOL}  # fmt: skip
+
+
+def in_short(result: dict[str, Any]) -> dict[str, str]:
+    """One line for each method, and the protocol."""
+    lines = {}
+    for name, row in [*result["published"].items(), ("liex_lab", result["ours"])]:
+        if "root_estimated_mm_14" not in row:
+            lines[name] = row.get("note", f"lost in all of {row['n_frames']} frames")
+            continue
+        lines[name] = (
+            f"{row['n_frames']} frames; 14 points: {row['root_estimated_mm_14']:.3f} mm, root given "
+            f"{row['root_given_mm_14']:.3f}; 13 points: {row['root_estimated_mm_13']:.3f} mm, root given "
+            f"{row['root_given_mm_13']:.3f}"
+        )
+    return {**lines, "protocol": result["protocol"]}
+
+
+def _ours(folder: Path, truth: np.ndarray, model: str | None, progress: Progress) -> dict[str, Any]:
+    """Our errors on the frames in the folder; a word where there are none, or no model."""
+    from liex_lab.errors import ModelError, RecordingError
+    from liex_lab.evaluation.nyu import nyu_errors
+    from liex_lab.recordings.formats.images.nyu import frame_numbers
+    from liex_lab.recordings.formats.images.nyu_labels import points_of_joints
+
+    from ..build import build_estimator, build_recording, build_scene
+
+    plan = Plan.load("hand")
+    if model is not None:
+        plan = plan.with_settings([f"estimation.model={model}"])
+    try:
+        numbers = np.array(frame_numbers(folder))
+    except RecordingError:
+        return {"n_frames": 0, "note": f"no frames depth_1_NNNNNNN.png in {folder}"}
+    if numbers.max() > len(truth):
+        raise LiexError(
+            f"{folder} holds the frame {numbers.max()}, but labels of {len(truth)} frames; give the frames that belong "
+            "to the labels"
+        )
+    try:
+        estimator = build_estimator(plan)
+    except ModelError as error:
+        return {"n_frames": 0, "note": str(error)}
+    points = np.full((len(numbers), *truth.shape[1:]), np.nan)
+    with build_recording(folder, plan) as recording:
+        scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+        size = estimator.find_size(sample, scene)
+        weights = points_of_joints(estimator.skeleton)
+        for frames in recording.chunks(_CHUNK):
+            depths = np.stack([frame.depth for frame in frames])
+            joints = estimator.estimate(depths, scene, size).chosen.pose.joints(estimator.skeleton)
+            points[[frame.index for frame in frames]] = weights @ joints
+            progress(frames[-1].index + 1, len(recording), "measuring hands")
+    return {"method": "liex_lab, default", "spine_mm": size * estimator.skeleton.length,
+            **nyu_errors(points, truth[numbers - 1])}  # fmt: skip

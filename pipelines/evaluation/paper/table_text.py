@@ -1,0 +1,202 @@
+"""Tables 1-3 as CSV, Markdown and JSON, with the paper's own numbers beside ours and in words where they disagree."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.evaluation.pose import POSE_PROTOCOL, plain
+
+if TYPE_CHECKING:
+    from .results import Results
+
+TITLES = {
+    "default": "liex_lab (default)",
+    "paper": "Lie-X as the paper has it",
+    "paper-one-pose": "Lie-X without multiple initial poses",
+    "paper-no-metric": "Lie-X without the learned metric",
+    "rf": "RF",
+    "cnn": "CNN",
+}
+PUBLISHED_MM = {  # Lie-X, Tables 1 and 2: mean joint error, real recordings, another camera and other animals
+    "fish": {"paper": 0.68, "paper-one-pose": 3.28, "paper-no-metric": 1.71, "rf": 1.28, "cnn": 0.79},
+    "mouse": {"paper": 6.64, "paper-one-pose": 13.27, "paper-no-metric": 9.82, "rf": 12.24, "cnn": 9.17},
+    "hand": {"paper": 14.51, "paper-one-pose": 20.50, "paper-no-metric": 16.72, "rf": 24.81, "cnn": 18.82},
+}
+OTHERS_MM = {"Tompson et al.": 21.0, "Oberweger et al. (a)": 20.0, "Oberweger et al. (b)": 16.5, "Zhou et al.": 16.9}
+PUBLISHED_FPS = {"fish": 83.0, "mouse": 267.0, "hand": 123.0}
+OTHERS_FPS = {"Tompson et al.": 30, "Oberweger et al. (a)": 5000, "Oberweger et al. (b)": 400, "Zhou et al.": 125}
+_COLUMNS = (
+    "animal", "split", "method", "variant", "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm",
+    "flip_rate", "lost_rate", "n_frames", "frames_per_s", "ratio_to_default", "published_mean_joint_error_mm",
+    "published_frames_per_s", "origin", "seed", "version", "command",
+)  # fmt: skip
+_QUICK = (
+    "**A quick run: few frames, and every row but the default trained on next to nothing. Its numbers say that "
+    "everything runs, and nothing about the methods.**"
+)
+_HOW = (
+    "The test frames are rendered, with cameras, arenas and animals that no model has seen; background, floor, animal "
+    "and, for the default, its size are found by the product, for every row alike. Published numbers are of real "
+    "recordings, other cameras and other animals: they show the order of the methods, and are not to be compared with "
+    "ours in millimetres. A row is *measured* in this run, or *kept*: measured earlier, with the command, seed and "
+    "version below, because its model takes long to train; kept rows hold for the same test frames. Frames/s count the "
+    "foreground too, on frames in memory; those of a kept row are of another run, so compare its ratio to the default, "
+    "which was timed beside it."
+)
+
+
+def write_tables(folder: Path, results: Sequence[Results], quick: bool) -> list[Path]:
+    """The tables of some animals as table1.csv to table3.csv, tables.md and results.json in the folder."""
+    first = [r for r in results if r.animal != "hand"]
+    second = [r for r in results if r.animal == "hand"]
+    written = []
+    for number, part, only_rates in ((1, first, False), (2, second, False), (3, list(results), True)):
+        if part:
+            rows = [row for r in part for row in _rows(r, only_rates)]
+            written.append(_write_csv(folder / f"table{number}.csv", rows))
+    text = ["# Tables 1 to 3 of Lie-X, on rendered test frames", *([_QUICK] if quick else []), _HOW, POSE_PROTOCOL]
+    for number, part in ((1, first), (2, second)):
+        for r in part:
+            text += [f"## Table {number}: {r.animal}, joint error in mm", _table(r), *_words(r, quick)]
+    text += ["## Table 3: frames per second", _rate_table(results), "## How each row was made", _origins(results)]
+    (folder / "tables.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
+    content = plain({r.animal: vars(r) for r in results})
+    (folder / "results.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return [*written, folder / "tables.md", folder / "results.json"]
+
+
+def _rows(results: Results, only_rates: bool) -> Iterator[dict[str, Any]]:
+    """The rows of a CSV: one for each method and split, or for its rate one for each method."""
+    published = PUBLISHED_MM.get(results.animal, {})
+    for variant, row in results.rows.items():
+        fixed = {
+            "animal": results.animal, "method": TITLES[variant], "variant": variant, "origin": row["origin"],
+            **row["rate"], "published_mean_joint_error_mm": published.get(variant),
+            "published_frames_per_s": PUBLISHED_FPS.get(results.animal) if variant == "paper" else None,
+            "seed": row["made"]["from"].get("recipe", {}).get("seed"), "version": row["made"]["version"],
+            "command": row["made"]["command"],
+        }  # fmt: skip
+        if only_rates:
+            yield fixed
+            continue
+        for split, numbers in row["splits"].items():
+            yield {**fixed, "split": split, **numbers}
+
+
+def _write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> Path:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        used = [name for name in _COLUMNS if any(row.get(name) is not None for row in rows)]
+        writer = csv.DictWriter(file, used, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _table(results: Results) -> str:
+    """One animal: a row for each method, and for each split mean, median and share of flips."""
+    head = ["method"]
+    for split in results.splits:
+        head += [f"{split}: mean", "median", "flips"]
+    rows = []
+    published = PUBLISHED_MM.get(results.animal, {})
+    for variant, title in TITLES.items():
+        row = results.rows.get(variant)
+        if row is None:
+            rows.append([title, *[""] * (3 * len(results.splits)), "", _number(published.get(variant)), "not measured"])
+            continue
+        cells = [title]
+        for split in results.splits:
+            numbers = row["splits"][split]
+            flips = numbers["flip_rate"]
+            cells += [_number(numbers["mean_joint_error_mm"]), _number(numbers["median_joint_error_mm"])]
+            cells.append("" if flips is None else f"{100 * flips:.1f} %")
+        n_frames = "/".join(str(row["splits"][split]["n_frames"]) for split in results.splits)
+        rows.append([*cells, n_frames, _number(published.get(variant)), row["origin"]])
+    if results.animal == "hand":
+        for title, value in OTHERS_MM.items():
+            rows.append([title, *[""] * (3 * len(results.splits)), "", _number(value), "published"])
+    return _grid([*head, "frames", "published, other data: mean", ""], rows)
+
+
+def _words(results: Results, quick: bool) -> list[str]:
+    """Which rows are missing and, unless the run was quick, where the order is not the paper's, in sentences."""
+    sentences = [f"{TITLES[variant]} was not measured: {why}." for variant, why in results.missing.items()]
+    if quick:
+        return sentences
+    for variant in results.rows:
+        if places := _where_ahead(results, variant, "default"):
+            sentences.append(f"{TITLES[variant]} is ahead of the default on {places}.")
+    turned = list(_turned_pairs(results))
+    if not turned and results.animal in PUBLISHED_MM:
+        sentences.append("The methods come out in the paper's order on every split.")
+    return sentences + turned
+
+
+def _where_ahead(results: Results, a: str, b: str) -> str:
+    """The splits on which a variant has the smaller mean error than another, with both."""
+    found = []
+    for split in results.splits:
+        means = _means(results, split)
+        if a in means and b in means and means[a] < means[b]:
+            found.append(f"{split} ({means[a]:.2f} against {means[b]:.2f} mm)")
+    return ", ".join(found)
+
+
+def _turned_pairs(results: Results) -> Iterator[str]:
+    """Pairs of rows whose order is not the published one on some split."""
+    published = PUBLISHED_MM.get(results.animal, {})
+    for a, b in combinations(published, 2):
+        ahead, behind = (a, b) if published[a] < published[b] else (b, a)
+        if places := _where_ahead(results, behind, ahead):
+            yield (
+                f"In the paper, {TITLES[ahead]} ({published[ahead]:.2f} mm) is ahead of {TITLES[behind]} "
+                f"({published[behind]:.2f} mm); here, {TITLES[behind]} is ahead on {places}."
+            )
+
+
+def _means(results: Results, split: str) -> dict[str, float]:
+    """Mean errors by variant."""
+    found = {variant: row["splits"][split]["mean_joint_error_mm"] for variant, row in results.rows.items()}
+    return {variant: value for variant, value in found.items() if value is not None}
+
+
+def _rate_table(results: Sequence[Results]) -> str:
+    rows = []
+    for r in results:
+        for variant, row in r.rows.items():
+            rate = row["rate"]
+            published = _number(PUBLISHED_FPS.get(r.animal) if variant == "paper" else None, 0)
+            rows.append([r.animal, TITLES[variant], _number(rate["frames_per_s"], 0),
+                         _number(rate["ratio_to_default"], 3), rate["picture"], str(rate["cores"]), published,
+                         row["origin"]])  # fmt: skip
+    for title, value in OTHERS_FPS.items() if any(r.animal == "hand" for r in results) else ():
+        rows.append(["hand", title, "", "", "", "", f"{_number(value, 0)} (GPU)", "published"])
+    return _grid(["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published", ""], rows)
+
+
+def _origins(results: Sequence[Results]) -> str:
+    """Command, seed, version and amount of training of each row."""
+    rows = []
+    for r in results:
+        for variant, row in r.rows.items():
+            made = row["made"]
+            recipe = made["from"].get("recipe", {})
+            rows.append([r.animal, TITLES[variant], row["origin"], str(recipe.get("n_images", "")),
+                         str(recipe.get("seed", "")), f"{made['version']} ({made['code']})", made["machine"],
+                         f"`{made['command']}`"])  # fmt: skip
+    return _grid(["animal", "method", "", "training images", "seed", "version (code)", "machine", "command"], rows)

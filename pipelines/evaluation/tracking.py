@@ -1,0 +1,181 @@
+"""What `liex evaluate tracking` measures: single frames, Algorithm 3 and the default tracker, against the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.evaluation.tracking import TRACKING_PROTOCOL, Followed, figures
+from liex_lab.runtime.progress import Progress, silent
+
+from ..build import build_scene, plan_of
+from .pose import estimator_of
+
+if TYPE_CHECKING:
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.plan import Plan
+    from liex_lab.simulation.tracking_sequences import TestSequence
+    from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.track import Track
+    from liex_lab.tracking.tracker import FrameTracker
+
+Array = NDArray[np.float64]
+
+ROWS = ("single", "algorithm3", "online", "smoothed")
+ONLINE_LAG = 5  # frames
+_CHUNK = 32
+_TIMED, _AGAIN = 3, 3  # chunks that the tracker is timed on, and how often
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A sequence and what each row made of it: joints (n, J, 3) mm in the true arena frame; speed: see `_speed`."""
+
+    sequence: TestSequence
+    rows: dict[str, Followed]
+    speed: dict[str, float]
+
+
+def evaluate_tracking(
+    animal: str = "mouse",
+    sequence: str = "hard",
+    *,
+    model: str | Path | None = None,
+    rows: Sequence[str] = ROWS,
+    seeds: Sequence[int] = (),
+    n_frames: int | None = None,
+    draw: Callable[[TestSequence, dict[str, Followed]], object] | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The figures of a fixed sequence; `liex evaluate tracking`.
+
+    rows: only some of `ROWS`; seeds: other sequences of the same kind, whose frames are taken together; draw: is given
+    the first sequence and what the rows made of it, for a picture.
+    """
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.simulation.simulator import world_of
+    from liex_lab.simulation.tracking_sequences import tracking_sequence
+
+    world, plan = world_of(Skeleton.load(animal)), plan_of(animal)
+    estimator = estimator_of(animal, "default", progress, *(() if model is None else (model,)))
+    measured = []
+    for seed in seeds or (None,):
+        recording = tracking_sequence(world, sequence, seed=seed, n_frames=n_frames)
+        measured.append(follow_sequence(recording, estimator, plan, rows, progress))
+    events = [m.sequence.events for m in measured]
+    length = float(np.mean([m.sequence.spine_mm for m in measured]))
+    table = {name: figures([m.rows[name] for m in measured], [m.rows["single"] for m in measured], events, length)
+             for name in measured[0].rows if name in rows}  # fmt: skip
+    result = {
+        "animal": animal, "sequence": sequence, "n_frames": sum(len(m.sequence) for m in measured), "rows": table,
+        "speed": measured[0].speed, "online_lag_frames": ONLINE_LAG, "protocol": TRACKING_PROTOCOL,
+    }  # fmt: skip
+    if draw is not None:
+        draw(measured[0].sequence, measured[0].rows)
+    return result
+
+
+def follow_sequence(
+    recording: TestSequence, estimator: PoseEstimator, plan: Plan, rows: Sequence[str], progress: Progress = silent
+) -> Measured:
+    """Every row's way through a sequence; scene, size and animal are found by the product, nothing is handed over."""
+    from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.tracker import FrameTracker
+
+    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+    tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
+    parts: list[Observations] = []
+    seconds = dict.fromkeys(("single", "observe", "algorithm3"), 0.0)
+    for frames in recording.chunks(_CHUNK):
+        progress(frames[0].index, len(recording), f"measuring {recording.name}")
+        depths = np.stack([frame.depth for frame in frames])
+        began = time.perf_counter()
+        estimator.estimate(depths, scene, tracker.size)
+        between = time.perf_counter()
+        parts.append(tracker.observe(frames))
+        seconds["single"] += between - began
+        seconds["observe"] += time.perf_counter() - between
+    seen = Observations.join(parts)
+    tracker.track(parts[0])  # compiled before the clock runs
+    _online(tracker, parts[0])
+    found: dict[str, Followed] = {}
+    tip = estimator.skeleton.tip
+    n = len(recording)
+    T = recording.T_arena_camera @ scene.floor.T_arena_camera.inverse()
+
+    def put(name: str, track: Track, spent: float) -> None:
+        found[name] = Followed(T @ track.joints_mm, recording.joints_arena, track.sd_mm, n / spent, tip)
+
+    began = time.perf_counter()
+    single = tracker.follow_again(seen)
+    put("single", single, seconds["single"])
+    if "smoothed" in rows:
+        began = time.perf_counter()
+        tracked = tracker.track(seen)
+        put("smoothed", tracked.track, seconds["observe"] + time.perf_counter() - began)
+    if "online" in rows:
+        began = time.perf_counter()
+        track = _online(tracker, seen)
+        put("online", track, seconds["observe"] + time.perf_counter() - began)
+    if "algorithm3" in rows:
+        progress(0, n, f"Algorithm 3 on {recording.name}")
+        began = time.perf_counter()
+        joints, sd = _algorithm3(tracker, recording, plan.seed)
+        found["algorithm3"] = Followed(recording.T_arena_camera @ joints, recording.joints_arena, sd,
+                                       n / (time.perf_counter() - began), tip)  # fmt: skip
+    progress(0, n, "timing the tracker")
+    return Measured(recording, {name: found[name] for name in ROWS if name in found}, _speed(tracker, recording))
+
+
+def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
+    """Frames/s of the default tracker, from pictures in memory to the smoothed track, on one core and on all of them:
+    the best of some tries in turn over the sequence's first frames.
+    """
+    import numba
+
+    from liex_lab.runtime.threads import threads
+    from liex_lab.tracking.observations import Observations
+
+    chunks = [frames for frames, _ in zip(recording.chunks(_CHUNK), range(_TIMED), strict=False)]
+    best = {"frames_per_s_1core": 0.0, "frames_per_s_all_cores": 0.0}
+    for _ in range(_AGAIN):
+        for name, parallel in zip(best, (False, True), strict=True):
+            began = time.perf_counter()
+            with threads(parallel):
+                tracker.track(Observations.join([tracker.observe(frames) for frames in chunks]))
+            best[name] = max(best[name], sum(map(len, chunks)) / (time.perf_counter() - began))
+    return {**best, "cores": float(numba.get_num_threads())}
+
+
+def _online(tracker: FrameTracker, seen: Observations) -> Track:
+    """The rows of the tracker that sees no more than ONLINE_LAG frames ahead."""
+    from liex_lab.tracking.online import OnlineTracker
+    from liex_lab.tracking.track import Track
+
+    online = OnlineTracker(tracker.subject, ONLINE_LAG)
+    return Track.join([part for part in (online.add(seen), online.close()) if part is not None])
+
+
+def _algorithm3(tracker: FrameTracker, recording: TestSequence, seed: int) -> tuple[Array, Array]:
+    """Joints (n, J, 3) mm in the camera frame and their standard deviations (n, J) by Algorithm 3; NaN where it has no
+    estimate.
+    """
+    from liex_lab.tracking.particles import ParticleFilter
+
+    skeleton = tracker.estimator.skeleton
+    filter = ParticleFilter(tracker.estimator, tracker.scene, tracker.size, np.random.default_rng(seed))
+    joints = np.full((len(recording), skeleton.n_joints, 3), np.nan)
+    sd = np.full(joints.shape[:2], np.nan)
+    share = np.array(tracker.subject.joint_share) / np.sqrt(3.0)
+    for frames in recording.chunks(_CHUNK):
+        for frame in frames:
+            step = filter.step(frame)
+            if step is not None:
+                joints[frame.index], sd[frame.index] = step[0].joints(skeleton), step[1] * share
+    return joints, sd

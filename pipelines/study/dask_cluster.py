@@ -1,0 +1,208 @@
+"""The job `liex cohort`: every session of a study on the workers of a Dask cluster. Dask is imported here alone.
+
+A session is one task. It may run twice (a worker dies, and another takes over): it leaves its results on disk, goes on
+where it was, and done twice it does the same. Sessions are done side by side, each by one worker; where fewer are left
+than there are workers, these share the stretches of each.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.errors import MissingPackageError, StudyError
+from liex_lab.plan.study import PlannedSession
+from liex_lab.sessions.failure import describe_failure
+
+from ..workers import Done, Work, n_cores, worker_environment
+from .one_session import RunSession, measure_one, quarantine
+from .slurm import SlurmTable
+from .status import Standing
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from distributed.deploy.cluster import Cluster
+
+TOPIC = "liex-progress"
+_DEATHS = 3  # of workers, before a session is held to be what kills them
+_TOLD_EVERY_S = 0.5
+
+Told = Callable[[str, int, int | None, str], None]  # session, pieces done, pieces in all, what is being done
+Finished = Callable[[dict[str, Any]], None]  # what `measure_one` returns
+
+
+def measure_cohort(
+    todo: Sequence[Standing],
+    run: RunSession,
+    *,
+    workers: int = 0,
+    threads: int = 0,
+    scheduler: str | None = None,
+    slurm: SlurmTable | None = None,
+    told: Told = lambda *_: None,
+    finished: Finished = lambda _: None,
+) -> list[dict[str, Any]]:
+    """Measure the sessions; returns how each went. workers: processes on this machine, 0 one for every two cores.
+
+    threads: cores for each, 0 an equal share; scheduler: the address of a running Dask scheduler; slurm: how to ask a
+    Slurm cluster for workers.
+    """
+    planned = {one.session.id: one.session for one in todo}
+    if not planned:
+        return []
+    with _client(len(planned), workers, threads, scheduler, slurm) as client:
+        client.subscribe_topic(TOPIC, lambda event: told(*event[1]))
+        count = slurm.jobs if slurm else len(client.nthreads())
+        return list(_results(client, planned, run, finished, n_shared(len(planned), count)))
+
+
+def n_shared(n: int, n_workers: int) -> int:
+    """How many of n sessions, the last ones, are cut into stretches for all workers to look at: as many as would leave
+    workers idle if each were measured by one. Cutting costs: what each worker wrote is copied into one.
+    """
+    return n % max(n_workers, 1)
+
+
+def _results(
+    client: Client, planned: dict[str, PlannedSession], run: RunSession, finished: Finished, shared: int
+) -> Iterator[dict[str, Any]]:
+    from distributed import as_completed
+
+    run_id = f"{os.getpid()}-{time.monotonic_ns()}"
+    submitted = [
+        client.submit(_on_worker, session, run, run_id, k >= len(planned) - shared, key=f"{id}-{run_id}", pure=False)
+        for k, (id, session) in enumerate(planned.items())
+    ]
+    sessions = {future.key: session for future, session in zip(submitted, planned.values(), strict=True)}
+    completed = as_completed(submitted, loop=client.loop)
+    del submitted
+    for future in completed:
+        session, error = sessions[future.key], future.exception()
+        result = _died(session, error) if error is not None else future.result()
+        future.release()  # what a worker holds would be made again if it died
+        finished(result)
+        yield result
+
+
+def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
+    """The outcome of a session whose workers ended without a word."""
+    failure = describe_failure(error, "measuring", None)
+    if type(error).__name__ == "KilledWorker":
+        failure |= {
+            "reason": f"the worker process died {_DEATHS + 1} times while it measured this session",
+            "remedy": "give workers more memory or run fewer at a time, see the system's log, and try it again",
+        }
+        failure.pop("traceback", None)
+    quarantine(session, failure)
+    return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
+
+
+def _on_worker(session: PlannedSession, run: RunSession, run_id: str, shared: bool) -> dict[str, Any]:
+    """The task: one session, its progress sent to whoever started the study. shared: by all workers."""
+    from distributed import get_worker
+
+    worker, last = get_worker(), 0.0
+
+    def tell(done: int, total: int | None, what: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > _TOLD_EVERY_S:
+            last = now
+            worker.log_event(TOPIC, [session.id, done, total, what])
+
+    return measure_one(session, run, tell, run_id, Workers() if shared else None)
+
+
+class Workers:
+    """All workers of the cluster that this task runs on, as a crew for the stretches of its session."""
+
+    def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
+        """See `crew.Crew`. The task steps aside meanwhile, and its worker looks at stretches like the others."""
+        from distributed import as_completed, worker_client
+
+        with worker_client() as client:
+            # before any other session, or all of them would be begun at once
+            futures = [client.submit(do, work, priority=10, pure=False) for work in works]
+            for future in as_completed(futures, loop=client.loop):
+                yield future.result()
+
+
+@contextmanager
+def _client(
+    n_tasks: int, workers: int, threads: int, scheduler: str | None, slurm: SlurmTable | None
+) -> Iterator[Client]:
+    """A client of the cluster that was asked for."""
+    import dask
+    from distributed import Client
+
+    # one session at a worker at a time: what waits there is held to have killed it, too
+    settings = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.scheduler.worker-saturation": 1.0,
+                "distributed.logging.distributed": "critical", "distributed.worker.memory.terminate": False,
+                # a machine that is busy or was put to sleep is not a dead one
+                "distributed.scheduler.worker-ttl": "3600s", "distributed.comm.timeouts.connect": "120s"}  # fmt: skip
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(settings))
+        if scheduler is not None:
+            try:
+                yield stack.enter_context(Client(scheduler, timeout="20s", set_as_default=False))
+            except (OSError, ValueError, TypeError) as error:
+                raise StudyError(
+                    f"no Dask scheduler answers at {scheduler} ({error}); start one with `dask scheduler`, or leave "
+                    "--scheduler out"
+                ) from None
+            return
+        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="liex-"))
+        cluster = slurm_cluster(slurm, scratch) if slurm else local_cluster(n_tasks, workers, threads, scratch)
+        stack.enter_context(cluster)
+        if slurm:
+            cluster.scale(min(slurm.jobs, n_tasks))  # a job is one worker
+        yield stack.enter_context(Client(cluster, set_as_default=False))
+
+
+def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
+    """Worker processes on this machine, reached through this machine alone and with keys made for this run."""
+    from distributed import LocalCluster, Security
+
+    cores = n_cores()
+    count = max(1, min(workers or (cores + 1) // 2, n_tasks))
+    return LocalCluster(
+        n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # any port: another study's may have the usual one
+        memory_limit=0, local_directory=scratch, silence_logs=50, security=Security.temporary(),
+        env=worker_environment(threads or max(1, cores // count)),
+    )  # fmt: skip
+
+
+def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
+    """A cluster whose workers are jobs of Slurm; the scheduler is this process."""
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise MissingPackageError(
+            "workers on Slurm need the package dask-jobqueue; install it with `pip install 'liex_lab[slurm]'`"
+        ) from None
+    from distributed import Security
+
+    shared = Path(table.shared_folder).expanduser()
+    shared.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return SLURMCluster(
+        **slurm_options(table, scratch), scheduler_options={"dashboard_address": None},
+        security=Security.temporary(), shared_temp_directory=str(shared), silence_logs=50,
+    )  # fmt: skip
+
+
+def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
+    """The options of one job: one worker that measures one session at a time on all of the job's cores."""
+    exports = [f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()]
+    return {
+        "queue": table.partition, "account": table.account, "cores": 1, "processes": 1, "memory": table.memory,
+        "job_cpu": table.cores_per_job, "walltime": table.walltime, "interface": table.interface,
+        "job_script_prologue": [*table.prologue, *exports], "job_extra_directives": list(table.directives),
+        "local_directory": table.local_folder or scratch, "log_directory": table.log_folder,
+        "worker_extra_args": ["--no-dashboard"],
+    }  # fmt: skip

@@ -1,0 +1,80 @@
+"""One session of a study: measured, or quarantined with a failed.json; whatever happens, the others go on."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+from liex_lab.errors import RecordingError
+from liex_lab.plan import Plan
+from liex_lab.plan.study import PlannedSession
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
+
+from ..shards import MEASURING
+from ..workers import Crew
+from .status import input_stamp, set_aside
+
+
+class RunSession(Protocol):
+    """What measures a recording: `liex_lab.api.run_session`, which knows the views as well."""
+
+    def __call__(
+        self, recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], crew: Crew | None,
+        progress: Progress,
+    ) -> Path:
+        """Write the session folder `folder`."""
+
+
+def measure_one(
+    session: PlannedSession, run: RunSession, progress: Progress = silent, run_id: str = "", crew: Crew | None = None
+) -> dict[str, Any]:
+    """Measure a session; returns how it went: id, state 'done' or 'failed', seconds, and the failure.
+
+    Done twice it does the same: what was interrupted goes on, what is there is replaced when the new one is whole.
+    run_id: of the study's run; what that has ended already is not done again. crew: looks at stretches of it.
+    """
+    if run_id and (ended := _ended(session, run_id)):
+        return ended
+    began, stage, frame = time.perf_counter(), "opening the recording", None
+
+    def watch(done: int, total: int | None, what: str) -> None:
+        nonlocal stage, frame
+        stage, frame = what, done if what == MEASURING else frame
+        progress(done, total, what)
+
+    failure = None
+    try:
+        if not session.recording_exists:
+            raise RecordingError(f"there is no recording {session.recording}; correct its path, or copy it there")
+        stamp = input_stamp(session.recording)
+        run(session.recording, session.plan, folder=session.folder, overwrite=True,
+            notes={"input": {"stamp": stamp}, "run_id": run_id}, crew=crew, progress=watch)  # fmt: skip
+    except Exception as error:
+        failure = describe_failure(error, stage, frame) | {"run_id": run_id}
+        quarantine(session, failure)
+    seconds = round(time.perf_counter() - began, 3)
+    return {"id": session.id, "state": "failed" if failure else "done", "seconds": seconds, "failure": failure}
+
+
+def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
+    """How the session ended in this run of the study already, before its worker could tell."""
+    failure = read_failure(session.folder)
+    if failure and failure.get("run_id") == run_id:
+        return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
+    try:
+        document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    same = isinstance(document, dict) and document.get("run_id") == run_id
+    return {"id": session.id, "state": "done", "seconds": 0.0, "failure": None} if same else None
+
+
+def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
+    """Leave failed.json in the session's place, with what was to be done, so that a change of it is noticed."""
+    known = {"session_id": session.id, **failure, "plan": session.plan.model_dump(exclude_none=True)}
+    known["input"] = {"stamp": input_stamp(session.recording)}
+    set_aside(session.folder)
+    write_failure(session.folder, known)

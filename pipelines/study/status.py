@@ -1,0 +1,165 @@
+"""Which sessions of a study are done, which are to be done (again), and why: looked up on disk, never remembered."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from liex_lab.errors import LiexError
+from liex_lab.plan import Plan
+from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
+from liex_lab.sessions.failure import FAILED_FILE, read_failure
+from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version
+
+_SAYS = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}  # files beside a recording that say what is in it
+State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a session stands. reason: why it is to be done, or was not; failure: of the last attempt, if it failed."""
+
+    session: PlannedSession
+    state: State
+    reason: str = ""
+    failure: dict[str, Any] | None = None
+
+    @property
+    def to_do(self) -> bool:
+        """Whether a run of the study measures it."""
+        return self.state in ("new", "begun", "changed")
+
+
+def standings(study: Study, *, retry: bool = False, only: Sequence[str] = (), again: bool = False) -> list[Standing]:
+    """Where every session stands. retry: failed ones are to be done; only: ids, the others are left out; again: all."""
+    known = [session.id for session in study.sessions]
+    for id in only:
+        if id not in known:
+            raise LiexError(f"the study {study.name} has no session {id}; it has {', '.join(known[:8]) or 'none'}")
+    found = [standing(session) for session in study.sessions if not only or session.id in only]
+    return [_asked_again(one, retry, again) for one in found]
+
+
+def _asked_again(one: Standing, retry: bool, again: bool) -> Standing:
+    if again and one.state == "done":
+        return Standing(one.session, "changed", "asked for with --again")
+    if (retry or again) and one.state == "failed":
+        return Standing(one.session, "changed", "it failed, and is tried again", one.failure)
+    return one
+
+
+def standing(session: PlannedSession) -> Standing:
+    """Where one session stands, by what lies in its folder."""
+    if session.exclude:
+        return Standing(session, "excluded", session.exclude)
+    if (session.folder / "session.json").is_file():
+        try:
+            document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
+            why = next(filter(None, (check() for check in _checks(session, document))), "")
+        except (OSError, ValueError, LiexError, AttributeError, TypeError):
+            why = "its session.json cannot be read"
+        return Standing(session, "changed" if why else "done", why)
+    failure = read_failure(session.folder)
+    if failure is not None:
+        why = "" if "input" not in failure else next(filter(None, (check() for check in _checks(session, failure))), "")
+        return Standing(session, "changed" if why else "failed", why or str(failure["reason"]), failure)
+    begun = session.folder.with_name(f"{session.folder.name}.part").is_dir()
+    return Standing(session, "begun", "it was interrupted and goes on") if begun else Standing(session, "new", "new")
+
+
+def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Callable[[], str]]:
+    """Each says why the session in `document` is not the planned one any more, or nothing; the cheapest first."""
+    return (
+        lambda: _version_changed(document),
+        lambda: _plan_changed(session.plan, document.get("plan", {})),
+        lambda: _model_changed(session.plan, document.get("model", {})),
+        lambda: _input_changed(session, document.get("input", {})),
+    )
+
+
+def _version_changed(document: dict[str, Any]) -> str:
+    then, now = document.get("versions", {}).get("liex_lab", ""), package_version("liex_lab")
+    if then != now:
+        return f"version changed: {then or 'unknown'}, now {now}"
+    schema = document.get("schema_version", SCHEMA_VERSION)
+    return f"version changed: session schema {schema}, now {SCHEMA_VERSION}" if schema != SCHEMA_VERSION else ""
+
+
+def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    then, now = Plan.from_table(stored).model_dump(), plan.model_dump()
+    differing = [
+        f"{section}.{key} = {now[section][key]}" if isinstance(now[section], dict) else f"{section} = {now[section]}"
+        for section in now
+        for key in (now[section] if isinstance(now[section], dict) else [""])
+        if (now[section][key] != then[section][key] if key else now[section] != then[section])
+    ]
+    more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+    return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
+
+
+def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    from liex_lab.catalog import find_model, sha256
+
+    if not stored:
+        return ""
+    return "" if sha256(find_model(plan.estimation.model)) == stored.get("sha256") else "model changed"
+
+
+def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
+    """By the files' sizes and times; where those differ, by their content."""
+    if stored.get("stamp") == input_stamp(session.recording):
+        return ""
+    if session.recording.startswith(VIRTUAL):
+        return "input changed: another virtual recording"
+    if not stored.get("sha256"):
+        return "input changed: sizes or times of its files"
+    from ..build import open_planned
+
+    if not session.recording_exists:
+        return ""  # its results are all there is left of it; they are kept
+    with open_planned(session.recording, session.plan) as recording:
+        return "" if recording.digest() == stored["sha256"] else "input changed: its content"
+
+
+def input_stamp(recording: str) -> str:
+    """A short hash of names, sizes and times of the recording's files and of those beside them; cheap to look up.
+
+    Empty where there is no recording.
+    """
+    if recording.startswith(VIRTUAL):
+        return recording
+    path = Path(recording)
+    if not path.exists():
+        return ""
+    folder = path if path.is_dir() else path.parent
+    entries = []
+    for inside, _, names in os.walk(folder):
+        for name in names:
+            file = Path(inside, name)
+            try:
+                found = file.stat()
+            except OSError:
+                continue
+            if path.is_dir() or file == path or file.suffix.lower() in _SAYS:
+                entries.append([str(file.relative_to(folder)), found.st_size, found.st_mtime_ns])
+        if not path.is_dir():
+            break
+    return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
+
+
+def set_aside(folder: Path) -> None:
+    """Make room for failed.json: an older session's results stay under another name, an older failed.json goes."""
+    if (folder / "session.json").is_file():
+        older = folder.with_name(f"{folder.name}.outdated")
+        if older.is_dir():
+            import shutil
+
+            shutil.rmtree(older)
+        folder.rename(older)
+    elif (folder / FAILED_FILE).is_file():
+        (folder / FAILED_FILE).unlink()

@@ -1,0 +1,105 @@
+"""The study's table: every session with its state, for people (CSV) and for programs (Parquet)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from liex_lab.plan.study import Study
+from liex_lab.sessions.failure import write_whole
+from liex_lab.tables.schema import columns, dictionary, harmless, write_table
+
+from .status import Standing
+
+STUDY_SESSIONS = columns(
+    "study",
+    ("session_id", "string", "", "the session's id in the study"),
+    ("subject_id", "string", "", "the animal across the study"),
+    ("group", "string", "", "experimental group"),
+    ("cage", "string", "", "home cage or tank"),
+    ("sex", "string", "", "sex"),
+    ("batch", "string", "", "batch of the experiment"),
+    ("state", "string", "",
+     "done; failed: see reason and remedy; excluded: by the study file; new, begun or changed: to be done"),
+    ("reason", "string", "", "why it failed, is excluded or is to be done"),
+    ("remedy", "string", "", "what to do about it"),
+    ("stage", "string", "", "what was being done when it failed"),
+    ("frame", "int64", "", "frames that had been measured when it failed; -1 where none was or it did not fail"),
+    ("n_frames", "int64", "", "recorded frames; 0 where it is not done"),
+    ("n_frames_observed", "int64", "", "recorded frames with a pose"),
+    ("observed_s", "float64", "s", "time with a pose"),
+    ("frames_per_s", "float64", "1/s", "frames measured per second of the run"),
+    ("peak_memory_mb", "float64", "MB", "the most memory the run held"),
+    ("recording", "string", "", "the recording, from the study's folder"),
+    ("folder", "string", "", "the session's folder, from the study's folder"),
+)  # fmt: skip
+TABLE = "study"
+
+
+def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
+    """Write cohort/study.parquet, study.csv and study.json; returns the CSV."""
+    import csv
+    import io
+
+    folder = study.cohort_folder
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = study_rows(study, standings)
+    names = [column.name for column in STUDY_SESSIONS]
+    block = {name: [row[name] for row in rows] for name in names}
+    part = folder / f".{TABLE}.parquet.part"
+    write_table(part, STUDY_SESSIONS, [block], {"study": study.name})
+    part.replace(folder / f"{TABLE}.parquet")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([harmless(row[name]) for name in names] for row in rows)
+    write_whole(folder / f"{TABLE}.csv", text.getvalue())
+    entries = [entry for entry in dictionary(STUDY_SESSIONS) if entry["table"] == TABLE]
+    write_whole(folder / f"{TABLE}_columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
+    return folder / f"{TABLE}.csv"
+
+
+def study_rows(study: Study, standings: Sequence[Standing]) -> list[dict[str, Any]]:
+    """One row per session, its keys the columns of STUDY_SESSIONS."""
+    return [_row(study, one) for one in standings]
+
+
+def _row(study: Study, one: Standing) -> dict[str, Any]:
+    session, failure = one.session, one.failure or {}
+    document = _document(session.folder) if one.state == "done" else {}
+    frames = document.get("frames", {})
+    return {
+        "session_id": session.id, "subject_id": session.animal.id,
+        **{name: getattr(session.animal, name) for name in ("group", "cage", "sex", "batch")},
+        "state": one.state, "reason": one.reason, "remedy": str(failure.get("remedy", "")),
+        "stage": str(failure.get("stage") or ""), "frame": _count(failure.get("frame"), -1),
+        "n_frames": _count(frames.get("n_frames"), 0), "n_frames_observed": _count(frames.get("n_observed"), 0),
+        "observed_s": _number(frames.get("observed_s")), "frames_per_s": _number(document.get("frames_per_s")),
+        "peak_memory_mb": _number(document.get("peak_memory_mb")),
+        "recording": _below(study, session.recording), "folder": _below(study, str(session.folder)),
+    }  # fmt: skip
+
+
+def _document(folder: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _below(study: Study, path: str) -> str:
+    try:
+        return Path(path).relative_to(study.folder).as_posix()
+    except ValueError:
+        return path
+
+
+def _count(value: Any, otherwise: int) -> int:
+    return value if isinstance(value, int) else otherwise
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")

@@ -1,0 +1,61 @@
+"""Which recordings action recognisers are trained on and judged by. Individuals are never on both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from liex_lab.simulation.agents import fish as fish_acts
+from liex_lab.simulation.agents import mouse as mouse_acts
+
+from .agent_tracks import Scenario
+
+Recorded = TypeVar("Recorded")
+
+WORDS = {"fish": fish_acts.ACTIONS, "mouse": mouse_acts.ACTIONS}
+RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
+FAST_HZ = 100.0
+N_TRAIN, N_TEST = 426, 173  # cut-out sequences, as in the paper, of 5 and 2 fish
+_TRAIN_FISH, _TEST_FISH = (101, 102, 103, 104, 105), (106, 107)
+_TRAIN_SET, _TEST_SET = tuple(range(201, 225)), tuple(range(301, 307))
+_FAST_SET = {"fish": tuple(range(225, 233))}
+_SECONDS, _FAST_SECONDS = 40.0, 20.0
+_TEST_SECONDS = 300.0  # of a test recording, about: fewer minutes are fewer of the same recordings
+_FAST_SHARE = 1.0 / 6.0  # of every test recording is filmed by a faster camera as well
+
+
+def cut_sequences(animal: str, test: bool) -> list[Scenario]:
+    """Single actions, cut out by hand as it were: the paper's experiment."""
+    individuals, n = (_TEST_FISH, N_TEST) if test else (_TRAIN_FISH, N_TRAIN)
+    words = WORDS[animal]
+    return [
+        Scenario(animal, individuals[k % len(individuals)], 1000 + k, RATE_HZ[animal], word=words[k % len(words)])
+        for k in range(n)
+    ]
+
+
+def training_recordings(animal: str) -> list[Scenario]:
+    """Uncut recordings to learn from, a fish's last ones by a faster camera."""
+    usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
+    return usual + [Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())]
+
+
+def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
+    """Of the recordings of `training_recordings` those by the animal's usual camera."""
+    return list(recordings[: len(_TRAIN_SET)])
+
+
+def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
+    """Uncut recordings, so many minutes in all, of individuals whose traits no other has; fast: the beginnings of the
+    same ones, by a faster camera.
+    """
+    n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
+    seconds = 60.0 * minutes / n
+    usual = [Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET[:n]]
+    return [replace(one, rate_hz=FAST_HZ, filmed_s=_FAST_SHARE * seconds) for one in usual] if fast else usual
+
+
+test_recordings.__test__ = False  # type: ignore[attr-defined]  # its name is not a test's

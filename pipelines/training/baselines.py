@@ -1,0 +1,134 @@
+"""The paper's baselines as models: trained when first asked for, kept in the user's cache."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.baselines.cnn import CnnPlan
+from liex_lab.baselines.forest import ForestPlan
+from liex_lab.runtime.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from liex_lab.baselines.baseline import Baseline
+    from liex_lab.baselines.cnn import Cnn
+    from liex_lab.baselines.forest import RegressionForest
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.training import Tell
+
+    from .pose_model import Recipe
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a baseline is trained on, and how."""
+
+    recipe: Recipe
+    plan: ForestPlan | CnnPlan
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values: equal ones, equal training."""
+        plain: dict[str, Any] = json.loads(json.dumps({"recipe": vars(self.recipe), "plan": asdict(self.plan)}))
+        return plain
+
+
+BASELINES: dict[str, ForestPlan | CnnPlan] = {"rf": ForestPlan(), "cnn": CnnPlan()}
+# about as many images as our own model of the animal learns from; the CNN sees as many in all, whatever their number
+_N_IMAGES = {"mouse": 40_960, "hand": 20_480}
+_N_OTHERS, _SEEN, _DEGRADED = 16_384, 122_880, 0.5
+
+
+def training_of(variant: str, skeleton: Skeleton) -> Training:
+    """Rendered images as our own model learns from, half of them degraded; all animals near home size, for like the
+    paper's variant the baselines are told nothing of an animal's size. Their number is no one else's, so that a
+    baseline stays what it is when our own model learns from more or fewer.
+    """
+    from .pose_model import recipe_of
+
+    n_images = _N_IMAGES.get(skeleton.name, _N_OTHERS)
+    recipe = replace(recipe_of("paper", skeleton), n_images=n_images, n_calibration=0, degraded_share=_DEGRADED)
+    plan = BASELINES[variant]
+    if isinstance(plan, CnnPlan):
+        plan = replace(plan, epochs=round(_SEEN / n_images))
+    return Training(recipe, plan)
+
+
+def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> Baseline:
+    """The baseline of an animal, from the cache or trained now."""
+    from liex_lab.body.skeleton import Skeleton
+
+    if variant == "cnn":
+        from liex_lab.baselines.cnn import require_torch
+
+        require_torch()  # before anything is rendered
+    skeleton = Skeleton.load(animal)
+    training = training_of(variant, skeleton)
+    path = cached_baseline(variant, skeleton, training)
+    if not path.is_file():
+        train_baseline(variant, skeleton, training, path, progress)
+    return _load(path, skeleton, training.plan)
+
+
+def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:
+    """Where the cache keeps it; its card lies beside it, as .json."""
+    from liex_lab.sessions.provenance import package_version
+
+    from .pose_model import cache_folder
+
+    made_from = json.dumps([package_version("liex_lab"), training.to_dict()], sort_keys=True)
+    return cache_folder() / f"{skeleton.name}-{variant}-{hashlib.sha256(made_from.encode()).hexdigest()[:12]}.npz"
+
+
+def train_baseline(variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress) -> None:
+    """Train and write a baseline, and its card."""
+    import numba
+
+    from liex_lab.estimation.method import method_of
+
+    from .pose_model import rendered_set
+
+    recipe = training.recipe
+    data = rendered_set(skeleton, method_of("paper", skeleton), recipe, 0, recipe.n_images, progress)
+    began = time.perf_counter()
+
+    def tell(share: float, what: str) -> None:
+        progress(round(100 * share), 100, f"training {what}")
+
+    model = _trained(training, data, skeleton, tell)
+    card = {
+        "animal": skeleton.name, "variant": variant, **training.to_dict(), "n_images": len(data.size),
+        "training_s": round(time.perf_counter() - began, 1), "cores": numba.get_num_threads(),
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.part-{os.getpid()}")
+    unfinished.write_bytes(model.to_bytes())
+    path.with_suffix(".json").write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
+def _trained(training: Training, data: Any, skeleton: Skeleton, tell: Tell) -> RegressionForest | Cnn:
+    rng = np.random.default_rng(training.recipe.seed)
+    if isinstance(training.plan, CnnPlan):
+        from liex_lab.baselines.cnn import train_cnn
+
+        return train_cnn(data, skeleton, training.plan, rng, tell)
+    from liex_lab.baselines.forest import train_forests
+
+    return train_forests(data, skeleton, training.plan, rng, tell)
+
+
+def _load(path: Path, skeleton: Skeleton, plan: ForestPlan | CnnPlan) -> RegressionForest | Cnn:
+    if isinstance(plan, CnnPlan):
+        from liex_lab.baselines.cnn import Cnn
+
+        return Cnn.load(path, skeleton, plan)
+    from liex_lab.baselines.forest import RegressionForest
+
+    return RegressionForest.load(path, skeleton, plan)

@@ -1,0 +1,285 @@
+"""The job `liex train`: rendered images in, a model with its card out, the same bytes whenever it is run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.threads import serial_products
+
+if TYPE_CHECKING:
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.method import Method
+    from liex_lab.estimation.model import Model
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.foreground.background_segmenter import Crops
+    from liex_lab.simulation.training_patches import TrainingWindows
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How much a model is trained on. degraded_share of the images have up to 2.5 times the noise (METHOD lesson 5).
+
+    sizes: the animals' mean spine in mm and the window in pixels that holds them, for one block of images after the
+    other; 0 is the skeleton's own length. Features do not depend on size, but pixels and noise do.
+    """
+
+    seed: int = 20
+    n_images: int = 49_152
+    n_correction: int = 12_288  # further images, for the last correction
+    n_calibration: int = 24_576  # and further ones, for the predicted error
+    degraded_share: float = 0.5
+    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (45.0, 144), (100.0, 232))
+
+
+_CALIBRATION, _CORRECTION = 1, 2  # numbers of their own random numbers, so that each can be made again by itself
+# of the images that an animal's predicted error is calibrated on show bodies that vary as individuals do; intervals for
+# bodies that vary far more, as the others do, are wider than most animals need
+_ORDINARY_SHARE = {"mouse": 0.5}
+_AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
+
+RECIPES = {
+    "default": Recipe(),
+    "paper": Recipe(n_images=10_240, n_correction=0, degraded_share=0.0, sizes=((0.0, 144),)),
+}
+_AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
+_OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
+_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
+# of an animal and a variant, where it is not the mouse's
+_OWN: dict[tuple[str, str], Recipe] = {
+    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES),
+    ("fish", "paper"): Recipe(
+        seed=31, n_images=6_144, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)
+    ),
+    ("hand", "default"): Recipe(n_images=20_480, n_correction=0, n_calibration=4_096, sizes=((0.0, 320),)),
+    ("hand", "paper"): Recipe(
+        n_images=8_192, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 320),)
+    ),
+}
+
+
+def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
+    """How much the variant is trained on for an animal; for one of the user's own, sizes around its home length."""
+    from liex_lab.simulation.simulator import GenericWorld, world_of
+
+    world = world_of(skeleton)
+    if not isinstance(world, GenericWorld):
+        return _OWN.get((skeleton.name, variant), RECIPES[variant])
+    sizes = tuple((factor * skeleton.length, world.window_px(factor * skeleton.length)) for factor in _OWN_SIZES)
+    images = {name: getattr(_OWN["fish", variant], name) for name in _AMOUNTS}
+    return Recipe(**images, sizes=sizes if variant == "default" else sizes[:1])
+
+
+def train_model(
+    animal: str,
+    variant: str,
+    out: str | Path,
+    *,
+    workers: int = 0,
+    n_images: int | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path.
+
+    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of that to correct and
+    to calibrate on, instead of what the recipe says.
+    """
+    import numba
+
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.method import method_of
+
+    if workers:
+        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+    skeleton = Skeleton.load(animal)
+    recipe = recipe_of(variant, skeleton)
+    if n_images is not None:
+        recipe = replace(recipe, n_images=n_images, n_correction=n_images // 4, n_calibration=n_images // 4)
+    model = make_model(skeleton, method_of(variant, skeleton), recipe, progress)
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = model.to_bytes()
+    unfinished = path.with_name(f"{path.name}.part-{os.getpid()}")
+    unfinished.write_bytes(content)
+    card = {**model.card, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    path.with_suffix(".json").write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+    return path
+
+
+@serial_products()
+def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
+    """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and the calibration."""
+    from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
+    from liex_lab.estimation.model import Calibration, Model
+    from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
+    from liex_lab.simulation.simulator import world_of
+
+    rng = np.random.default_rng(recipe.seed)
+    data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
+    steps = len(skeleton.solved) * method.rounds + 2
+
+    def tell(share: float, what: str) -> None:
+        progress(round(share * (steps - 2)), steps, f"growing forests: {what}")
+
+    cascade, candidates = train_cascade(data, skeleton, method, rng, tell)
+    progress(steps - 2, steps, "growing forests: the learned metric")
+    metric = train_metric(data, cascade, candidates, rng)
+    pruner = train_pruner(data, cascade, candidates, rng)
+    area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
+    card = {
+        "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
+        "images": world_of(skeleton).sources,
+    }  # fmt: skip
+    model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
+    if recipe.n_correction and (method.corrector is not None or method.settle):
+        progress(steps - 1, steps, "learning the last correction")
+        unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_correction, silent)
+        own = np.random.default_rng([recipe.seed, _CORRECTION])
+        model = with_settler(with_corrector(model, unseen, own), unseen, own)
+    if recipe.n_calibration:
+        progress(steps - 1, steps, "calibrating the predicted error")
+        first = recipe.n_images + recipe.n_correction
+        unseen = calibration_set(skeleton, method, recipe, first)
+        model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
+    if method.tells_facing:
+        progress(steps - 1, steps, "learning to tell head from tail")
+        first = recipe.n_images + recipe.n_correction + recipe.n_calibration
+        model = with_facing(model, rendered_set(skeleton, method, recipe, first, recipe.n_images, silent), recipe.seed)
+    return model
+
+
+def rendered_set(
+    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress,
+    family: str = "augmented",
+) -> TrainingSet:  # fmt: skip
+    """N training images from number `first` on, of bodies of a family, cut out by the product's own foreground."""
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.simulation.simulator import world_of
+    from liex_lab.simulation.training_patches import BLOCK
+
+    world = world_of(skeleton)
+    blocks, begin = -(-n // BLOCK), -(-first // BLOCK)
+    parts: list[TrainingSet] = []
+    for number in range(begin, begin + blocks):
+        progress(number - begin, blocks, "rendering training images")
+        spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
+        (windows,) = world.training_blocks(
+            recipe.seed, 1, first=number, family=family, degraded_share=recipe.degraded_share,
+            spine_mm=spine_mm or None, window_px=window_px,
+        )  # fmt: skip
+        parts.append(cut_out(skeleton, method, windows))
+    return TrainingSet.join(parts)
+
+
+def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
+    """Training images from number `first` on as a model is calibrated on them: some of ordinary bodies, see
+    `_ORDINARY_SHARE`, the rest as varied as those that it was trained on.
+    """
+    from liex_lab.estimation.training import TrainingSet
+
+    ordinary = round(_ORDINARY_SHARE.get(skeleton.name, 0.0) * recipe.n_calibration)
+    varied = rendered_set(skeleton, method, recipe, first, recipe.n_calibration - ordinary, silent)
+    if not ordinary:
+        return varied
+    first += recipe.n_calibration - ordinary
+    return TrainingSet.join([varied, rendered_set(skeleton, method, recipe, first, ordinary, silent, "train")])
+
+
+def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
+    """Training images of what the foreground found in the windows, with the truth in their view frames."""
+    from liex_lab.body.skeleton import FOREGROUNDS
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.foreground.background_segmenter import SPREADS, Windows
+    from liex_lab.foreground.hand_segmenter import NearestWindows
+
+    size, origin = windows.spine_mm / skeleton.length, windows.origin.astype(float)
+    shown = size if method.session_size else np.ones(len(size))
+    if skeleton.view.foreground == FOREGROUNDS[1]:
+        held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
+        crops, looks = held.extract(shown, method.camera_view, n_things=2)
+    else:
+        depth, background = (
+            picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+            for picture in (windows.depth, windows.background)
+        )
+        cut = Windows(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+        area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
+        # a scene learned from a recording knows how much its readings spread
+        least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+        crops, looks = cut.extract(shown, area, least, method.camera_view, n_things=2)
+    n = len(size)
+    return TrainingSet.join(
+        [with_truth(skeleton, method, windows, crops[thing], looks[thing]) for thing in (slice(n), slice(n, None))]
+    )
+
+
+def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
+    """Training images of blobs that were cut from the windows, with the truth in their view frames."""
+    from liex_lab.body.pose import Pose
+    from liex_lab.estimation.cascade import ImageSet, Truth
+    from liex_lab.estimation.training import TrainingSet
+    from liex_lab.foreground.height_maps import view_of
+    from liex_lab.geometry import SE3
+
+    T_view_camera = view_of(looks)
+    pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
+    frames = pose.frames(skeleton)
+    joints = frames.translation
+    if windows.own_bones:
+        joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
+    middle = joints.mean(axis=1)
+    off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
+    if method.camera_view:  # what is beside it in depth is another thing as well
+        off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
+    animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
+    good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
+    return TrainingSet(
+        ImageSet(crops.heights[good], looks[good], crops.moments[good]),
+        Truth(frames.rotation[good], joints[good], pose.scale[good]),
+        (windows.spine_mm / skeleton.length)[good],
+        animal[good],
+    )
+
+
+def home_area_mm2(skeleton: Skeleton) -> float:
+    """About the area of a home-sized animal seen from above."""
+    from liex_lab.body.surface import Surface
+
+    return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
+
+
+def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
+    """A model that does not come with the package, trained once and kept in the user's cache folder."""
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.method import method_of
+    from liex_lab.sessions.provenance import package_version
+
+    skeleton = Skeleton.load(animal)
+    method, recipe = method_of(variant, skeleton), recipe_of(variant, skeleton)
+    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe), "skeleton": skeleton.table}
+    key = hashlib.sha256(json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()).hexdigest()[:12]
+    path = cache_folder() / f"{skeleton.name}-{variant}-{key}.npz"
+    return path if path.is_file() else train_model(animal, variant, path, progress=progress)
+
+
+def cache_folder() -> Path:
+    """Where programs of this user keep what can be made again."""
+    if stated := os.environ.get("LIEX_CACHE"):
+        return Path(stated)
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "liex_lab"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "liex_lab"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "liex_lab"

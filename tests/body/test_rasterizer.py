@@ -1,0 +1,84 @@
+"""The renderer against a ray through every pixel, and the laws a picture obeys."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.body import Pose, Skeleton
+from liex_lab.body.surface import Surface, render_mesh, render_meshes
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import KINECT_V2, Camera
+from tests.oracles.raster import ray_cast_depth
+
+CAMERA = Camera(200.0, 210.0, 30.0, 25.0, 64, 48)
+
+
+def random_pose(animal: str, seed: int, z_mm: float) -> tuple[Surface, Pose]:
+    rng = np.random.default_rng(seed)
+    skeleton = Skeleton.load(animal)
+    angles = rng.uniform(-0.4, 0.4, (skeleton.n_joints, 3)) * skeleton.axes
+    angles[0] = 0.0
+    twist = np.concatenate([rng.uniform(-1.5, 1.5, 3), np.zeros(3)])
+    root = SE3(SE3.exp(twist).rotation, np.array([0.0, 0.0, z_mm]))
+    return Surface.of(skeleton), Pose(root, angles, np.array(1.2))
+
+
+@pytest.mark.parametrize(("animal", "z_mm"), [("mouse", 300.0), ("hand", 900.0), ("fish", 150.0)])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_pictures_agree_with_a_ray_through_every_pixel(animal: str, z_mm: float, seed: int) -> None:
+    surface, pose = random_pose(animal, seed, z_mm)
+    window = (5, 3, 50, 40)
+    fast = surface.render(pose, CAMERA, window)
+    slow = ray_cast_depth(surface.vertices(pose), surface.faces, CAMERA, window)
+    both = (fast > 0) & (slow > 0)
+    assert both.sum() > 40
+    # a ray along an edge may go either way
+    assert ((fast > 0) != (slow > 0)).mean() < 1e-3
+    np.testing.assert_allclose(fast[both], slow[both], rtol=3e-6)
+
+
+def test_a_window_is_that_part_of_the_picture() -> None:
+    surface, pose = random_pose("mouse", 3, 300.0)
+    whole = surface.render(pose, CAMERA)
+    np.testing.assert_array_equal(surface.render(pose, CAMERA, (20, 10, 30, 25)), whole[10:35, 20:50])
+
+
+def test_depth_across_a_tilted_triangle_is_perspective_correct() -> None:
+    camera = Camera(100.0, 100.0, 50.0, 50.0, 101, 101)
+    corners = np.array([[-200.0, -200.0, 300.0], [400.0, -200.0, 900.0], [0.0, 500.0, 600.0]])
+    depth = render_mesh(corners, np.array([[0, 1, 2]], np.int32), camera)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    rows, columns = np.nonzero(depth)
+    rays = camera.unproject(np.stack([columns, rows], -1), np.ones(len(rows)))
+    np.testing.assert_allclose(depth[rows, columns], corners[0] @ normal / (rays @ normal), rtol=1e-6)
+    assert len(rows) > 500
+
+
+def test_both_sides_of_a_triangle_are_seen() -> None:
+    corners = np.array([[-20.0, -20.0, 300.0], [20.0, -20.0, 300.0], [0.0, 30.0, 320.0]])
+    front = render_mesh(corners, np.array([[0, 1, 2]], np.int32), CAMERA)
+    back = render_mesh(corners, np.array([[0, 2, 1]], np.int32), CAMERA)
+    assert (front > 0).sum() > 100
+    np.testing.assert_allclose(front, back, rtol=1e-6)
+
+
+def test_what_is_behind_the_camera_is_not_drawn() -> None:
+    surface, pose = random_pose("mouse", 4, -300.0)
+    assert not surface.render(pose, CAMERA).any()
+
+
+def test_a_batch_is_its_pictures_one_by_one_serial_or_parallel() -> None:
+    surface, _ = random_pose("mouse", 5, 300.0)
+    rng = np.random.default_rng(5)
+    n, k = 20, KINECT_V2
+    pose = Pose(SE3.exp(rng.uniform(-1, 1, (n, 6))), np.zeros((n, 5, 3)), rng.uniform(0.9, 1.1, n))
+    T = SE3.identity(n)
+    T.translation[:, 2] = 600.0
+    vertices = surface.vertices(pose)
+    intrinsics, origin = np.tile([k.fx, k.fy, k.cx, k.cy], (n, 1)), np.tile([210.0, 170.0], (n, 1))
+    serial = render_meshes(vertices, surface.faces, T, intrinsics, origin, (96, 80), parallel=False)
+    parallel = render_meshes(vertices, surface.faces, T, intrinsics, origin, (96, 80), parallel=True)
+    np.testing.assert_array_equal(serial, parallel)
+    one = render_mesh(vertices[7], surface.faces, k, (210, 170, 96, 80), SE3(T.rotation[7], T.translation[7]))
+    np.testing.assert_array_equal(serial[7], one)

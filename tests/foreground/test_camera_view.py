@@ -1,0 +1,176 @@
+"""Animals of the camera view: heights along the optical axis, bodies with holes, backs that rise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from liex_lab.arena.floor import Floor
+from liex_lab.body.skeleton import View
+from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.foreground import _blob_kernels as segment
+from liex_lab.foreground.background import stride_for
+from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.recording import Recording
+
+CAMERA = Camera(600.0, 600.0, 119.5, 89.5, 240, 180)
+FLOOR = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 300.0, CAMERA)
+BEHIND, HIGH = 20.0, 40.0
+
+
+def scene(frame: str) -> Scene:
+    bare = Scene.from_floor(CAMERA, FLOOR, 3.0)
+    view = View(frame, behind_mm=BEHIND, smooth_mm=0.6)
+    return Scene(CAMERA, FLOOR, bare.background, bare.limit, bare.on_floor, view=view)
+
+
+def bar(rise: float = 0.0, turned: float = 0.3) -> np.ndarray:
+    """A frame with a bar of 60 x 8 mm that hangs HIGH above the floor, along a heading, its front higher by `rise`."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    z = FLOOR.distance_mm - HIGH
+    x, y = (u - CAMERA.cx) / CAMERA.fx * z, -(v - CAMERA.cy) / CAMERA.fy * z
+    along, across = np.cos(turned) * x + np.sin(turned) * y, -np.sin(turned) * x + np.cos(turned) * y
+    inside = (np.abs(along) < 30.0) & (np.abs(across) < 4.0)
+    return np.where(inside, z - rise * along, FLOOR.depth(CAMERA.width, CAMERA.height)).astype(np.float32)
+
+
+def test_heights_are_measured_from_behind_the_mean_of_what_is_kept():
+    crops = scene("camera").extract(bar(0.2)[None], 1.0, camera_view=True)
+    heights = crops.heights[0][crops.heights[0] > 0] / 16.0
+    assert heights.mean() == pytest.approx(BEHIND, abs=0.1)
+    assert crops.distance[0] == pytest.approx(FLOOR.distance_mm - HIGH + BEHIND, abs=0.2)
+    assert np.ptp(heights) == pytest.approx(0.2 * 60.0, rel=0.15)
+
+
+def test_the_height_map_does_not_tell_the_size_for_which_it_was_cut():
+    cut = [scene("camera").extract(bar(0.2)[None], size, camera_view=True) for size in (0.9, 1.1)]
+    np.testing.assert_array_equal(cut[0].heights, cut[1].heights)
+    np.testing.assert_array_equal(cut[0].distance, cut[1].distance)
+
+
+def test_what_hangs_together_with_the_animal_but_lies_far_behind_it_is_left_out():
+    frame = bar()
+    frame[85:95, 185:200] = FLOOR.distance_mm - 4.0  # something low on the floor, seen beside the animal
+    crops = scene("camera").extract(frame[None], 1.0, camera_view=True)
+    assert crops.distance[0] == pytest.approx(FLOOR.distance_mm - HIGH + BEHIND, abs=0.2)
+
+
+def under_a_beam(thing: float, columns: slice) -> tuple[np.ndarray, np.ndarray]:
+    """The bar with a beam of depth `thing` mm over some columns, and the same with the beam's readings missing."""
+    frame, unread = bar(), bar()
+    frame[:, columns], unread[:, columns] = thing, 0.0
+    return frame, unread
+
+
+@pytest.mark.parametrize("columns", [slice(40, 70), slice(150, 230)])
+def test_a_thing_far_before_the_animal_is_taken_for_unread_though_they_touch_in_the_picture(columns):
+    known = replace(scene("camera"), area_mm2=480.0)
+    frame, unread = under_a_beam(150.0, columns)
+    crops, alone = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
+    assert crops.n_px[0] > 0.5 * known.extract(bar()[None], 1.0, camera_view=True).n_px[0]
+    np.testing.assert_array_equal(crops.n_px, alone.n_px)
+    np.testing.assert_array_equal(crops.heights, alone.heights)
+    np.testing.assert_array_equal(crops.moments, alone.moments)
+    whole = known.extract(np.rint(frame[None]).astype(np.uint16), 1.0, camera_view=True)
+    np.testing.assert_array_equal(whole.n_px, alone.n_px)
+
+
+def test_a_larger_thing_far_behind_the_animal_is_background_though_they_touch_in_the_picture():
+    known = replace(scene("camera"), area_mm2=480.0)
+    alone = bar()
+    alone[alone < FLOOR.distance_mm - 20.0] -= 20.0
+    frame = alone.copy()
+    beside = (slice(60, 130), slice(170, 230))
+    frame[beside] = np.minimum(alone[beside], FLOOR.distance_mm - 4.0)  # low on the floor
+    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, alone))
+    np.testing.assert_array_equal(crops.n_px, same.n_px)
+    np.testing.assert_array_equal(crops.heights, same.heights)
+
+
+def test_an_animal_between_a_thing_before_it_and_specks_far_behind_it_is_told_apart_from_both():
+    alone = bar(turned=0.0)
+    alone[alone < FLOOR.distance_mm - 20.0] -= 60.0
+    known = replace(scene("camera"), area_mm2=280.0)
+    frame, unread = alone.copy(), alone.copy()
+    frame[:, 150:230], unread[:, 150:230] = 150.0, 0.0
+    frame[60:72, 146:150] = FLOOR.distance_mm - 10.0
+    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
+    assert crops.n_px[0] > 0
+    np.testing.assert_array_equal(crops.n_px, same.n_px)
+    np.testing.assert_array_equal(crops.moments, same.moments)
+
+
+def test_a_thing_elsewhere_that_hangs_together_with_specks_behind_it_does_not_take_the_animal_away():
+    known = replace(scene("camera"), area_mm2=480.0)
+    alone = bar()
+    frame = alone.copy()
+    frame[:, :40] = 200.0  # larger than the animal, and likest to it of what hangs together there
+    frame[60:72, 40:44] = FLOOR.distance_mm - 10.0
+    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, alone))
+    assert crops.n_blobs[0] == 2
+    np.testing.assert_array_equal(crops.n_px, same.n_px)
+    np.testing.assert_array_equal(crops.heights, same.heights)
+
+
+def test_readings_missing_across_the_body_do_not_part_it():
+    frame = bar(turned=0.0)
+    frame[60:120, 100:112] = 0.0  # 12 pixels, 5 mm
+    whole = scene("camera").extract(frame[None], 1.0, camera_view=True)
+    assert np.ptp(np.nonzero(whole.heights[0] > 0)[1]) * whole.step[0] > 120
+    part = scene("floor").extract(frame[None], 1.0)
+    assert np.ptp(np.nonzero(part.heights[0] > 0)[1]) * part.step[0] < 90
+
+
+@pytest.mark.parametrize("rise", [-0.3, 0.0, 0.15])
+@pytest.mark.parametrize("wrong_share", [0.0, 0.12])
+def test_the_slope_of_the_back_is_told_in_spite_of_gross_errors(rise, wrong_share):
+    rng = np.random.default_rng(3)
+    frame = bar(rise)
+    body = frame < FLOOR.distance_mm - 20.0
+    wrong = body & (rng.random(frame.shape) < wrong_share)
+    frame[wrong] -= rng.uniform(3.0, 12.0, int(wrong.sum())).astype(np.float32) * (np.nonzero(wrong)[1] > CAMERA.cx)
+    crops = scene("camera").extract(frame[None], 1.0, camera_view=True)
+    assert np.cos(crops.moments[0, 5] - 0.3) == pytest.approx(1.0, abs=0.01)
+    assert crops.moments[0, 8] == pytest.approx(rise, abs=0.03)
+    assert scene("floor").extract(frame[None], 1.0).moments[0, 8] == 0.0
+
+
+@pytest.mark.parametrize("rise", [-0.3, 0.15])
+def test_an_animal_of_the_camera_view_starts_as_steep_as_its_back_both_ways(rise):
+    moments = scene("camera").extract(bar(rise)[None], 1.0, camera_view=True).moments
+    starts = draw_starts(np.random.default_rng(1), 1, 8)
+    rotation, position, _ = start_poses(moments, starts, np.ones((1, 8)), 60.0, True, True, camera_view=True)
+    forward = rotation[0, :, :, 0]
+    slope = forward[:, 2] / np.hypot(forward[:, 0], forward[:, 1])
+    ahead = np.sign(forward[:, 0])  # the bar's front points to the right
+    np.testing.assert_allclose(slope * ahead, rise, atol=0.08)
+    assert {-1.0, 1.0} == set(ahead)
+    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), (1, 8, 3, 3)),
+                               atol=1e-12)  # fmt: skip
+    tip = position[0, :, 2] - moments[0, 2] / moments[0, 1]
+    assert (np.sign(tip + 0.05 * 60.0) == np.sign(forward[:, 2])).all()  # the base is the front here
+
+
+def test_a_large_picture_is_looked_at_as_finely_as_the_smallest_animal_needs():
+    def recording(camera: Camera, depth_mm: float) -> Recording:
+        depth = np.full((camera.height, camera.width), depth_mm, np.float32)
+        return Recording(
+            name="flat", format="synthetic", camera=camera, times_ns=np.arange(3) * 10, read=lambda k: depth
+        )
+
+    large = Camera(2363.0, 2363.0, 511.5, 511.5, 1024, 1024)
+    assert stride_for(recording(large, 280.0), 18.0) == 2
+    assert stride_for(recording(large, 280.0), 60.0) == 4
+    assert stride_for(recording(CAMERA, 280.0), 18.0) == 1
+    assert stride_for(recording(large, 0.0), 18.0) == 1  # nothing to tell it by
+
+
+def test_levelling_leaves_what_is_background_alone():
+    raw = np.full((8, 8), -1.0, np.float32)
+    raw[2:6, 2:6], raw[3, 3], raw[7, 7] = 50.0, -2.0, 5.0
+    lift = segment.level_heights(raw, 20.0)
+    assert lift == pytest.approx(-30.0)
+    assert (raw[2, 2], raw[3, 3], raw[7, 7], raw[0, 0]) == (20.0, -2.0, -1.0, -1.0)

@@ -1,0 +1,288 @@
+"""A study on real worker processes, with a run that takes no time: what fails is told, and stops no other."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from liex_lab.pipelines.study import dask_cluster as cohort
+from liex_lab.pipelines.study.one_session import measure_one
+from liex_lab.pipelines.study.slurm import SlurmTable
+from liex_lab.pipelines.study.status import standing, standings
+from liex_lab.pipelines.study.table import write_study_table
+from typer.testing import CliRunner
+
+from liex_lab import api, cli
+from liex_lab.errors import LiexError, StudyError
+from liex_lab.plan.study import Study
+from liex_lab.runtime.progress import Board
+from tests.pipelines.pretended import pretended_run, shared_task
+
+BROKEN = ("empty", "torn", "full", "fault", "deadly", "missing")
+
+
+def make_study(folder: Path, names: list[str], **more: str) -> Path:
+    """A study with one animal and one recording for each name."""
+    raw = folder / "rawdata"
+    raw.mkdir(parents=True, exist_ok=True)
+    text = 'name = "=1+1"\n'
+    for name in names:
+        if not name.startswith("missing"):
+            (raw / f"{name}.mcap").write_bytes(name.encode())
+        text += f'[[animals]]\nid = "{name}"\ngroup = "@g"\n'
+        text += f'[[sessions]]\nanimal = "{name}"\nsession = "01"\nrecording = "rawdata/{name}.mcap"\n'
+        text += more.get(name, "") + "\n"
+    (folder / "study.toml").write_text(text)
+    return folder / "study.toml"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
+    """Seventeen sessions on two workers, six of them broken: the study's file, what was printed, the exit code."""
+    folder = tmp_path_factory.mktemp("study")
+    names = [f"good{k}" for k in range(9)] + ["unlucky", *BROKEN, "last"]
+    file = make_study(folder, [*names, "skipped"], skipped='exclude = "fell asleep"')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(api, "run_session", pretended_run)
+        result = CliRunner().invoke(cli.app, ["cohort", str(file), "--workers", "2"])
+    return file, result.output, result.exit_code
+
+
+def test_what_can_be_done_is_done_and_the_rest_is_quarantined(finished: tuple[Path, str, int]) -> None:
+    file, printed, code = finished
+    assert code == 3, printed
+    states = {one.session.animal.id: one.state for one in standings(Study.load(file))}
+    assert {name for name, state in states.items() if state == "failed"} == set(BROKEN)
+    assert {name for name, state in states.items() if state == "excluded"} == {"skipped"}
+    assert list(states.values()).count("done") == 11, "a worker that dies once is no reason to give up its session"
+    assert "18 sessions: 11 done, 1 excluded, 6 failed" in printed
+    assert f"liex cohort {file} --retry" in printed
+
+
+def test_no_session_is_measured_more_often_than_its_worker_dies(finished: tuple[Path, str, int]) -> None:
+    runs = {path.stem: path.stat().st_size for path in finished[0].parent.glob("*.runs")}
+    assert 2 <= runs["deadly"] <= 4
+    assert runs["unlucky"] == 2
+    assert {runs[f"good{k}"] for k in range(9)} == {1}
+
+
+def test_a_quarantined_session_says_why_where_and_what_to_do(finished: tuple[Path, str, int]) -> None:
+    told = {one.session.animal.id: one.failure or {} for one in standings(Study.load(finished[0]))}
+    assert told["empty"]["reason"] == "no animal was found in the sampled frames"
+    assert told["empty"]["remedy"] == "check the depth unit and the plan"
+    assert (told["empty"]["stage"], told["empty"]["frame"]) == ("learning the background", None)
+    assert (told["torn"]["stage"], told["torn"]["frame"]) == ("measuring poses", 32)
+    assert "No space left" in told["full"]["reason"]
+    assert "room" in told["full"]["remedy"]
+    assert "slip of ours" in told["fault"]["reason"]
+    assert any("ZeroDivisionError" in line for line in told["fault"]["traceback"])
+    assert "worker process died" in told["deadly"]["reason"]
+    assert "there is no recording" in told["missing"]["reason"]
+    assert all({"stage", "frame", "reason", "remedy", "versions", "plan"} <= set(told[name]) for name in BROKEN)
+
+
+def test_every_session_ends_with_exactly_one_of_two_files(finished: tuple[Path, str, int]) -> None:
+    for session in Study.load(finished[0]).sessions:
+        ends = [(session.folder / name).is_file() for name in ("session.json", "failed.json")]
+        assert sum(ends) == (0 if session.exclude else 1), session.id
+    assert not list(finished[0].parent.rglob("*.part"))
+
+
+def test_the_studys_table_lists_every_session_and_holds_no_formula(finished: tuple[Path, str, int]) -> None:
+    folder = Study.load(finished[0]).cohort_folder
+    table = pd.read_parquet(folder / "study.parquet")
+    assert table["state"].value_counts().to_dict() == {"done": 11, "failed": 6, "excluded": 1}
+    assert (table["group"] == "@g").all()
+    rows = list(csv.reader((folder / "study.csv").read_text(encoding="utf-8").splitlines()))
+    assert len(rows) == 19
+    assert not [cell for row in rows for cell in row if cell[:1] in ("=", "+", "-", "@") and not cell[1:].isdigit()]
+    described = {entry["name"] for entry in json.loads((folder / "study_columns.json").read_text())}
+    assert described == set(table.columns)
+
+
+def test_workers_share_the_cores(finished: tuple[Path, str, int]) -> None:
+    done = next(one for one in standings(Study.load(finished[0])) if one.state == "done")
+    told = json.loads((done.session.folder / "session.json").read_text())["threads"]
+    assert int(told) == max(1, len(os.sched_getaffinity(0)) // 2)
+
+
+def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(finished: tuple[Path, str, int]) -> None:
+    assert [cohort.n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
+    assert [cohort.n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
+    assert cohort.n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
+    done = [one.session for one in standings(Study.load(finished[0])) if one.state == "done"]
+    shared = {one.animal.id: json.loads((one.folder / "session.json").read_text())["shared"] for one in done}
+    assert [name for name, so in shared.items() if so] == ["last"]
+
+
+def test_all_workers_share_the_stretches_of_one_session() -> None:
+    with cohort._client(2, 2, 1, None, None) as client:
+        found = client.submit(shared_task, 6, pure=False).result(timeout=120)
+    assert sorted(number for number, _ in found) == list(range(6))
+    assert len({process for _, process in found}) == 2, "the worker that steps aside does its share"
+
+
+def one_session(tmp_path: Path, name: str = "good") -> Path:
+    """A study of one session, measured."""
+    file = make_study(tmp_path, [name])
+    measure_one(Study.load(file).sessions[0], pretended_run)
+    return file
+
+
+def why(file: Path) -> tuple[str, str]:
+    found = standing(Study.load(file).sessions[0])
+    return found.state, found.reason
+
+
+def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = one_session(tmp_path)
+    assert why(file) == ("done", "")
+    text = file.read_text()
+    file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
+    assert why(file) == ("changed", "plan changed: behaviour.rear_height_mm = 41.0")
+    file.write_text(text)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.status.package_version", lambda name: "9.9")
+    assert why(file)[1].startswith("version changed: ")
+    monkeypatch.undo()
+    assert why(file) == ("done", "")
+    recording = tmp_path / "rawdata" / "good.mcap"
+    recording.write_bytes(b"other bytes")
+    monkeypatch.setattr("liex_lab.pipelines.build.open_planned", lambda *_: _Digest("0" * 64))
+    assert why(file) == ("changed", "input changed: its content")
+    stored = json.loads((Study.load(file).sessions[0].folder / "session.json").read_text())["input"]["sha256"]
+    monkeypatch.setattr("liex_lab.pipelines.build.open_planned", lambda *_: _Digest(stored))
+    assert why(file) == ("done", ""), "only copied to another place"
+    recording.unlink()
+    assert why(file) == ("done", ""), "results outlive their recording"
+
+
+class _Digest:
+    """A recording of which only the hash is asked."""
+
+    def __init__(self, digest: str) -> None:
+        self.digest = lambda: digest
+
+    def __enter__(self) -> _Digest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def test_a_failed_session_is_left_alone_until_something_changed_or_it_is_asked_for(tmp_path: Path) -> None:
+    file = one_session(tmp_path, "torn")
+    study = Study.load(file)
+    assert why(file)[0] == "failed"
+    assert not standings(study)[0].to_do
+    assert standings(study, retry=True)[0].to_do
+    recording = tmp_path / "rawdata" / "torn.mcap"
+    recording.write_bytes(b"copied again")
+    assert why(file) == ("changed", "input changed: sizes or times of its files")
+
+
+def test_an_outdated_session_that_fails_is_kept_under_another_name(tmp_path: Path) -> None:
+    file = one_session(tmp_path)
+    session = Study.load(file).sessions[0]
+    measure_one(session, lambda *_, **__: 1 / 0)
+    assert why(file)[0] == "failed"
+    assert not (session.folder / "session.json").exists()
+    assert (session.folder.with_name("behav.outdated") / "session.json").is_file()
+    measure_one(session, pretended_run)
+    assert why(file) == ("done", "")
+
+
+def test_a_damaged_end_of_a_session_is_done_again(tmp_path: Path) -> None:
+    file = one_session(tmp_path)
+    folder = Study.load(file).sessions[0].folder
+    for text in ("", "[]", "{", '{"plan": 3}', '{"versions": []}'):
+        (folder / "session.json").write_text(text)
+        assert why(file)[0] == "changed", text
+    (folder / "session.json").unlink()
+    for text in ("", "[]", "{}", '{"reason": 3}'):
+        (folder / "failed.json").write_text(text)
+        assert why(file)[0] == "failed", text
+
+
+def test_dry_run_changes_nothing(tmp_path: Path) -> None:
+    file = make_study(tmp_path, ["good", "bad"])
+    before = sorted(tmp_path.rglob("*"))
+    result = CliRunner().invoke(cli.app, ["cohort", str(file), "--dry-run"])
+    assert result.exit_code == 0
+    assert result.output == "new      sub-good_ses-01  new\nnew      sub-bad_ses-01  new\n2 sessions: 2 new\n"
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_two_runs_of_a_study_at_once_are_refused(tmp_path: Path) -> None:
+    from liex_lab.sessions.lock import take_lock
+
+    file = make_study(tmp_path, ["good"])
+    folder = Study.load(file).cohort_folder
+    folder.mkdir(parents=True)
+    held = take_lock(folder / ".lock")
+    assert held is not None
+    with pytest.raises(LiexError, match="another process"):
+        api.run_study(file)
+    held.close()
+
+
+def test_mistakes_on_the_command_line_are_told(tmp_path: Path) -> None:
+    file = make_study(tmp_path, ["good"])
+    with pytest.raises(LiexError, match="has no session sub-x"):
+        api.run_study(file, only=["sub-x"])
+    with pytest.raises(StudyError, match="either"):
+        api.run_study(file, scheduler="tcp://127.0.0.1:1", slurm="slurm")
+    assert CliRunner().invoke(cli.app, ["cohort", str(file), str(tmp_path)]).exit_code == 2
+
+
+def test_a_table_of_nothing_is_a_table(tmp_path: Path) -> None:
+    study = Study.from_table({}, tmp_path / "study.toml")
+    assert write_study_table(study, []).read_text().startswith("session_id,")
+
+
+def test_the_job_script_for_slurm_asks_for_what_the_file_says(tmp_path: Path) -> None:
+    from dask_jobqueue.slurm import SLURMJob
+    from liex_lab.pipelines.study.dask_cluster import slurm_options
+
+    table = SlurmTable(
+        partition="batch", account="neuro", memory="6GB", cores_per_job=3, walltime="02:00:00",
+        prologue=["module load python/3.11"], directives=["--qos=normal"], log_folder="logs",
+    )  # fmt: skip
+    script = SLURMJob("tls://10.0.0.1:8786", name="w0", **slurm_options(table, str(tmp_path))).job_script()
+    for line in ("#SBATCH -p batch", "#SBATCH -A neuro", "#SBATCH --cpus-per-task=3", "#SBATCH --mem=6G",
+                 "#SBATCH -t 02:00:00", "#SBATCH --qos=normal", "module load python/3.11",
+                 "export NUMBA_NUM_THREADS=3"):  # fmt: skip
+        assert f"\n{line}\n" in script, script
+    assert "distributed.cli.dask_worker tls://10.0.0.1:8786" in script
+    assert "--nthreads 1" in script
+
+
+def test_the_bundled_slurm_file_loads_and_slips_are_told(tmp_path: Path) -> None:
+    assert SlurmTable.load("slurm") == SlurmTable()
+    for text, said in (("jobs = 0", "greater"), ("job = 3", "job"), ("partition = 'a\\nb'", "partition"),
+                       ("prologue = ['a\\nrm']", "TOML|prologue"), ("[", "TOML")):  # fmt: skip
+        (tmp_path / "own.toml").write_text(text.replace("'", '"'))
+        with pytest.raises(StudyError, match=said):
+            SlurmTable.load(tmp_path / "own.toml")
+    with pytest.raises(StudyError, match="there is no file"):
+        SlurmTable.load(tmp_path / "none.toml")
+
+
+def test_a_board_says_how_long_it_will_take() -> None:
+    lines: list[str] = []
+    now = [0.0]
+    board = Board(4, lines.append, lambda: now[0])
+    board.told("a", 5, 10, "measuring")
+    now[0] = 10.0
+    assert board.share == pytest.approx(1 / 8)
+    assert board.left_s == pytest.approx(70.0)
+    board.ended("a", "is done", failed=False)
+    assert lines == ["1 of 4: a is done, about 30 s left"]
+    for name in "bcd":
+        board.ended(name, "failed", failed=True)
+    assert (board.n_failed, board.share, lines[-1]) == (3, 1.0, "4 of 4: d failed")

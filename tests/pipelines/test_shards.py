@@ -1,0 +1,124 @@
+"""A recording looked at in stretches, side by side: the tables are those of one process, also after an accident."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from liex_lab.pipelines import session as job
+from liex_lab.pipelines import shards as stretches
+from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker
+from liex_lab.pipelines.verify import verify_session
+from liex_lab.pipelines.workers import Processes
+
+from liex_lab.api import run_session
+from liex_lab.errors import RecordingError, SessionError
+from liex_lab.plan import Plan
+from liex_lab.recordings.recording import Recording
+from liex_lab.sessions import Session
+from tests.pipelines.test_session import N_RENDERED, folder, mouse, pictures, session, times_ns  # noqa: F401
+from tests.sessions.test_checkpoint import depth_messages, tables_of
+
+LENGTH = 8  # frames of a stretch here
+
+
+class InTurn:
+    """A crew of this process alone, which takes the last stretch first and may meet with an accident."""
+
+    def __init__(self, accident_after: int = 1000) -> None:
+        self.left, self.n_done = accident_after, 0
+
+    def each(self, do: Callable[[Any], Any], works: Sequence[Any]) -> Iterator[Any]:
+        for work in reversed(works):
+            if self.left == 0:
+                raise SessionError("a worker process ended without a word; run the same command again")
+            self.left -= 1
+            self.n_done += 1
+            yield do(work)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stretches, "LENGTH", LENGTH)
+    monkeypatch.setattr(job, "LENGTH", LENGTH)
+
+
+def run(folder: Path, out: Path, **how: Any) -> Path:  # noqa: F811
+    return run_session(folder, Plan.load("mouse"), out, **how)
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_tables_do_not_depend_on_the_number_of_workers(n: int, session: Session, folder: Path, tmp_path: Path) -> None:  # noqa: F811
+    shared = run(folder, tmp_path, crew=Processes(n))
+    assert tables_of(shared) == tables_of(session.path)
+    assert depth_messages(shared) == depth_messages(session.path)
+    assert Session.open(shared).metadata["interruptions"] == 0
+    assert sorted(path.name for path in shared.iterdir()) == sorted(path.name for path in session.path.iterdir())
+    assert not [one.sentence for one in verify_session(shared, run_session) if one.state == "wrong"]
+
+
+@pytest.mark.parametrize("then", ["with a crew", "alone"])
+def test_after_an_accident_what_is_whole_is_not_done_again(
+    then: str, session: Session, folder: Path, tmp_path: Path  # noqa: F811
+) -> None:  # fmt: skip
+    with pytest.raises(SessionError, match="without a word"):
+        run(folder, tmp_path, crew=InTurn(accident_after=3))
+    assert not list(tmp_path.glob("*.liex"))
+    n_stretches = -(-(N_RENDERED - 3) // LENGTH)
+    crew = InTurn()
+    done = run(folder, tmp_path, crew=crew if then == "with a crew" else None)
+    assert crew.n_done == (n_stretches - 3 if then == "with a crew" else 0)
+    assert tables_of(done) == tables_of(session.path)
+    assert depth_messages(done) == depth_messages(session.path)
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
+    session: Session, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
+) -> None:  # fmt: skip
+    frame = Recording.frame
+
+    def torn(self: Recording, row: int) -> Any:
+        if row == 21 and stretches.CHUNK:
+            raise RecordingError("frame 21 cannot be read; copy the recording again")
+        return frame(self, row)
+
+    def torn_stretch(work: Any) -> Any:
+        with monkeypatch.context() as patch:
+            patch.setattr(Recording, "frame", torn)
+            return look_at(work)
+
+    look_at = stretches.look_at
+    monkeypatch.setattr(stretches, "look_at", torn_stretch)
+    with pytest.raises(RecordingError, match="frame 21"):
+        run(folder, tmp_path, crew=InTurn())
+    monkeypatch.setattr(stretches, "look_at", look_at)
+    assert tables_of(run(folder, tmp_path)) == tables_of(session.path)
+
+
+def test_a_short_recording_and_one_that_is_open_are_looked_at_by_one(
+    session: Session, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
+) -> None:  # fmt: skip
+    monkeypatch.setattr(job, "LENGTH", 1000)
+    crew = InTurn()
+    assert tables_of(run(folder, tmp_path, crew=crew)) == tables_of(session.path)
+    assert crew.n_done == 0
+
+
+def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:
+    assert list(stretches._cuts(0, 20)) == [(0, 8), (8, 16), (16, 20)]
+    assert list(stretches._cuts(11, 20)) == [(11, 16), (16, 20)]
+    assert list(stretches._cuts(20, 20)) == []
+
+
+def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(mouse: Any, tmp_path: Path) -> None:  # noqa: F811
+    plan = Plan.load("mouse")
+    with build_recording(mouse, plan) as opened:
+        tracker = build_tracker(opened, plan)
+        origin = build_provenance(opened, plan, tracker)
+    sent = pickle.dumps(stretches.Stretch("recording", plan, tracker, origin, tmp_path, 0, 8))
+    assert len(sent) < 0.2 * len(pickle.dumps(tracker))
+    assert pickle.loads(sent).tracker.estimator is tracker.estimator  # of the same process

@@ -1,0 +1,120 @@
+"""`liex train tracking`: numbers that are changed are kept where tracks come nearer to the truth."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.training.motion_model import (
+    Seen,
+    changed,
+    honest_about_joints,
+    honest_about_roots,
+    search,
+    train_tracking,
+)
+
+from liex_lab.geometry import so3
+from liex_lab.simulation.corruptions import Event
+from liex_lab.tracking.motion_model import Tuning
+from liex_lab.tracking.offline import track_whole
+from tests.tracking.stories import MOUSE, SUBJECT, noisy, told, walk
+
+SECONDS = np.arange(80) / 30.0
+
+
+@pytest.fixture(scope="module")
+def measured() -> list[Seen]:
+    truth = walk(SECONDS)
+    made = []
+    for kind, seed, sd_mm in (("easy", 1, 0.8), ("hard", 2, 2.0)):
+        seen = told(SECONDS, noisy(truth, np.random.default_rng(seed), sd_mm))
+        made.append(Seen(kind, seen, SUBJECT, truth, truth.joints(MOUSE), [Event("hidden", 10, 12)], 0.0, 0.0))
+    return made
+
+
+def error(measured: list[Seen], tuning: Tuning) -> float:
+    tracks = [track_whole(each.subject, each.seen, (), tuning).track for each in measured]
+    return float(np.mean([each.errors(track.joints_mm).mean() for each, track in zip(measured, tracks, strict=True)]))
+
+
+def flat(value: object) -> list[float]:
+    if isinstance(value, dict):
+        return [x for each in value.values() for x in flat(each)]
+    if isinstance(value, list | tuple):
+        return [x for each in value for x in flat(each)]
+    return [float(value)]  # type: ignore[arg-type]
+
+
+def test_one_number_is_changed_at_a_time_and_none_of_those_that_are_found_otherwise():
+    rng, tuning = np.random.default_rng(0), Tuning.of("mouse")
+    for _ in range(60):
+        other = changed(tuning, rng)
+        before, after = flat(asdict(tuning)), flat(asdict(other))
+        assert sum(a != b for a, b in zip(before, after, strict=True)) == 1
+        assert other.motion.honest == tuning.motion.honest
+        assert other.chain.ceiling == tuning.chain.ceiling
+
+
+def test_a_search_mends_what_was_set_wrong(measured):
+    good = Tuning.of("mouse")
+    bad = replace(good, motion=replace(good.motion, reject=0.6))
+    found = search(measured, bad, 40, np.random.default_rng(3))
+    assert error(measured, found) < 0.9 * error(measured, bad)
+    assert search(measured, good, 0, np.random.default_rng(3)) == good
+
+
+def covered(measured: list[Seen], tuning: Tuning) -> list[float]:
+    """Of each sequence the share of joint coordinates within their 90 % intervals."""
+    shares, (per_blur, per_spread) = [], tuning.motion.stretch
+    for each in measured:
+        stretch_sd = float(np.hypot(per_blur * each.blur, per_spread * each.size_spread))
+        track = track_whole(replace(each.subject, stretch_sd=stretch_sd), each.seen, (), tuning).track
+        shares.append(float(np.mean(np.abs(track.joints_mm - each.truth) < 1.645 * track.sd_mm[..., None])))
+    return shares
+
+
+def test_an_honest_track_covers_nine_in_ten(measured):
+    wrong = replace(Tuning.of("mouse").motion, honest=((0.03, 0.3),))
+    tuning = honest_about_joints(measured, Tuning(Tuning.of("mouse").chain, wrong))
+    knots = tuning.motion.honest
+    assert [said for said, _ in knots] == sorted(said for said, _ in knots)
+    assert 0.85 < np.mean(covered(measured, tuning)) < 0.96
+
+
+def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(measured):
+    spread, sequences = 0.1, []
+    for k, size in enumerate((1.0, 1.0, 0.88, 1.12)):
+        each = measured[k % 2]
+        pose = replace(each.pose, scale=size * each.pose.scale)
+        truth = pose.joints(MOUSE)
+        sequences.append(replace(each, pose=pose, truth=truth, size_spread=0.0 if size == 1.0 else spread))
+    tuning = honest_about_joints(sequences, Tuning.of("mouse"))
+    alike = honest_about_joints([replace(each, size_spread=0.0) for each in sequences], Tuning.of("mouse"))
+    assert tuning.motion.stretch[1] > 0
+    assert alike.motion.stretch == (0.0, 0.0), "what tells nothing is not used"
+    assert np.ptp(covered(sequences, tuning)) < 0.5 * np.ptp(covered(sequences, alike))
+
+
+@pytest.mark.slow
+def test_the_table_is_the_same_on_one_thread_and_on_two(tmp_path):
+    made = [
+        train_tracking("mouse", tmp_path / f"{workers}.toml", n_frames=100, seeds=(31,), workers=workers)
+        for workers in (1, 2)
+    ]
+    assert made[0].read_bytes() == made[1].read_bytes()
+
+
+def test_roots_and_bends_are_covered_as_well(measured):
+    tuning = honest_about_roots(measured, Tuning.of("mouse"))
+    turned, placed, bent = [], [], []
+    for each in measured:
+        track = track_whole(each.subject, each.seen, (), tuning).track
+        off = track.root.inverse() @ each.pose.root
+        turned.append(np.abs(so3.log(off.rotation)) / track.sd_root[:, :3])
+        placed.append(np.abs(off.translation) / track.sd_root[:, 3:])
+        free = MOUSE.axes[1:]
+        bent.append((np.abs(track.angles_rad - each.pose.angles)[:, 1:][:, free]) / track.sd_angles_rad[:, 1:][:, free])
+    for z in (turned, placed, bent):
+        assert 0.85 < np.mean(np.concatenate(z) < 1.645) < 0.95

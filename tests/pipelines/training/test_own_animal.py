@@ -1,0 +1,90 @@
+"""An animal of the user's own, as README.md has it: a TOML, then train, evaluate and run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.build import plan_of
+from liex_lab.pipelines.evaluation.pose import evaluate_pose, sizes_of
+from liex_lab.pipelines.training import pose_model as train
+
+from liex_lab.api import run_session
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.catalog import find_sample
+from liex_lab.errors import PlanError
+from liex_lab.estimation import method as methods
+from liex_lab.estimation.model import Model
+from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
+from liex_lab.sessions import Session
+from liex_lab.simulation import recording as synthetic
+
+SNAKE = str(find_sample("snake.toml"))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A model of the snake, from few pictures and few shallow trees."""
+    default = methods.METHODS["default"]
+    small = replace(
+        default, rounds=2, n_candidates=6, training_candidates=4, survivors=0, pruner=None, corrector=None,
+        regressors=replace(default.regressors, n_trees=5, max_depth=12, n_tests=50),
+        metric=replace(default.metric, n_trees=16, max_depth=7, n_tests=40),
+    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(methods.METHODS, "default", small)
+        yield train.train_model(SNAKE, "default", tmp_path_factory.mktemp("models") / "snake.npz", n_images=1024)
+
+
+def test_the_model_knows_its_animal_and_how_it_is_looked_at(model):
+    made = Model.load(model)
+    assert made.skeleton.name == "snake"
+    assert made.skeleton.view == Skeleton.load(SNAKE).view
+    assert made.card["recipe"]["n_images"] == 1024
+    assert made.method.reach_mm == pytest.approx(22.0 * 240.0 / 52.834, rel=1e-5)
+    assert made.calibration.area_mm2 == pytest.approx(4000.0, rel=0.3)
+
+
+def test_its_accuracy_is_measured_on_rendered_snakes(model, monkeypatch):
+    drawn = synthetic.test_split
+    monkeypatch.setattr(synthetic, "test_split", lambda name, spine, n, habits: drawn(name, spine, 2, habits))
+    result = evaluate_pose(SNAKE, "clean", model=model)
+    assert result["n_frames"] == 100
+    assert result["lost_rate"] < 0.05
+    assert result["median_joint_error_mm"] < 30.0  # of 240; a model from 1,024 pictures
+
+
+def test_a_plan_of_three_lines_turns_a_recording_into_a_session(model, tmp_path):
+    plan = tmp_path / "plan.toml"
+    plan.write_text(
+        f'[animal]\nname = "snake"\nskeleton = "{SNAKE}"\nspine_min_mm = 150.0\nspine_max_mm = 400.0\n'
+        f'[estimation]\nmodel = "{model}"\n'
+    )
+    recording = open_recording(f"synthetic:move?animal={SNAKE}&seed=2&frames=40&spine_mm=250")
+    session = Session.open(run_session(recording, Plan.load(plan), tmp_path))
+    joints = session.poses.pivot(index="frame_index", columns="joint", values="x_mm")
+    assert joints.shape == (40, 9)
+    assert joints.notna().to_numpy().mean() > 0.9
+    assert session.metadata["animal"]["spine_mm"] == pytest.approx(250.0, rel=0.15)
+    assert (session.path / "report.html").is_file()
+    off = joints.to_numpy().mean(axis=1) - recording.joints_arena[..., 0].mean(axis=1)  # type: ignore[attr-defined]
+    assert np.nanmedian(np.abs(off)) < 12.0
+
+
+def test_the_plan_of_an_own_animal_follows_from_its_toml():
+    plan = plan_of(SNAKE)
+    assert (plan.animal.spine_min_mm, plan.animal.spine_max_mm) == (144.0, 432.0)
+    assert (plan.animal.name, plan.estimation.model) == ("snake", "snake.npz")
+    assert plan_of("mouse") == Plan.load("mouse")
+    assert sizes_of(SNAKE) == (180.0, 240.0, 300.0, 360.0)
+    assert sizes_of("fish") == (18.0, 25.0, 32.0, 45.0)
+
+
+def test_a_model_of_another_animal_is_refused(model, tmp_path):
+    plan = plan_of(SNAKE).with_settings(["estimation.model=mouse"])
+    with pytest.raises(PlanError, match="made for the skeleton mouse"):
+        run_session(f"synthetic:move?animal={SNAKE}&frames=3", plan, tmp_path)

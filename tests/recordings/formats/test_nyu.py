@@ -1,0 +1,115 @@
+"""The NYU layout: its pictures as a recording, its joints beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.formats.images.nyu import NYU_CAMERA, read_nyu_joints
+from tests.recordings.asking import refusal
+from tests.recordings.picture_writers import write_nyu
+from tests.recordings.writers import depth_frames, even_times, write_times
+
+STORED = depth_frames(12)
+
+
+def test_its_camera_is_known_and_its_rate_assumed(tmp_path: Path) -> None:
+    folder = write_nyu(tmp_path / "test", depth_frames(2, 640, 480))
+    (folder / "camera.toml").unlink()
+    with open_recording(folder) as recording:
+        camera = recording.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (588.036865, 587.075073, 320.0, 240.0)
+        assert camera.source == "NYU hand pose data set"
+        assert any("constant 30 frames/s was assumed" in problem for problem in recording.problems)
+    write_times(folder, even_times(2))
+    with open_recording(folder) as recording:
+        assert (recording.times_ns.tolist(), recording.problems) == (even_times(2), [])
+    with open_recording(folder / "depth_1_0000002.png", fps=30) as recording:
+        assert (len(recording), recording.format) == (1, "nyu")
+
+
+def test_the_first_view_is_read_and_its_real_pictures(tmp_path: Path) -> None:
+    folder = write_nyu(tmp_path, STORED)
+    for name in ("depth_2_0000001.png", "synthdepth_1_0000001.png", "rgb_1_0000001.png"):
+        cv2.imwrite(str(folder / name), np.full((48, 64, 3), 9, np.uint8))
+    with open_recording(folder) as recording:
+        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+
+
+def test_sixteen_bit_pictures_of_that_name_are_pictures(tmp_path: Path) -> None:
+    folder = write_nyu(tmp_path, STORED[:0])
+    for k, frame in enumerate(STORED):
+        cv2.imwrite(str(folder / f"depth_1_{k + 1:07d}.png"), frame)
+    with open_recording(folder, fps=30) as recording:
+        assert recording.format == "images"
+        np.testing.assert_array_equal(recording.frame(11).depth, STORED[11])
+
+
+def joint_file(folder: Path, **other: Any) -> np.ndarray:
+    """A joint_data.mat as the data set has it, of three views; what joint_uvd holds."""
+    rng = np.random.default_rng(2)
+    uvd = rng.uniform([0, 0, 400], [639, 479, 1200], (3, 5, 36, 3))
+    u, v, d = np.moveaxis(uvd, -1, 0)
+    lens = NYU_CAMERA
+    xyz = np.stack([(u - lens.cx) * d / lens.fx, (lens.cy - v) * d / lens.fy, d], axis=-1)  # y up
+    names = np.array([f"F1_KNU{k}" for k in range(36)], object)
+    savemat(folder / "joint_data.mat", {"joint_uvd": uvd, "joint_xyz": xyz, "joint_names": names} | other)
+    return uvd
+
+
+def test_joints_are_where_the_camera_sees_them(tmp_path: Path) -> None:
+    uvd = joint_file(tmp_path)
+    for given, view in ((tmp_path, 1), (tmp_path / "joint_data.mat", 3)):
+        joints = read_nyu_joints(given, view=view)
+        np.testing.assert_array_equal(joints.uvd, uvd[view - 1])
+        np.testing.assert_allclose(NYU_CAMERA.project(joints.xyz), uvd[view - 1, ..., :2], atol=1e-9)
+        assert joints.names == tuple(f"F1_KNU{k}" for k in range(36))
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ({"joint_uvd": np.zeros((3, 5, 14, 3))}, "(views, frames, 36, 3)"),
+        ({"joint_uvd": np.zeros(3)}, "(views, frames, 36, 3)"),
+        ({"joint_xyz": np.zeros((3, 4, 36, 3))}, "(3, 4, 36, 3)"),
+    ],
+)
+def test_joints_of_another_shape_are_refused(tmp_path: Path, other: dict[str, Any], says: str) -> None:
+    joint_file(tmp_path, **other)
+    with pytest.raises(RecordingError) as error:
+        read_nyu_joints(tmp_path)
+    assert says in str(error.value)
+
+
+def test_a_file_that_holds_no_joints_is_told(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"no joint_data\.mat"):
+        read_nyu_joints(tmp_path)
+    savemat(tmp_path / "joint_data.mat", {"joint_uvd": np.zeros((3, 5, 36, 3))})
+    with pytest.raises(RecordingError, match="joint_xyz, joint_names"):
+        read_nyu_joints(tmp_path)
+    joint_file(tmp_path)
+    whole = (tmp_path / "joint_data.mat").read_bytes()
+    rng = np.random.default_rng(0)
+    for content in [
+        b"",
+        b"text",
+        whole[:200],
+        whole[:9000],
+        *(bytes(rng.integers(0, 256, 500, np.uint8)) for _ in range(5)),
+    ]:
+        (tmp_path / "joint_data.mat").write_bytes(content)
+        with pytest.raises(RecordingError, match=r"joint_data\.mat"):
+            read_nyu_joints(tmp_path)
+
+
+def test_a_folder_of_other_views_only_says_which_is_missing(tmp_path: Path) -> None:
+    folder = write_nyu(tmp_path, STORED[:1])
+    (folder / "depth_1_0000001.png").rename(folder / "depth_2_0000001.png")
+    assert "depth_1_0000001.png" in refusal(folder)

@@ -1,0 +1,265 @@
+"""Depth in ROS's messages: in MCAP files, in ROS 1 bags and in ROS 2 bags, which read alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags import rosbag1
+from rosbags.highlevel import AnyReader
+
+from liex_lab.optics.camera import Camera, Distortion, Lens
+from liex_lab.recordings import open_recording
+from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.ros_writers import How, ros_messages, store, write_bag, write_db3, write_ros_mcap
+from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times
+
+STORED = depth_frames(9)
+FLOATS = STORED.astype(np.float32) / 1000
+Writer = Callable[..., Path]
+WRITERS: dict[str, Writer] = {
+    "mcap, ROS 1": lambda folder, frames, **how: write_ros_mcap(folder / "r.mcap", frames, 1, **how),
+    "mcap, ROS 2": lambda folder, frames, **how: write_ros_mcap(folder / "r.mcap", frames, 2, **how),
+    "bag": lambda folder, frames, **how: write_bag(folder / "r.bag", frames, **how),
+    "db3": lambda folder, frames, **how: write_db3(folder / "r", frames, **how),
+}
+
+
+@pytest.fixture(params=WRITERS)
+def write(request: pytest.FixtureRequest, tmp_path: Path) -> Writer:
+    writer = WRITERS[request.param]
+    return lambda frames=STORED, **how: writer(tmp_path, frames, **how)
+
+
+@pytest.mark.parametrize("kind", ["16UC1", "mono16", "png", "rvl", "plain png"])
+def test_sixteen_bits_are_millimetres(write: Writer, kind: str) -> None:
+    with open_recording(write(kind=kind), strict=True) as recording:
+        assert recording.times_ns.tolist() == even_times(len(STORED))
+        for frame in recording:
+            np.testing.assert_array_equal(frame.depth, STORED[frame.index])
+        assert recording.problems == []
+        assert recording.camera.matrix.tolist() == SMALL.matrix.tolist()
+        assert recording.camera.source == "CameraInfo on /camera/depth/camera_info"
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+@pytest.mark.parametrize("padding", [0, 6])
+@pytest.mark.parametrize("frames", [STORED, FLOATS])
+def test_either_byte_order_and_padded_rows(write: Writer, frames: Any, big_endian: bool, padding: int) -> None:
+    kind = "16UC1" if frames is STORED else "32FC1"
+    with open_recording(write(frames, kind=kind, big_endian=big_endian, padding=padding)) as recording:
+        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["32FC1 png", "32FC1 rvl"])
+def test_quantised_inverse_depth_is_metres_again(write: Writer, kind: str) -> None:
+    """A step of ROS's own quantisation is 0.05 mm wide at 0.7 m."""
+    with open_recording(write(FLOATS, kind=kind)) as recording:
+        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=0.06)
+        np.testing.assert_array_equal(recording.frame(3).depth == 0, STORED[3] == 0)
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_points_in_rows_are_a_depth_picture(write: Writer, big_endian: bool) -> None:
+    with open_recording(write(kind="cloud", big_endian=big_endian, padding=8)) as recording:
+        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
+
+
+def test_loose_points_are_seen_through_the_lens(write: Writer) -> None:
+    with open_recording(write(kind="loose cloud")) as recording:
+        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
+
+
+def test_of_two_points_on_a_pixel_the_nearer_is_seen(tmp_path: Path) -> None:
+    far = np.full((1, 96, 128), 900, np.uint16)
+    far[0, ::2, ::2] = 600
+    fine = Camera(120.0, 122.0, 63.25, 47.25, 128, 96)
+    path = write_ros_mcap(tmp_path / "r.mcap", far, kind="loose cloud", camera=fine)
+    with open_recording(path, camera=Camera(60.0, 61.0, 31.5, 23.5, 64, 48)) as recording:
+        depth = recording.frame(0).depth
+    assert set(np.unique(depth.round())) <= {0.0, 600.0, 900.0}
+    assert (depth.round() == 600).mean() > 0.9
+
+
+def test_loose_points_need_a_picture_to_be_seen_in(write: Writer) -> None:
+    path = write(kind="loose cloud", calibrated=False)
+    assert "write a camera.toml" in refusal(path)
+    assert "lie in no picture" in refusal(path, camera=Lens(60.0, 61.0, 31.5, 23.5))
+    with open_recording(path, camera=SMALL) as recording:
+        np.testing.assert_allclose(recording.frame(0).depth, STORED[0], atol=1e-3)
+
+
+def test_pictures_come_before_the_clouds_made_of_them(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("ros2")
+        for how in (How(kind="cloud", topics=("/camera/points",)), How(topics=("/camera/depth",))):
+            channels: dict[str, int] = {}
+            for topic, log_ns, message in ros_messages(2, STORED, how):
+                kind = message.__msgtype__
+                if topic not in channels:
+                    schema = writer.register_schema(kind, "ros2msg", b"")
+                    channels[topic] = writer.register_channel(topic, "cdr", schema)
+                data = bytes(store(2).serialize_cdr(message, kind))
+                writer.add_message(channels[topic], log_ns, data, log_ns)
+        writer.finish()
+    with open_recording(path) as recording:
+        np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+    with open_recording(path, topic="/camera/points") as recording:
+        np.testing.assert_allclose(recording.frame(2).depth, STORED[2], atol=1e-3)
+
+
+def test_infrared_is_not_taken_for_depth(write: Writer) -> None:
+    path = write(kind="mono16", topics=("/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw"))
+    with open_recording(path) as recording:
+        assert recording.camera.source.endswith("/camera/depth/camera_info")
+    with open_recording(path, topic="/camera/infra1/image_rect_raw") as recording:
+        assert recording.camera.source.endswith("/camera/infra1/camera_info")
+
+
+def test_several_depth_topics_are_named_and_one_is_chosen(write: Writer) -> None:
+    path = write(topics=("/left/depth", "/right/depth"))
+    sentence = refusal(path)
+    assert "/left/depth, /right/depth; choose one with --topic /left/depth" in sentence
+    with open_recording(path, topic="/right/depth") as recording:
+        assert len(recording) == len(STORED)
+        assert recording.camera.source == "CameraInfo on /right/camera_info"
+
+
+def test_the_sensors_stamp_comes_before_the_time_of_logging(write: Writer) -> None:
+    with open_recording(write(log_delay_ns=7_000_000)) as recording:
+        assert recording.times_ns.tolist() == even_times(len(STORED))
+
+
+def test_a_file_without_stamps_has_the_times_of_logging(write: Writer) -> None:
+    with open_recording(write(stamped=False)) as recording:
+        assert recording.times_ns.tolist() == even_times(len(STORED))
+        assert any("no stamp" in problem for problem in recording.problems)
+
+
+def test_distortion_belongs_to_the_camera_unless_the_picture_is_straightened(write: Writer) -> None:
+    path = write(distortion=(0.1, 0.0, 0.0, 0.0, 0.0), topics=("/d/image_raw", "/straight/image_rect_raw"))
+    with open_recording(path, topic="/d/image_raw") as recording:
+        assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
+    with open_recording(path, topic="/straight/image_rect_raw") as recording:
+        assert recording.camera.distortion is None
+
+
+def test_points_are_straight_already(write: Writer) -> None:
+    with open_recording(write(kind="loose cloud", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))) as recording:
+        assert recording.camera.distortion is None
+        np.testing.assert_allclose(recording.frame(2).depth, STORED[2], atol=1e-3)
+
+
+def test_a_distortion_that_is_not_known_is_told(write: Writer) -> None:
+    with open_recording(write(model="Inverse Brown Conrady", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))) as recording:
+        assert recording.camera.distortion is None
+        assert "Inverse Brown Conrady" in recording.problems[0]
+
+
+@pytest.mark.parametrize("compression", [*CompressionType])
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_every_packing_of_an_mcap_reads_alike(tmp_path: Path, compression: Any, use_chunking: bool) -> None:
+    path = write_ros_mcap(tmp_path / "r.mcap", STORED, compression=compression, use_chunking=use_chunking)
+    with open_recording(path, strict=True) as recording:
+        for index in (8, 3, 4, 0):
+            np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
+
+
+@pytest.mark.parametrize("compression", ["lz4", "bz2", None])
+@pytest.mark.parametrize("chunk_bytes", [1, 1 << 20])
+def test_every_packing_of_a_bag_reads_alike(tmp_path: Path, compression: str | None, chunk_bytes: int) -> None:
+    path = write_bag(tmp_path / "r.bag", STORED, compression=compression, chunk_bytes=chunk_bytes)
+    with open_recording(path, strict=True) as recording:
+        for index in (8, 3, 4, 0):
+            np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
+
+
+@pytest.mark.parametrize("writer", ["bag", "db3"])
+def test_it_agrees_with_the_reader_of_rosbags(tmp_path: Path, writer: str) -> None:
+    path = WRITERS[writer](tmp_path, STORED, log_delay_ns=5_000_000)
+    with AnyReader([path]) as reader, open_recording(path) as recording:
+        depth = [c for c in reader.connections if c.msgtype.endswith("/Image")]
+        messages: list[Any] = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(depth)]
+        assert len(messages) == len(recording)
+        for frame, message in zip(recording, messages, strict=True):
+            assert frame.time_ns == message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            np.testing.assert_array_equal(frame.depth.ravel(), message.data.view("<u2"))
+
+
+@pytest.mark.parametrize(("unit_m", "step_mm"), [(0.001, 1.0), (0.00025, 0.25), (0.0001, 0.1)])
+def test_a_realsense_recording_states_its_unit(tmp_path: Path, unit_m: float, step_mm: float) -> None:
+    topic = "/device_0/sensor_0/Depth_0/image/data"
+    path = write_bag(tmp_path / "r.bag", STORED, kind="mono16", topics=(topic,), unit_m=unit_m)
+    with open_recording(path) as recording:
+        np.testing.assert_allclose(recording.frame(1).depth, STORED[1] * step_mm, rtol=1e-6)
+
+
+@pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 15).round(3).tolist())
+@pytest.mark.parametrize(("compression", "n_lost"), [("lz4", 13), (None, 3)])  # lz4 packs 64 kB at once: 11 pictures
+def test_a_cut_bag_gives_the_frames_that_are_whole(
+    tmp_path: Path, share: float, compression: str | None, n_lost: int
+) -> None:
+    """Also those of the chunk in which it was cut; `rosbags` refuses every one of these files."""
+    stored = depth_frames(40)
+    path = write_bag(tmp_path / "r.bag", stored, compression=compression, chunk_bytes=1 << 20)
+    cut(path, share)
+    with pytest.raises(rosbag1.ReaderError):
+        rosbag1.Reader(path).open()
+    recording, sentence = opened_or_refused(path)
+    if recording is None:
+        assert "the file is cut or damaged" in sentence
+        assert share * len(stored) < n_lost
+        return
+    with recording:
+        assert recording.truncated
+        assert len(recording) >= int(share * len(stored)) - n_lost
+        np.testing.assert_array_equal([frame.depth for frame in recording], stored[: len(recording)])
+
+
+def test_a_cut_db3_gives_frames_or_a_sentence(tmp_path: Path) -> None:
+    path = next(write_db3(tmp_path / "r", STORED).glob("*.db3"))
+    for share in (0.9, 0.6, 0.3, 0.01):
+        part = cut(path, share, tmp_path / "cut.db3")
+        recording, sentence = opened_or_refused(part)
+        if recording is None:
+            assert "cut.db3" in sentence
+            continue
+        with recording:
+            assert recording.truncated
+            np.testing.assert_array_equal([frame.depth for frame in recording], STORED[: len(recording)])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("r.bag", b"hello", "something else"),
+        ("r.bag", b"#ROSBAG V1.2\n" + bytes(99), "old ROS"),
+        ("r.bag", b"#ROSBAG V2.0\n", "holds no depth pictures"),
+        ("r.db3", b"", "is empty"),
+        ("r.db3", b"SQLite format 3\0" + bytes(5000), "holds no depth pictures"),
+    ],
+)
+def test_what_is_no_bag_is_told_in_a_sentence(tmp_path: Path, name: str, content: bytes, says: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert says in refusal(tmp_path / name)
+
+
+def test_an_encrypted_bag_is_told(tmp_path: Path) -> None:
+    fields = [b"op=\x03", b"index_pos=" + bytes(8), b"encryptor=rosbag/AesCbcEncryptor"]
+    header = b"".join(len(field).to_bytes(4, "little") + field for field in fields)
+    path = tmp_path / "r.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + len(header).to_bytes(4, "little") + header + bytes(4))
+    assert "encrypted" in refusal(path)
+
+
+def test_log_times_are_whole_nanoseconds(write: Writer) -> None:
+    times = [START_NS + k * 33_333_333 + (k % 3) for k in range(len(STORED))]
+    with open_recording(write(times_ns=times)) as recording:
+        assert recording.times_ns.tolist() == times

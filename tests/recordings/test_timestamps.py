@@ -1,0 +1,266 @@
+"""Time stamps: exact, strictly increasing, and honest about what was not."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.timestamp_files import name_times, read_column_times, read_csv_times, to_ns
+from liex_lab.recordings.timestamps import (
+    FAULTS,
+    Gap,
+    find_faults,
+    find_gaps,
+    from_rate,
+    match_counts,
+    median_step,
+    settle,
+    start_of_clock,
+    start_of_day,
+)
+from tests.recordings.writers import depth_frames, write_png_folder
+
+stamps = st.lists(st.integers(-20, 20), min_size=1, max_size=9)
+
+
+@given(stamps)
+def test_settled_times_increase_and_stay_where_they_already_did(times: list[int]) -> None:
+    given_ns = np.array(times, np.int64)
+    found = settle(given_ns)
+    settled, sentence = found.times_ns, found.problem
+    np.testing.assert_array_equal(found.faults > 0, settled != given_ns)
+    assert np.all(np.diff(settled) > 0)
+    if np.all(np.diff(given_ns) > 0):
+        np.testing.assert_array_equal(settled, given_ns)
+        assert sentence is None
+    else:
+        assert sentence is not None
+        assert f"{(settled != given_ns).sum()} of {len(times)}" in sentence
+
+
+@given(stamps)
+def test_no_other_choice_moves_fewer_stamps(times: list[int]) -> None:
+    settled = settle(np.array(times, np.int64)).times_ns
+    kept = int((settled == times).sum())
+
+    def can_stay(chosen: tuple[int, ...]) -> bool:
+        """Room for the stamps between: at least one nanosecond each."""
+        return all(times[b] - times[a] >= b - a for a, b in pairwise(chosen))
+
+    assert kept == max(n for n in range(len(times) + 1) for c in combinations(range(len(times)), n) if can_stay(c))
+
+
+def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
+    found = settle(np.array([0, 33, 10**12, 100, 133]))
+    np.testing.assert_array_equal(found.times_ns, [0, 33, 66, 100, 133])
+    assert "1 of 5" in str(found.problem)
+    assert find_faults(found.times_ns, 33, found.faults) == [Gap(2, 3, 66, 100, 0, "clock_jumped")]
+
+
+def test_stamps_that_are_moved_are_spread_evenly_between_those_that_stay() -> None:
+    np.testing.assert_array_equal(settle(np.array([0, 33, 33, 99, 132])).times_ns, [0, 33, 66, 99, 132])
+    np.testing.assert_array_equal(settle(np.array([0, 33, 33, 33, 132])).times_ns, [0, 33, 66, 99, 132])
+    np.testing.assert_array_equal(settle(np.array([0, 33, 33, 34])).times_ns, [0, 16, 33, 34])  # no room behind it
+    np.testing.assert_array_equal(settle(np.array([0, 30, 60, 90, 5, 6])).times_ns, [0, 30, 60, 90, 120, 150])
+    np.testing.assert_array_equal(settle(np.array([900, 901, 60, 90, 120])).times_ns, [0, 30, 60, 90, 120])
+
+
+def faults_of(times: list[int]) -> list[str]:
+    return [FAULTS[fault] for fault in settle(np.array(times, np.int64)).faults]
+
+
+def test_each_stamp_that_is_moved_is_told_with_its_reason() -> None:
+    assert faults_of([0, 33, 66, 99]) == ["", "", "", ""]
+    assert sorted(faults_of([0, 33, 33, 66])) == ["", "", "", "stamp_repeated"]
+    assert faults_of([0, 66, 33, 99]).count("stamp_out_of_order") == 1
+    assert faults_of([0, 33, 10**12, 99])[2] == "clock_jumped"
+
+
+@pytest.mark.parametrize("back", [10**6, 10**9, 3600 * 10**9])
+@pytest.mark.parametrize("at", [5, 20, 35])
+def test_a_clock_that_is_set_back_goes_on_as_after_a_missing_frame(back: int, at: int) -> None:
+    step = 33_333_333 if back > 10**6 else 1000
+    stated = np.arange(40, dtype=np.int64) * step
+    stated[at:] -= back
+    found = settle(stated)
+    expected = np.arange(40, dtype=np.int64) * step
+    expected[at:] += step
+    np.testing.assert_array_equal(found.times_ns, expected)
+    assert [FAULTS[fault] for fault in found.faults[[at - 1, at]]] == ["", "clock_jumped"]
+    assert f"at frame {at}" in str(found.problem)
+
+
+def test_a_counter_that_wraps_every_minute_goes_on_each_time() -> None:
+    step = 40_000_000
+    stated = (np.arange(5000, dtype=np.int64) * step) % (60 * 10**9)
+    found = settle(stated)
+    assert (found.faults == FAULTS.index("clock_jumped")).sum() == 3
+    assert set(np.diff(found.times_ns).tolist()) == {step, 2 * step}
+
+
+def test_a_few_frames_out_of_order_are_no_jump_of_the_clock() -> None:
+    stated = np.arange(40, dtype=np.int64) * 100
+    stated[[20, 21, 22]] = stated[[22, 20, 21]]
+    found = settle(stated)
+    assert (found.times_ns != stated).sum() == 1
+    assert {FAULTS[fault] for fault in found.faults} == {"", "stamp_out_of_order"}
+
+
+def test_clocks_in_noise_stay_within_what_an_integer_holds() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        wild = np.sort(rng.integers(-(2**61), 2**61, (4, 10)), axis=1).ravel()
+        assert np.all(np.diff(settle(wild).times_ns) > 0)
+
+
+def test_a_recording_lists_what_its_clock_did(tmp_path: Path) -> None:
+    step = 33_000_000
+    times = [k * step for k in range(40)]
+    times[10] = times[9]
+    for k in range(20, 40):
+        times[k] += 2 * step  # two frames were left out
+    for k in range(30, 40):
+        times[k] += 3600 * 10**9  # and an hour passed, or somebody set the clock
+    folder = write_png_folder(tmp_path, depth_frames(40), times_ns=times)
+    with open_recording(folder) as recording:
+        told = sorted((gap.start_frame, gap.reason, gap.n_frames_missing) for gap in recording.gaps)
+        assert told == [(20, "camera_dropped", 2), (30, "clock_jumped", 1)]
+        (fault,) = recording.faults
+        assert recording.times_ns[10] == 10 * step  # where it would have been
+        assert (fault.start_frame, fault.stop_frame) == (10, 11)
+        assert (fault.n_frames_missing, fault.reason) == (0, "stamp_repeated")
+        assert recording[15:].faults == []
+        assert [gap.start_frame for gap in recording[15:].gaps] == [5, 15]
+    times = [k * step - 10**10 * (k > 19) for k in range(40)]
+    with open_recording(write_png_folder(tmp_path, depth_frames(40), times_ns=times)) as recording:
+        (gap,) = recording.gaps
+        assert (gap.start_frame, gap.reason, gap.n_frames_missing) == (20, "clock_jumped", 1)
+        assert recording.faults == []
+
+
+@pytest.mark.parametrize(
+    ("names", "first", "steps", "moment"),
+    [
+        (["f_20121214T142255.814212.tif", "f_20121214T142256.068683.tif"], 1355494975_814212000, [254_471_000], False),
+        (["2024-05-01_10-00-00.123.png", "2024-05-01_10-00-00.456.png"], 1714557600_123000000, [333_000_000], False),
+        (["1305031102.175304.png", "1305031102.211214.png"], 1305031102_175304000, [35_910_000], True),
+        (["d_1700000000123.png", "d_1700000000156.png"], 1700000000_123000000, [33_000_000], True),
+        (["1700000000123456_a.png", "1700000000156789_a.png"], 1700000000_123456000, [33_333_000], True),
+        (["1700000000123456789.png", "1700000000156789012.png"], 1700000000_123456789, [33_332_223], True),
+    ],
+)
+def test_stamps_in_names_are_read_as_people_write_them(
+    names: list[str], first: int, steps: list[int], moment: bool
+) -> None:
+    found = name_times(names)
+    assert found is not None
+    assert (int(found[0][0]), np.diff(found[0]).tolist(), found[1]) == (first, steps, moment)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [], ["frame_0.png", "frame_1.png"], ["frame_0000000000001.png", "frame_0000000000002.png"],
+        ["1305031102.175304.png", "last.png"], ["20121399T142255.814212.png"], ["1305031102.175_1305031103.175.png"],
+        ["20240501.png"], ["20240501_101010.png"],
+    ],
+)  # fmt: skip
+def test_names_that_only_count_hold_no_stamps(names: list[str]) -> None:
+    assert name_times(names) is None
+
+
+def test_gaps_are_steps_of_more_than_one_and_a_half_medians() -> None:
+    times = np.cumsum([0, 10, 10, 10, 30, 10, 15, 10, 16, 10]).astype(np.int64)
+    first, second = find_gaps(times, median_step(times))
+    assert (first.start_frame, first.stop_frame, first.n_frames_missing) == (4, 4, 2)
+    assert (first.start_ns, first.stop_ns) == (40, 60)  # from when the next frame was due until the one that came
+    assert (second.start_frame, second.n_frames_missing) == (8, 1)
+    assert find_gaps(times[:1], 0) == []
+
+
+def test_a_rate_gives_stamps_that_do_not_drift() -> None:
+    times = from_rate(100_001, 30.0)
+    assert times[-1] == round(100_000 / 30 * 1e9)
+    assert np.diff(times).max() - np.diff(times).min() <= 1
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "ns"),
+    [
+        ("666649624.5888", 10**6, 666649624588800),
+        ("1760000000.123456789", 10**9, 1760000000123456789),
+        ("-1.5", 10**9, -1_500_000_000),
+        ("1.76e9", 10**9, 1_760_000_000 * 10**9),
+    ],
+)
+def test_decimal_times_are_exact(text: str, unit: int, ns: int) -> None:
+    assert to_ns(text, unit) == ns
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "time_ns\n5\n7\n",
+        "frame,time_ns\na,5\nb,7\n",
+        'frame;"time_ns"\r\na;5\r\nb;7\r\n',
+        "\ufefftime_s\n0.000000005\n0.000000007\n",
+        "time_ms\n0.000005\n\n0.000007",
+    ],
+)
+def test_a_csv_is_read_whatever_program_wrote_it(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_text(content, encoding="utf-8")
+    np.testing.assert_array_equal(read_csv_times(path), [5, 7])
+
+
+def test_moseq_stamps_may_have_a_header_and_commas(tmp_path: Path) -> None:
+    path = tmp_path / "depth_ts.txt"
+    path.write_text("time,other\n1.5, 0\n2.5, 0\n")
+    np.testing.assert_array_equal(read_column_times(path, 10**6), [1_500_000, 2_500_000])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "missing"),
+        (b"1\n2\n3\n", "time_ns or time_s"),
+        (b"time_ns\n1\nnan\n", "'nan' on line 3"),
+        (b"time_s\n1\n1e30\n", "'1e30' on line 3"),
+        (b"time_s\n1\ninf\n", "'inf' on line 3"),
+        (b"time_s\n" + b"x" * 500, "..."),
+        (b"frame,time_ns\n1\n", "'' on line 2"),
+        (b"\xff\xfe\x00\x01\x02\x80", "not text"),
+    ],
+)
+def test_a_wrong_csv_is_told_in_a_sentence(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"timestamps\.csv") as error:
+        read_csv_times(path)
+    assert says in str(error.value)
+    assert len(str(error.value)) < 400 + len(str(tmp_path))
+
+
+def test_two_counts_give_the_smaller_and_a_sentence_with_both() -> None:
+    assert match_counts(5, np.arange(5), "a", "b") == (5, None)
+    n, sentence = match_counts(5, np.arange(7), "depth.dat", "depth_ts.txt")
+    assert n == 5
+    assert sentence is not None
+    assert "depth.dat holds 5" in sentence
+    assert "depth_ts.txt holds 7" in sentence
+
+
+def test_a_start_needs_a_zone_to_be_a_moment() -> None:
+    assert start_of_day("2017-01-25T10:42:07.1734698-05:00") == "2017-01-25T10:42:07.173469-05:00"
+    assert start_of_day("2017-01-25T10:42:07") is None
+    assert start_of_day("yesterday") is None
+    assert start_of_day(None) is None
+    assert start_of_clock(1_760_000_000 * 10**9) == "2025-10-09T08:53:20+00:00"
+    assert start_of_clock(666_649_624_588_800) is None  # a week since some machine was switched on

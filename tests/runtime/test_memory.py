@@ -1,0 +1,67 @@
+"""Arrays on disk: they hold what arrays hold, take no memory once let go of, and a full disk is told beforehand."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.runtime.memory import let_go, on_disk
+from liex_lab.tracking.track import Track
+
+_MB = 1 << 20
+
+
+def resident_mb() -> float:
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / _MB
+
+
+def test_what_is_written_stays_when_its_memory_is_let_go_of_and_no_file_is_left(tmp_path):
+    array = on_disk(tmp_path)((1000, 3), np.float64)
+    part = array[10:20]
+    part[:] = np.arange(30.0).reshape(10, 3)
+    let_go(part, np.zeros(3))
+    np.testing.assert_array_equal(array[10:20].ravel(), np.arange(30.0))
+    assert not array[:10].any()
+    assert list(tmp_path.iterdir()) == []
+    assert on_disk(tmp_path)((0, 3), np.int64).shape == (0, 3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there the system tells and takes back")
+def test_a_track_on_disk_takes_no_memory_when_it_rests(tmp_path):
+    mouse, n = Skeleton.load("mouse"), 100_000
+    before = resident_mb()
+    track = Track.empty(mouse, np.arange(n, dtype=np.int64), room=on_disk(tmp_path))
+    track.joints_mm[:] = 1.0
+    assert resident_mb() - before > 10
+    track.rest()
+    assert resident_mb() - before < 5
+    assert track.posed.all()
+    assert np.isnan(track.uv_px).all()
+
+
+def test_a_disk_without_room_is_told_before_any_of_it_is_taken(tmp_path, monkeypatch):
+    free = shutil.disk_usage(tmp_path).free
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda **how: pytest.fail("it was tried all the same"))
+    with pytest.raises(OSError, match="No space left"):
+        on_disk(tmp_path)((2 * free,), np.uint8)
+
+
+def test_where_files_cannot_be_mapped_arrays_are_in_memory_and_a_full_disk_is_told(tmp_path, monkeypatch):
+    def refuse(number):
+        def memmap(*what, **how):
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr("numpy.memmap", memmap)
+
+    refuse(errno.ENODEV)
+    assert on_disk(tmp_path)((5, 2), np.float64).shape == (5, 2)
+    refuse(errno.ENOSPC)
+    with pytest.raises(OSError, match="No space left"):
+        on_disk(tmp_path)((5, 2), np.float64)

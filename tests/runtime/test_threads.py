@@ -1,0 +1,66 @@
+"""What is made ahead by a thread is what would have been made in turn."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from liex_lab.runtime.threads import ahead, meanwhile
+
+
+def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
+    assert list(ahead(range(7))) == list(range(7))
+    assert list(ahead([])) == []
+
+
+def test_one_item_is_made_while_the_one_before_it_is_used() -> None:
+    made: list[int] = []
+    third = threading.Event()
+
+    def items() -> Iterator[int]:
+        for k in range(5):
+            made.append(k)
+            if k == 2:
+                third.set()
+            yield k
+
+    coming = ahead(items())
+    assert next(coming) == 0
+    assert next(coming) == 1
+    assert third.wait(10)
+    assert 4 not in made
+    coming.close()
+
+
+def test_what_goes_wrong_is_raised_after_the_items_before_it() -> None:
+    def items() -> Iterator[int]:
+        yield 1
+        raise OSError("the drive is gone")
+
+    coming = ahead(items())
+    assert next(coming) == 1
+    with pytest.raises(OSError, match="drive"):
+        next(coming)
+
+
+def test_something_is_made_while_a_block_runs_and_what_goes_wrong_is_raised_where_it_is_wanted() -> None:
+    asked, begun = threading.Event(), threading.Event()
+
+    def make() -> int:
+        begun.set()
+        assert asked.wait(10)
+        return 7
+
+    def fail() -> int:
+        raise OSError("the drive is gone")
+
+    with meanwhile(make) as made:
+        assert begun.wait(10)  # before anybody asks for it
+        asked.set()
+        assert made() == made() == 7
+    with meanwhile(fail) as failed, pytest.raises(OSError, match="gone"):
+        failed()
+    with meanwhile(fail):  # nobody wants it
+        pass

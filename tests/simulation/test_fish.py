@@ -1,0 +1,156 @@
+"""The fish: what real ones do it can do, too; it hangs anywhere in the water; its camera errs as a light field does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Surface
+from liex_lab.optics.camera import RAYTRIX_R5
+from liex_lab.simulation import _sensor_kernels as k
+from liex_lab.simulation import training_patches as windows
+from liex_lab.simulation.fish import KINDS, FishHabits, draw_bends
+from liex_lab.simulation.locomotion import swimming_session
+from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR
+from liex_lab.simulation.training_patches import TrainingWindows, training_blocks
+
+FISH = Skeleton.load("fish")
+
+
+@pytest.fixture(scope="module")
+def pictures() -> TrainingWindows:
+    """Sixteen training windows of fish."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(windows, "BLOCK", 16)
+        return next(training_blocks(3, 1, FishHabits(), window_px=272))
+
+
+def real_bends(reference_data: Path) -> np.ndarray:
+    """Bends (n, 19) rad at the inner joints of annotated fish, signed by the side of the fish's own plane."""
+    xyz = np.loadtxt(reference_data / "liex_tracks" / "fish_S1_frames_1_16.txt").reshape(-1, 21, 3)
+    bones = np.diff(xyz, axis=1)
+    bones /= np.linalg.norm(bones, axis=-1, keepdims=True)
+    up = np.array([0.0, 0.0, 1.0])  # the camera looks along -z, and the fish are nearly level
+    across = np.cross(bones[:, :-1], bones[:, 1:]) @ up
+    return np.arctan2(across, np.sum(bones[:, :-1] * bones[:, 1:], axis=-1))
+
+
+def test_every_real_posture_is_near_one_that_is_drawn(reference_data):
+    rng = np.random.default_rng(0)
+    drawn = draw_bends(rng, FISH, rng.integers(len(KINDS), size=20_000))[:, 1:20]
+    for real in real_bends(reference_data):
+        off = np.sqrt(np.mean((drawn - real) ** 2, axis=1)).min()
+        assert np.degrees(off) < 1.6  # a joint; annotations hold two arcs, whole bodies of drawn ones wave a little
+
+
+def test_fish_bend_as_far_as_swimming_larvae_do(reference_data):
+    points = np.load(reference_data / "zebrafish_larva_3d" / "free_swim_1000.npz")["xyz_mm"][:, :10].astype(float)
+    bones = np.diff(points, axis=1)
+    bones /= np.linalg.norm(bones, axis=-1, keepdims=True)
+    head_to_tail = np.degrees(np.arccos(np.clip(np.sum(bones[:, 0] * bones[:, -1], axis=-1), -1, 1)))
+    rng = np.random.default_rng(1)
+    total = np.abs(np.degrees(draw_bends(rng, FISH, rng.integers(len(KINDS), size=4000)).sum(axis=1)))
+    assert np.quantile(total, 0.95) > np.quantile(head_to_tail, 0.95)
+    assert np.quantile(total, 0.4) < np.quantile(head_to_tail, 0.75)  # and most are not turning
+    assert total.max() < 230.0
+
+
+def test_bends_stay_within_the_joints_limits_and_the_hind_half_does_most_of_them():
+    rng = np.random.default_rng(2)
+    bends = draw_bends(rng, FISH, rng.integers(len(KINDS), size=3000))
+    assert (bends >= FISH.limits[:, 2, 0]).all()
+    assert (bends <= FISH.limits[:, 2, 1]).all()
+    assert (bends[:, [0, 20]] == 0).all()
+    front, hind = np.abs(bends[:, 1:10]).mean(), np.abs(bends[:, 11:20]).mean()
+    assert 1.2 * front < hind < 3.0 * front
+
+
+def test_the_joints_lie_within_the_fish_of_the_picture(pictures):
+    uv = pictures.joints_mm[..., :2] / pictures.joints_mm[..., 2:] * pictures.intrinsics[:, None, :2]
+    uv = np.rint(uv + pictures.intrinsics[:, None, 2:] - pictures.origin[:, None]).astype(int)
+    for i in range(len(pictures)):
+        depth, still = (picture[i] * pictures.unit_mm for picture in (pictures.depth, pictures.background))
+        inner = uv[i, 1:14]
+        here, behind = depth[inner[:, 1], inner[:, 0]], still[inner[:, 1], inner[:, 0]]
+        read = (here > 0) & (behind > 0)
+        # the back is nearer than the mid-axis, by no more than half a fish's height
+        assert ((pictures.joints_mm[i, 1:14, 2] - here)[read] > -3.0).mean() > 0.9
+        assert ((behind - here)[read] > 2.0).mean() > 0.8
+
+
+def test_fish_hang_between_the_floor_and_the_nearest_that_the_camera_sees_whole():
+    rng = np.random.default_rng(4)
+    habits, n = FishHabits(), 600
+    size, camera_mm = rng.uniform(0.6, 1.5, n), rng.uniform(230.0, 330.0, n)
+    shape = habits.shapes(rng, "train", n)
+    pose, girth, kind = habits.postures(rng, size, shape, camera_mm)
+    z = Surface.of(FISH).vertices(pose, shape, girth)[..., 2]
+    assert z.min() > 0.0
+    assert (camera_mm - z.max(axis=1)).min() > 140.0
+    assert set(kind) == set(range(len(KINDS)))
+    height = z.mean(axis=1) / camera_mm
+    assert np.quantile(height, 0.05) < 0.06
+    assert np.quantile(height, 0.95) > 0.28
+
+
+def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
+    fish = swimming_session(6, 400)
+    uv = fish.camera.project(fish.joints_camera)
+    assert ((uv > 0) & (uv < 1023)).all()
+    middle = fish.joints_arena.mean(axis=1)
+    step = np.diff(middle, axis=0)
+    speed = np.linalg.norm(step, axis=1) * fish.rate_hz / fish.spine_mm
+    assert speed.max() < 8.0  # lengths a second
+    assert np.median(speed) > 0.1
+    ahead = fish.joints_arena[:-1, 0] - fish.joints_arena[:-1, 10]
+    cosine = np.sum(step * ahead, axis=1) / np.linalg.norm(step, axis=1) / np.linalg.norm(ahead, axis=1)
+    assert np.median(cosine[speed > 0.5]) > 0.9
+
+
+def test_the_same_seed_gives_the_same_fish():
+    first, again = (SyntheticSession.draw([7, 1], 2, habits=FishHabits()) for _ in range(2))
+    np.testing.assert_array_equal(first.depths(0, 2), again.depths(0, 2))
+    assert first.camera == RAYTRIX_R5
+    assert 25.0 <= first.spine_mm <= 40.0
+    assert np.diff(first.times_ns).tolist() == [20_000_000]
+
+
+# the light-field camera
+
+
+def sensed(distance_mm: float, **changes: float) -> np.ndarray:
+    """A flat animal at a distance, as one unit of the camera sees it, mm (0 unread)."""
+    p = RAYTRIX_R5_SENSOR.draw(np.random.default_rng(0), 1, np.zeros(1))[0]
+    columns = {"noise": k.NOISE, "dark": k.DARK, "filled": k.FLYING, "outliers": k.OUTLIERS, "smooth": k.SMOOTH}
+    p[[k.LUMPS, k.OUTLIERS, k.DARK]] = 0.0, 99.0, -99.0
+    for name, value in changes.items():
+        p[columns[name]] = value
+    shape = (240, 240)
+    depth, what = np.full(shape, distance_mm, np.float32), np.full(shape, k.ANIMAL, np.uint8)
+    out = np.zeros(shape, np.uint16)
+    k.sense(depth, what, p, 2363.0, 0.0, 0.0, np.array([99], np.uint64), k.NORMAL, np.empty(shape, np.float32), out)
+    return out * p[k.UNIT]
+
+
+def test_range_noise_grows_with_the_square_of_the_distance_and_is_mostly_smooth():
+    near, far = sensed(200.0, smooth=1.0), sensed(400.0, smooth=1.0)
+    assert near.mean() == pytest.approx(200.0, abs=0.3)
+    assert far.std() / near.std() == pytest.approx(4.0, rel=0.1)
+    assert np.diff(near, axis=1).std() < 0.8 * near.std()
+    assert sensed(200.0, smooth=1.0, noise=2.0).std() / near.std() == pytest.approx(2.0, rel=0.1)
+
+
+def test_skin_without_texture_is_unread_or_filled():
+    bare, filled = sensed(250.0, dark=-0.5, filled=0.0), sensed(250.0, dark=-0.5, filled=1.0)
+    assert 0.1 < (bare == 0).mean() < 0.5
+    assert (filled == 0).mean() == 0.0
+    assert filled.std() > bare[bare > 0].std()
+
+
+def test_some_patches_are_matched_wrongly():
+    wrong = np.abs(sensed(250.0, outliers=2.4) - 250.0)
+    assert 0.0005 < (wrong > 8.0).mean() < 0.05
