@@ -32,7 +32,8 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     walk: a mouse, swim: a fish, gesture: a hand, move: the animal of a skeleton's TOML, animal=snake.toml. Each setting
     may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn from the seed. track-easy and
     track-hard: the test sequences of `simulation.tracking_sequences`, of a mouse, or animal=fish or animal=hand, with a
-    seed or more frames others of their kind. camera: taken for the one that made the pictures, to see what a wrong one does.
+    seed or more frames others of their kind. camera: taken for the one that made the pictures, to see what a wrong one
+    does.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
     if kind not in _KINDS:
