@@ -35,13 +35,18 @@ def page(session: Session) -> str:
     style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
     drawn = charts(session, list(session.metadata["actions"]))
     sheet = pictures(session)
-    some = sorted({round(k * (len(sheet) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)} if sheet else ())
+    some = sorted(
+        {round(k * (len(sheet) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)} if sheet else ()
+    )
     strip = "".join(
         f"<figure>{svg}<figcaption><b>{word.replace('_', ' ') or '–'}</b> · {when}</figcaption></figure>"
         for svg, when, word, _ in (sheet[k] for k in some)
     )
-    titled = [("Actions", drawn["lanes"]), *((title, svg) for title, _, svg in curves(session)),
-              ("Joint error to be expected", drawn["error"])]  # fmt: skip
+    titled = [
+        ("Actions", drawn["lanes"]),
+        *((title, svg) for title, _, svg in curves(session)),
+        ("Joint error to be expected", drawn["error"]),
+    ]
     lines = "".join(f'<p class="title">{title}</p><figure>{svg}</figure>' for title, svg in titled)
     way = f'<figure><p class="title">Way over the floor</p>{drawn["way"]}</figure>'
     css = (style[1] if style else "") + _STYLE
@@ -56,7 +61,14 @@ def photograph(session: str | Path, png: str | Path, browser: str = "chromium") 
         html.write_text(page(Session.open(session)), encoding="utf-8")
         command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
         subprocess.run(
-            [*command, f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={Path(png).resolve()}", html.as_uri()],
-            check=True, capture_output=True, timeout=120,
-        )  # fmt: skip
+            [
+                *command,
+                f"--window-size={WIDTH},{HEIGHT}",
+                f"--screenshot={Path(png).resolve()}",
+                html.as_uri(),
+            ],
+            check=True,
+            capture_output=True,
+            timeout=120,
+        )
     return Path(png)

@@ -54,9 +54,17 @@ def run_session(
         crew = Processes(workers)
     with telling_of_compiling(progress) as progress:
         return measure_session(
-            recording, plan, out, folder=folder, overwrite=overwrite, notes=notes, blueprint=replay_blueprint,
-            report=write_views, crew=crew, progress=progress,
-        )  # fmt: skip
+            recording,
+            plan,
+            out,
+            folder=folder,
+            overwrite=overwrite,
+            notes=notes,
+            blueprint=replay_blueprint,
+            report=write_views,
+            crew=crew,
+            progress=progress,
+        )
 
 
 def correct_session(
@@ -76,14 +84,26 @@ def correct_session(
     from liex_lab.dashboards.report.views import write_views
     from liex_lab.pipelines.correct import correct_session as job
 
-    return job(session, what, undo=undo, author=author, blueprint=replay_blueprint, report=write_views,
-               progress=progress)  # fmt: skip
+    return job(
+        session,
+        what,
+        undo=undo,
+        author=author,
+        blueprint=replay_blueprint,
+        report=write_views,
+        progress=progress,
+    )
 
 
 def follow_live(
-    source: str, plan: Plan, *, replay: bool = False, to: str = "viewer", patience_s: float = 3.0,
+    source: str,
+    plan: Plan,
+    *,
+    replay: bool = False,
+    to: str = "viewer",
+    patience_s: float = 3.0,
     progress: Progress = silent,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured latencies."""
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
@@ -91,11 +111,17 @@ def follow_live(
 
     arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
     numbers, _ = job(
-        arriving, plan, progress=progress,
+        arriving,
+        plan,
+        progress=progress,
         viewer=lambda tracker, arriving: LiveView(
-            arriving.name, arriving.camera, tracker.subject.T_arena_camera, tracker.subject.skeleton, to
+            arriving.name,
+            arriving.camera,
+            tracker.subject.T_arena_camera,
+            tracker.subject.skeleton,
+            to,
         ),
-    )  # fmt: skip
+    )
     return numbers
 
 
@@ -103,7 +129,9 @@ def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     """The bundled sample recording as a session; an earlier session of the demo is replaced."""
     from liex_lab.catalog import find_sample
 
-    return run_session(find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress)
+    return run_session(
+        find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress
+    )
 
 
 def run_study(
@@ -126,8 +154,18 @@ def run_study(
     """
     from liex_lab.pipelines.study.run import run_study as job
 
-    return job(Study.load(study), run_session, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry,
-               again=again, only=only, dry_run=dry_run, board=board)  # fmt: skip
+    return job(
+        Study.load(study),
+        run_session,
+        workers=workers,
+        scheduler=scheduler,
+        slurm=slurm,
+        retry=retry,
+        again=again,
+        only=only,
+        dry_run=dry_run,
+        board=board,
+    )
 
 
 def serve_dashboard(
@@ -230,7 +268,9 @@ def evaluate_actions(
     from liex_lab.pipelines.evaluation.actions import evaluate_actions as measure
 
     draw = None if figure is None else partial(draw_confusions, path=figure)
-    return measure(animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress)
+    return measure(
+        animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress
+    )
 
 
 def run_tables(
@@ -251,5 +291,12 @@ def run_tables(
     from liex_lab.dashboards.paper.plates import draw_figures
     from liex_lab.pipelines.evaluation.paper.run import make_tables
 
-    return make_tables(out, animals or list(bundled_models()), n_frames=n_frames, quick=quick, fresh=fresh,
-                       draw=draw_figures, progress=progress)  # fmt: skip
+    return make_tables(
+        out,
+        animals or list(bundled_models()),
+        n_frames=n_frames,
+        quick=quick,
+        fresh=fresh,
+        draw=draw_figures,
+        progress=progress,
+    )

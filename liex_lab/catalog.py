@@ -22,7 +22,9 @@ def datasets_folder() -> Path:
     for folder in (_HERE / "datasets", _HERE.parent / "datasets"):
         if folder.is_dir():
             return folder
-    raise LiexError(f"the folder datasets should be in {_HERE} or beside it, but is in neither; install liex_lab again")
+    raise LiexError(
+        f"the folder datasets should be in {_HERE} or beside it, but is in neither; install liex_lab again"
+    )
 
 
 def kept_results_folder() -> Path:
@@ -36,13 +38,19 @@ def find_sample(name: str) -> Path:
     if name and (folder / name).exists():
         return folder / name
     not_samples, kept = {".toml", ".md"}, kept_results_folder()
-    known = sorted(p.name for p in folder.iterdir() if p.suffix not in not_samples and p.name[0] != "." and p != kept)
+    known = sorted(
+        p.name
+        for p in folder.iterdir()
+        if p.suffix not in not_samples and p.name[0] != "." and p != kept
+    )
     raise LiexError(f"there is no bundled sample '{name}'; there are: {', '.join(known) or 'none'}")
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
     """The cards of the bundled models by name, in alphabetical order; the hashes are not checked here."""
-    return {path.stem: _read_card(path.with_suffix(".json")) for path in sorted(folder.glob("*.npz"))}
+    return {
+        path.stem: _read_card(path.with_suffix(".json")) for path in sorted(folder.glob("*.npz"))
+    }
 
 
 def find_model(model: str | Path, folder: Path = MODELS) -> Path:
@@ -56,7 +64,9 @@ def find_model(model: str | Path, folder: Path = MODELS) -> Path:
         known = [p.stem for p in sorted(folder.glob("*.npz"))]
         near = difflib.get_close_matches(str(model), known, 1)
         hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
-        raise ModelError(f"there is no model '{model}'; {hint}, or give the path of an .npz made by `liex train`")
+        raise ModelError(
+            f"there is no model '{model}'; {hint}, or give the path of an .npz made by `liex train`"
+        )
     card_path = path.with_suffix(".json")
     if path == bundled or card_path.is_file():
         stated, found = _read_card(card_path)["sha256"], sha256(path)
@@ -76,11 +86,17 @@ def sha256(path: Path) -> str:
 
 def _read_card(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise ModelError(f"the model {path.stem} needs its card {path}, which is missing; install liex_lab again")
+        raise ModelError(
+            f"the model {path.stem} needs its card {path}, which is missing; install liex_lab again"
+        )
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ModelError(f"the model card {path} should be JSON, but: {error}; install liex_lab again") from None
+        raise ModelError(
+            f"the model card {path} should be JSON, but: {error}; install liex_lab again"
+        ) from None
     if not isinstance(card, dict) or not isinstance(card.get("sha256"), str):
-        raise ModelError(f"the model card {path} should state the model's sha256; make it again with `liex train`")
+        raise ModelError(
+            f"the model card {path} should state the model's sha256; make it again with `liex train`"
+        )
     return card

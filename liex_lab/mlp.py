@@ -38,9 +38,17 @@ class Network:
 
 
 def descend(
-    inputs: NDArray[np.floating], labels: NDArray[Any], hidden: Sequence[int], *, epochs: int, batch: int, rate: float,
-    least_rate: float, weight_decay: float, seed: int,
-) -> list[tuple[Array, Array]]:  # fmt: skip
+    inputs: NDArray[np.floating],
+    labels: NDArray[Any],
+    hidden: Sequence[int],
+    *,
+    epochs: int,
+    batch: int,
+    rate: float,
+    least_rate: float,
+    weight_decay: float,
+    seed: int,
+) -> list[tuple[Array, Array]]:
     """Layers (weights, bias) that tell the labels (m,) of inputs (m, F), by scikit-learn's stochastic gradient descent
     (Adam), whose rate falls with a cosine; the last gives one number where there are two labels, else one for each. The
     same bits on any number of cores.
@@ -48,12 +56,19 @@ def descend(
     from sklearn.neural_network import MLPClassifier
 
     classifier = MLPClassifier(
-        tuple(hidden), alpha=weight_decay, batch_size=batch, learning_rate_init=rate, max_iter=1, warm_start=True,
+        tuple(hidden),
+        alpha=weight_decay,
+        batch_size=batch,
+        learning_rate_init=rate,
+        max_iter=1,
+        warm_start=True,
         random_state=seed,
-    )  # fmt: skip
+    )
     present = np.unique(labels)
     with serial_products():
         for epoch in range(epochs):
-            classifier.learning_rate_init = rate * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs)) + least_rate
+            classifier.learning_rate_init = (
+                rate * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs)) + least_rate
+            )
             classifier.partial_fit(inputs, labels, classes=present if epoch == 0 else None)
     return list(zip(classifier.coefs_, classifier.intercepts_, strict=True))

@@ -104,7 +104,9 @@ class _Forward(Loader):
         """The module at its new path; a warning says where that is."""
         new = MOVED[spec.name]
         # seen without asking for it, unlike a DeprecationWarning
-        warnings.warn(f"{spec.name} has moved to {new}; import it from there", FutureWarning, stacklevel=2)
+        warnings.warn(
+            f"{spec.name} has moved to {new}; import it from there", FutureWarning, stacklevel=2
+        )
         module = import_module(new)
         self._own = module.__spec__
         return module

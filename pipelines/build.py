@@ -31,10 +31,15 @@ if TYPE_CHECKING:
     from liex_lab.tracking.tracker import FrameTracker
 
 
-_SPANS = (0.6, 1.8)  # of the home length: how small and how large an animal of the user's own may be
+_SPANS = (
+    0.6,
+    1.8,
+)  # of the home length: how small and how large an animal of the user's own may be
 
 
-def build_recording(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
+def build_recording(
+    recording: str | Path | Recording, plan: Plan, progress: Progress = silent
+) -> Recording:
     """The recording at a path, or one that is open already, as an ideal camera in air would have made it.
 
     Lens distortion, the water's refraction and a mirror are undone whenever a frame is read.
@@ -45,7 +50,9 @@ def build_recording(recording: str | Path | Recording, plan: Plan, progress: Pro
     return mirrored(seen) if plan.recording.mirrored else seen
 
 
-def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progress = silent) -> Recording:
+def open_planned(
+    recording: str | Path | Recording, plan: Plan, progress: Progress = silent
+) -> Recording:
     """The recording at a path, opened as the plan says, or one that is open already; the plan's camera overrules.
 
     A plan that states all four intrinsics opens a recording that has none, too.
@@ -55,9 +62,13 @@ def open_planned(recording: str | Path | Recording, plan: Plan, progress: Progre
     settings = plan.recording
     if isinstance(recording, str | Path):
         recording = open_recording(
-            recording, camera=_stated_lens(plan), fps=settings.fps, topic=settings.topic,
-            strict=not settings.accept_truncated, progress=progress,
-        )  # fmt: skip
+            recording,
+            camera=_stated_lens(plan),
+            fps=settings.fps,
+            topic=settings.topic,
+            strict=not settings.accept_truncated,
+            progress=progress,
+        )
     recording.camera = _overruled(recording.camera, plan)
     return recording
 
@@ -86,7 +97,9 @@ def _stated_distortion(plan: Plan) -> Distortion | None:
 
 def _overruled(camera: Camera, plan: Plan) -> Camera:
     """The camera with what the plan states put in."""
-    stated: dict[str, Any] = plan.camera.model_dump(exclude_none=True, exclude={"distortion", "distortion_model"})
+    stated: dict[str, Any] = plan.camera.model_dump(
+        exclude_none=True, exclude={"distortion", "distortion_model"}
+    )
     if plan.camera.distortion is not None:
         stated["distortion"] = _stated_distortion(plan)
     return replace(camera, **{"source": "plan", **stated}) if stated else camera
@@ -102,7 +115,12 @@ def plan_of(animal: str) -> Plan:
     low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
     return Plan.from_table(
         {
-            "animal": {"name": skeleton.name, "skeleton": animal, "spine_min_mm": low, "spine_max_mm": high},
+            "animal": {
+                "name": skeleton.name,
+                "skeleton": animal,
+                "spine_min_mm": low,
+                "spine_max_mm": high,
+            },
             "foreground": {"min_height_mm": skeleton.view.min_height_mm},
             "estimation": {"model": f"{Path(animal).stem}.npz"},
         }
@@ -146,7 +164,9 @@ def build_tracker(
 
     build_zones(plan)  # a slip in their file is told before any work is done
     estimator = estimator_of() if estimator_of else build_estimator(plan)
-    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+    scene, sample = build_scene(
+        recording, plan, estimator.skeleton, plan.foreground.n_background_frames
+    )
     limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
     return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)
 
@@ -161,7 +181,9 @@ def build_scene(
 
     animal, foreground = plan.animal, plan.foreground
     if skeleton.view.foreground == FOREGROUNDS[1]:
-        return NearestScene.learn(recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm))
+        return NearestScene.learn(
+            recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
+        )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
     return Scene.learn(recording, sizes, n_frames, foreground.min_height_mm, skeleton.view)
 
@@ -173,16 +195,24 @@ def build_provenance(
     from liex_lab.catalog import find_model, sha256
     from liex_lab.sessions import Provenance
 
-    recording.digest(progress)  # kept by the recording; the longest wait here, so it is the one that is shown
+    recording.digest(
+        progress
+    )  # kept by the recording; the longest wait here, so it is the one that is shown
     arena, zones = build_arena(tracker.scene, plan)
-    origin = {"plan": "stated in the plan", "recording": "estimated over the recording"}[tracker.size_origin]
+    origin = {"plan": "stated in the plan", "recording": "estimated over the recording"}[
+        tracker.size_origin
+    ]
     return Provenance.of(
         recording,
         tracker.scene.floor,
         tracker.estimator.skeleton,
         plan,
         model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
-        animal_size={"spine_mm": round(tracker.spine_mm, 3), "origin": origin, "girth": round(tracker.body.girth, 3)},
+        animal_size={
+            "spine_mm": round(tracker.spine_mm, 3),
+            "origin": origin,
+            "girth": round(tracker.body.girth, 3),
+        },
         arena=arena,
         zones=zones,
     )

@@ -49,7 +49,9 @@ def compare_sessions(
     wanted = list(measures) or usual_measures(table)
     absent = [name for name in wanted if name not in table]
     if absent:
-        raise SessionError(f"no session's summary has the column '{absent[0]}'; see columns.json in a session's folder")
+        raise SessionError(
+            f"no session's summary has the column '{absent[0]}'; see columns.json in a session's folder"
+        )
     groups = sorted({str(group) for group in table["group"].fillna("")} - {""})
     if len(groups) < 2 or (reference is not None and reference not in groups):
         raise SessionError(
@@ -64,7 +66,9 @@ def compare_sessions(
     stats.to_csv(target / "stats.csv", index=False, lineterminator="\n")
     table.to_csv(target / "sessions.csv", index=False, lineterminator="\n")
     entries = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
-    (target / "columns.json").write_text(json.dumps(entries, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (target / "columns.json").write_text(
+        json.dumps(entries, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     (target / "methods.txt").write_text(methods(stats) + "\n", encoding="utf-8")
     return {"stats": stats, "folder": target}
 
@@ -74,9 +78,17 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
     found: set[Path] = set()
     for place in map(Path, places):
         if not place.is_dir():
-            raise SessionError(f"{place} is not a folder; name session folders, or folders with sessions in them")
-        inside = {place} if (place / "session.json").is_file() else {p.parent for p in place.rglob("session.json")}
-        inside = {folder for folder in inside if not inside & set(folder.parents)}  # not a session's older tables
+            raise SessionError(
+                f"{place} is not a folder; name session folders, or folders with sessions in them"
+            )
+        inside = (
+            {place}
+            if (place / "session.json").is_file()
+            else {p.parent for p in place.rglob("session.json")}
+        )
+        inside = {
+            folder for folder in inside if not inside & set(folder.parents)
+        }  # not a session's older tables
         if not inside:
             raise SessionError(f"there is no session in {place}; `liex run` makes them")
         found |= {folder.resolve() for folder in inside}
@@ -90,8 +102,14 @@ def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     try:
         stated = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
-        raise SessionError(f"{path} should be a CSV with the column subject_id, but: {error}; correct it") from None
-    if "subject_id" not in stated or not set(stated.columns) & set(_WHO) or stated["subject_id"].duplicated().any():
+        raise SessionError(
+            f"{path} should be a CSV with the column subject_id, but: {error}; correct it"
+        ) from None
+    if (
+        "subject_id" not in stated
+        or not set(stated.columns) & set(_WHO)
+        or stated["subject_id"].duplicated().any()
+    ):
         raise SessionError(
             f"{path} should have a column subject_id, each animal once, and any of {', '.join(_WHO)}; it has "
             f"{', '.join(map(str, stated.columns))}"
@@ -99,5 +117,9 @@ def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     known = stated.set_index("subject_id")
     unknown = sorted(set(table["subject_id"].astype(str)) - set(known.index))
     if unknown:
-        raise SessionError(f"{path} does not list the animal '{unknown[0]}' of the sessions; add a row for it")
-    return table.assign(**{name: table["subject_id"].map(known[name]) for name in _WHO if name in known})
+        raise SessionError(
+            f"{path} does not list the animal '{unknown[0]}' of the sessions; add a row for it"
+        )
+    return table.assign(
+        **{name: table["subject_id"].map(known[name]) for name in _WHO if name in known}
+    )

@@ -17,14 +17,23 @@ from liex_lab.optics.camera import Lens
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.depth_units import whole_steps
-from liex_lab.recordings.writer import STAMPS, OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import (
+    STAMPS,
+    OniRecordingWriter,
+    PictureFolderWriter,
+    RecordingWriter,
+)
 from liex_lab.runtime.progress import Progress, silent
 
-_STEPS_MM = {".oni": (1.0, 0.1), "": (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)}  # what each format can state
+_STEPS_MM = {
+    ".oni": (1.0, 0.1),
+    "": (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01),
+}  # what each format can state
 _N_PROBED = 8
 # a name that ends like another kind of file is no folder's
 _OTHER_KINDS = re.compile(
-    r"\.(bag|db3|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$", re.I
+    r"\.(bag|db3|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$",
+    re.I,
 )
 _PICTURE = re.compile(r"frame_\d+\.png")
 
@@ -64,11 +73,15 @@ def convert(
         return _convert(recording, target, step_mm, ros, progress)
     if target.exists() and Path(recording).exists() and target.samefile(recording):
         raise RecordingError(f"{target} is the recording itself; write under another name")
-    with open_recording(recording, camera=camera, fps=fps, topic=topic, progress=progress) as opened:
+    with open_recording(
+        recording, camera=camera, fps=fps, topic=topic, progress=progress
+    ) as opened:
         return _convert(opened, target, step_mm, ros, progress)
 
 
-def _convert(recording: Recording, target: Path, step_mm: float | None, ros: bool, progress: Progress) -> Converted:
+def _convert(
+    recording: Recording, target: Path, step_mm: float | None, ros: bool, progress: Progress
+) -> Converted:
     with _in_place(target) as part:
         writer = _writer(recording, target, part, step_mm, ros)
         with writer:
@@ -78,26 +91,45 @@ def _convert(recording: Recording, target: Path, step_mm: float | None, ros: boo
     return Converted(target, len(recording), writer.notes, list(recording.problems))
 
 
-def _writer(recording: Recording, target: Path, part: Path, step_mm: float | None, ros: bool) -> RecordingWriter:
+def _writer(
+    recording: Recording, target: Path, part: Path, step_mm: float | None, ros: bool
+) -> RecordingWriter:
     kind, camera = _kind(target), recording.camera
     if ros and kind != ".mcap":
-        raise RecordingError(f"ROS's messages are written into an .mcap file, not into {target.name}; leave out --ros")
+        raise RecordingError(
+            f"ROS's messages are written into an .mcap file, not into {target.name}; leave out --ros"
+        )
     if kind == ".mcap":
         from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 
         if step_mm is not None:
-            raise RecordingError("an .mcap file keeps depth as it is, so that --step-mm says nothing; leave it out")
-        metadata = {"source": recording.name, "source_format": recording.format} | recording.metadata
-        return McapDepthWriter(part, camera, messages="ros" if ros else "foxglove", metadata=metadata)
+            raise RecordingError(
+                "an .mcap file keeps depth as it is, so that --step-mm says nothing; leave it out"
+            )
+        metadata = {
+            "source": recording.name,
+            "source_format": recording.format,
+        } | recording.metadata
+        return McapDepthWriter(
+            part, camera, messages="ros" if ros else "foxglove", metadata=metadata
+        )
     step = _step(recording, kind, target) if step_mm is None else step_mm
     if kind == ".oni":
         if step not in _STEPS_MM[kind]:
-            raise RecordingError(f"{target.name} holds steps of 1 mm or 0.1 mm, got {step:g}; state one of them")
+            raise RecordingError(
+                f"{target.name} holds steps of 1 mm or 0.1 mm, got {step:g}; state one of them"
+            )
         return OniRecordingWriter(
-            part, camera, step_mm=step, exact=step_mm is None, start_ns=int(recording.times_ns[0]),
+            part,
+            camera,
+            step_mm=step,
+            exact=step_mm is None,
+            start_ns=int(recording.times_ns[0]),
             rate_hz=recording.rate_hz if len(recording) > 1 else 30.0,
-        )  # fmt: skip
-    return PictureFolderWriter(part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata)
+        )
+    return PictureFolderWriter(
+        part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata
+    )
 
 
 def _kind(target: Path) -> str:
@@ -131,13 +163,19 @@ def _check_target(target: Path, overwrite: bool) -> None:
             "pictures"
         )
     if not target.parent.is_dir():
-        raise RecordingError(f"there is no folder {target.parent} to write {target.name} into; make it first")
+        raise RecordingError(
+            f"there is no folder {target.parent} to write {target.name} into; make it first"
+        )
     if not target.exists():
         return
     is_file = bool(_kind(target))
     if target.is_dir() if is_file else not target.is_dir():
         raise RecordingError(f"{target} is a {'folder' if is_file else 'file'}; give another name")
-    others = [] if is_file else [path.name for path in sorted(target.iterdir()) if not _written_here(path)]
+    others = (
+        []
+        if is_file
+        else [path.name for path in sorted(target.iterdir()) if not _written_here(path)]
+    )
     if others:
         raise RecordingError(
             f"{target} holds more than a recording written by liex convert, such as {others[0]}; give another name"
@@ -147,7 +185,9 @@ def _check_target(target: Path, overwrite: bool) -> None:
 
 
 def _written_here(path: Path) -> bool:
-    return path.is_file() and (path.name in (CAMERA_FILE, STAMPS) or _PICTURE.fullmatch(path.name) is not None)
+    return path.is_file() and (
+        path.name in (CAMERA_FILE, STAMPS) or _PICTURE.fullmatch(path.name) is not None
+    )
 
 
 @contextmanager

@@ -12,12 +12,20 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions.corrections import FOLDER, LOG, REPLAY, BoutEdit, Correction, Log, basis, read_log
+from liex_lab.sessions.corrections import (
+    FOLDER,
+    LOG,
+    REPLAY,
+    BoutEdit,
+    Correction,
+    Log,
+    basis,
+    read_log,
+)
 
 from .session import measure_behaviour
 
 if TYPE_CHECKING:
-
     from liex_lab.behaviour.summary import Behaviour
     from liex_lab.sessions import Session
     from liex_lab.sessions.applying import CorrectedTrack
@@ -56,7 +64,9 @@ def correct_session(
             )
         log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
         if not log.entries:
-            raise SessionError(f"{raw.path} has no corrections to apply; `liex correct --help` says how to make one")
+            raise SessionError(
+                f"{raw.path} has no corrections to apply; `liex correct --help` says how to make one"
+            )
         part = raw.path / f"{FOLDER}.part"
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
@@ -89,7 +99,9 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     skeleton = skeleton_of(raw)
     origin, found = provenance_of(raw, skeleton), corrected_track(raw, log, skeleton)
     index = raw.frames["frame_index"].to_numpy()
-    rows = Rows(found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones)
+    rows = Rows(
+        found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
+    )
     results = Results(origin, rows, found.flips)
     behaviour, facts = _behaviour(raw, log, found, results)
     written = behaviour.tables
@@ -112,13 +124,17 @@ def _told(log: Log) -> dict[str, Any]:
     """The standing corrections in short: `corrections` of session.json as it is read."""
     made = [(entry.what, entry.author) for entry in log.standing if entry.what is not None]
     kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
-    return {"n": len(made), **kinds, "authors": sorted({author for _, author in made}),
-            "last": log.standing[-1].made_at}  # fmt: skip
+    return {
+        "n": len(made),
+        **kinds,
+        "authors": sorted({author for _, author in made}),
+        "last": log.standing[-1].made_at,
+    }
 
 
 def _behaviour(
     raw: Session, log: Log, found: CorrectedTrack, results: Results
-) -> tuple[Behaviour, dict[str, Any]]:  # fmt: skip
+) -> tuple[Behaviour, dict[str, Any]]:
     """The behaviour of the corrected track, and facts of it for session.json.
 
     The ethogram is the session's own; where head and tail were exchanged it is named again; then come the edits.
@@ -132,8 +148,13 @@ def _behaviour(
     actions = dict(raw.metadata.get("actions") or {})
     facts: dict[str, Any] = {}
     if len(found.turned):
-        again, facts = measure_behaviour(results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin)
-        bouts, actions = spliced_bouts(bouts, again.bouts, found.turned, frames), {**again.actions, **actions}
+        again, facts = measure_behaviour(
+            results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin
+        )
+        bouts, actions = (
+            spliced_bouts(bouts, again.bouts, found.turned, frames),
+            {**again.actions, **actions},
+        )
     bouts = edited_bouts(bouts, log.corrections(BoutEdit), frames)
     return measure_rows(results.rows, rules, around, bouts=bouts, actions=actions), facts
 

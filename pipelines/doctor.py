@@ -52,8 +52,14 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "animal_sits_still": "whether it had become a part of the background",
     "problems": "what is wrong, and what to do about it",
 }
-_N_SAMPLED, _N_RAW = 96, 16  # frames looked at, spread over the recording; as many as a run learns its scene from
-_PLAUSIBLE_MM = (100.0, 10_000.0)  # median depth: nearer than any camera reads, farther than any animal is watched
+_N_SAMPLED, _N_RAW = (
+    96,
+    16,
+)  # frames looked at, spread over the recording; as many as a run learns its scene from
+_PLAUSIBLE_MM = (
+    100.0,
+    10_000.0,
+)  # median depth: nearer than any camera reads, farther than any animal is watched
 
 
 def examine(
@@ -93,7 +99,12 @@ def examine(
             "water": None if water is None else water.to_dict(),
             **depth.facts(),
             **look.facts,
-            "problems": [*seen.problems, *_time_problems(opened), *depth.problems(), *look.problems],
+            "problems": [
+                *seen.problems,
+                *_time_problems(opened),
+                *depth.problems(),
+                *look.problems,
+            ],
         }
     return {key: found[key] for key in FINDINGS}
 
@@ -164,7 +175,10 @@ class _Depths:
                 self.n_empty += 1
                 continue
             n_unread, n_pixels = n_unread + frame.size - read.size, n_pixels + frame.size
-            self.low, self.high = min(self.low, float(read.min())), max(self.high, float(read.max()))
+            self.low, self.high = (
+                min(self.low, float(read.min())),
+                max(self.high, float(read.max())),
+            )
             medians.append(float(np.median(read)))
         self.median_mm = float(np.median(medians)) if medians else None
         self.unread_share = n_unread / n_pixels if n_pixels else 1.0
@@ -181,7 +195,9 @@ class _Depths:
     def problems(self) -> list[str]:
         """Sentences about what the depths themselves say."""
         if self.median_mm is None:
-            return [f"none of the {self.n_frames} frames looked at holds any depth; check the camera and unit_mm"]
+            return [
+                f"none of the {self.n_frames} frames looked at holds any depth; check the camera and unit_mm"
+            ]
         found = []
         if self.n_empty:
             found.append(
@@ -229,31 +245,67 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
         edge = {"wall": ", with walls", "drop": ", ends in the air"}.get(arena.get("edge", ""), "")
         shape = f"{Arena.from_dict(arena)}{edge}"
     degrees = None if tilt is None else f"{math.degrees(tilt):.1f}"
-    coefficients = None if bent is None else ", ".join(f"{value:g}" for value in bent["coefficients"])
+    coefficients = (
+        None if bent is None else ", ".join(f"{value:g}" for value in bent["coefficients"])
+    )
     moves = {True: "sits still", False: "moves about", None: ""}[f["animal_sits_still"]]
     return [
         ("format", f["format"]),
         ("frames", f"{f['n_frames']} in {_text(f['duration_s'], 's', 2)}"),
-        ("rate", f"{_text(f['rate_hz'], 'frames/s', 2)}, steps vary by {_text(f['jitter_ms'], 'ms', 2)}"),
+        (
+            "rate",
+            f"{_text(f['rate_hz'], 'frames/s', 2)}, steps vary by {_text(f['jitter_ms'], 'ms', 2)}",
+        ),
         ("gaps", f"{f['n_gaps']}, {f['n_missing']} frames missing" if f["n_gaps"] else "none"),
-        ("time stamps", f"{f['n_time_faults']} could not be true" if f["n_time_faults"] else "increase as they should"),
+        (
+            "time stamps",
+            f"{f['n_time_faults']} could not be true"
+            if f["n_time_faults"]
+            else "increase as they should",
+        ),
         ("picture", f"{f['width']} x {f['height']} px"),
-        ("intrinsics", f"fx {f['fx']:.1f}, fy {f['fy']:.1f}, cx {f['cx']:.1f}, cy {f['cy']:.1f} px"),
+        (
+            "intrinsics",
+            f"fx {f['fx']:.1f}, fy {f['fy']:.1f}, cx {f['cx']:.1f}, cy {f['cy']:.1f} px",
+        ),
         ("intrinsics from", f["intrinsics_source"]),
-        ("lens distortion", "none" if bent is None else f"{bent['model']} {coefficients}, undone on reading"),
-        ("water", "none" if water is None else f"{_text(f['water_depth_mm'], 'mm')} deep, n = "
-         f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')}; refraction undone on reading"),
-        ("depth", f"{_text(f['depth_min_mm'], 'mm')} to {_text(f['depth_max_mm'], 'mm')}, {f['unread_share']:.1%} "
-         "of the pixels unread"),
-        ("on the floor", "unknown" if f["floor_unread_share"] is None else
-         f"{f['floor_unread_share']:.1%} unread, noise {_text(f['noise_mm'], 'mm', 1)}"),
-        ("floor", "unknown" if degrees is None else
-         f"{_text(f['floor_mm'], 'mm')} from the lens, tilted by {degrees} degrees"),
+        (
+            "lens distortion",
+            "none" if bent is None else f"{bent['model']} {coefficients}, undone on reading",
+        ),
+        (
+            "water",
+            "none"
+            if water is None
+            else f"{_text(f['water_depth_mm'], 'mm')} deep, n = "
+            f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')}; refraction undone on reading",
+        ),
+        (
+            "depth",
+            f"{_text(f['depth_min_mm'], 'mm')} to {_text(f['depth_max_mm'], 'mm')}, {f['unread_share']:.1%} "
+            "of the pixels unread",
+        ),
+        (
+            "on the floor",
+            "unknown"
+            if f["floor_unread_share"] is None
+            else f"{f['floor_unread_share']:.1%} unread, noise {_text(f['noise_mm'], 'mm', 1)}",
+        ),
+        (
+            "floor",
+            "unknown"
+            if degrees is None
+            else f"{_text(f['floor_mm'], 'mm')} from the lens, tilted by {degrees} degrees",
+        ),
         ("arena", shape or "unknown"),
-        ("animal", "not found" if f["animal_length_mm"] is None else
-         f"{_text(f['animal_length_mm'], 'mm')} long from above, {moves}, found in {f['animal_share']:.0%} of "
-         "the frames"),
-    ]  # fmt: skip
+        (
+            "animal",
+            "not found"
+            if f["animal_length_mm"] is None
+            else f"{_text(f['animal_length_mm'], 'mm')} long from above, {moves}, found in {f['animal_share']:.0%} of "
+            "the frames",
+        ),
+    ]
 
 
 def _text(value: float | None, unit: str, digits: int = 0) -> str:

@@ -26,12 +26,22 @@ _LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over i
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
 _MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
 _STILL_SHARE = 0.4  # of the animal's area was in the background
-_WIDER = 20.0  # an animal whose size the plan does not allow is looked for down to and up to this factor
+_WIDER = (
+    20.0  # an animal whose size the plan does not allow is looked for down to and up to this factor
+)
 
 KEYS = (
-    "floor_unread_share", "noise_mm", "floor_mm", "floor_tilt_rad", "water_depth_mm", "arena", "animal_length_mm",
-    "animal_area_mm2", "animal_share", "animal_sits_still",
-)  # fmt: skip
+    "floor_unread_share",
+    "noise_mm",
+    "floor_mm",
+    "floor_tilt_rad",
+    "water_depth_mm",
+    "arena",
+    "animal_length_mm",
+    "animal_area_mm2",
+    "animal_share",
+    "animal_sits_still",
+)
 
 
 @dataclass
@@ -70,7 +80,9 @@ class SceneLook:
         try:
             for zone in build_zones(self.plan):
                 zone.placed(
-                    self.seen.camera, Floor.from_plane(floor.normal, floor.distance_mm, self.seen.camera), arena
+                    self.seen.camera,
+                    Floor.from_plane(floor.normal, floor.distance_mm, self.seen.camera),
+                    arena,
                 )
         except PlanError as error:
             self.problems.append(str(error))
@@ -132,15 +144,20 @@ class SceneLook:
 
         animal, foreground = self.plan.animal, self.plan.foreground
         memory = Recording(
-            name=self.seen.name, format="sample", camera=self.seen.camera.every(self.stride),
-            times_ns=np.arange(len(self.sample)), read=lambda k: self.sample[k],
-        )  # fmt: skip
+            name=self.seen.name,
+            format="sample",
+            camera=self.seen.camera.every(self.stride),
+            times_ns=np.arange(len(self.sample)),
+            read=lambda k: self.sample[k],
+        )
         view = Skeleton.load(animal.skeleton).view
         expected = (animal.spine_min_mm, animal.spine_max_mm)
         for factor in (1.0, _WIDER):
             sizes = (expected[0] / factor, expected[1] * factor)
             try:
-                scene, sample = Scene.learn(memory, sizes, len(self.sample), foreground.min_height_mm, view)
+                scene, sample = Scene.learn(
+                    memory, sizes, len(self.sample), foreground.min_height_mm, view
+                )
             except EstimationError as error:
                 missing = error
                 continue
@@ -153,15 +170,25 @@ class SceneLook:
             return
         self.problems.append(str(missing))
 
-    def _tell_animal(self, scene: Scene, background: NDArray[np.float32], length: float, share: float) -> None:
+    def _tell_animal(
+        self, scene: Scene, background: NDArray[np.float32], length: float, share: float
+    ) -> None:
         raised = scene.background - background[:: scene.stride, :: scene.stride]
-        covered = scene.on_floor & (raised > self.plan.foreground.min_height_mm) & (raised < scene.background)
-        area = float((scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy))
+        covered = (
+            scene.on_floor
+            & (raised > self.plan.foreground.min_height_mm)
+            & (raised < scene.background)
+        )
+        area = float(
+            (scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy)
+        )
         still = area > _STILL_SHARE * scene.area_mm2
         self.facts |= {
-            "animal_length_mm": length, "animal_area_mm2": scene.area_mm2, "animal_share": share,
+            "animal_length_mm": length,
+            "animal_area_mm2": scene.area_mm2,
+            "animal_share": share,
             "animal_sits_still": still,
-        }  # fmt: skip
+        }
         if still:
             self.problems.append(
                 "the animal hardly leaves its place, so that it is a part of the background; it was told from the bare "

@@ -21,12 +21,16 @@ if TYPE_CHECKING:
     from liex_lab.tracking.track import Track, Tracked
     from liex_lab.tracking.tracker import FrameTracker
 
-LEARN_FRAMES = 90  # that are waited for: the background, the floor and the animal's size are learned from them
+LEARN_FRAMES = (
+    90  # that are waited for: the background, the floor and the animal's size are learned from them
+)
 _AT_ONCE, _LONG_S = 16, 0.2
 Viewer = Callable[["FrameTracker", "Arriving"], Any]
 
 
-def open_live(source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0) -> Arriving:
+def open_live(
+    source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0
+) -> Arriving:
     """What arrives at a source: a file or folder that is being written, HOST:PORT, or (replay) a recording sent at its
     own pace.
     """
@@ -42,9 +46,13 @@ def open_live(source: str, plan: Plan, *, replay: bool = False, patience_s: floa
 
 
 def follow_live(
-    arriving: Arriving, plan: Plan, *, learn_frames: int = LEARN_FRAMES, viewer: Viewer | None = None,
+    arriving: Arriving,
+    plan: Plan,
+    *,
+    learn_frames: int = LEARN_FRAMES,
+    viewer: Viewer | None = None,
     progress: Progress = silent,
-) -> tuple[dict[str, Any], Tracked]:  # fmt: skip
+) -> tuple[dict[str, Any], Tracked]:
     """Skeletons as frames come, shown in a viewer; returns latencies and the track of the whole, smoothed.
 
     Latency: from when a frame was there to when its skeleton was told, of every frame from the first on that came when
@@ -79,10 +87,14 @@ def follow_live(
     tracked = tracker.track(Observations.join(seen))
     quantiles = np.quantile(latency, [0.5, 0.95]) * 1e3 if latency else [None, None]
     numbers = {
-        "name": arriving.name, "n_frames": len(seen), "n_live": len(latency), "latency_median_ms": quantiles[0],
-        "latency_p95_ms": quantiles[1], "n_measured": int(tracked.track.observed.sum()),
+        "name": arriving.name,
+        "n_frames": len(seen),
+        "n_live": len(latency),
+        "latency_median_ms": quantiles[0],
+        "latency_p95_ms": quantiles[1],
+        "n_measured": int(tracked.track.observed.sum()),
         "n_bridged": int(tracked.track.bridged.sum()),
-    }  # fmt: skip
+    }
     return numbers, tracked
 
 
@@ -113,5 +125,10 @@ def _as_recording(arriving: Arriving, held: list[Arrival]) -> Recording:
     from liex_lab.recordings.recording import Recording
 
     times = np.array([arrival.frame.time_ns for arrival in held], np.int64)
-    return Recording(name=arriving.name, format="live", camera=arriving.camera, times_ns=times,
-                     read=lambda index: held[index].frame.depth)  # fmt: skip
+    return Recording(
+        name=arriving.name,
+        format="live",
+        camera=arriving.camera,
+        times_ns=times,
+        read=lambda index: held[index].frame.depth,
+    )

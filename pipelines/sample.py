@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 SEED = 341  # of a walk in which the animal turns, crosses its arena and rears once
 SPINE_MM = 65.0
 N_FRAMES = 154
-LEFT_OUT = (40, 101, 102, 103)  # frames that "the camera did not deliver", so that a sample has gaps as recordings have
+LEFT_OUT = (
+    40,
+    101,
+    102,
+    103,
+)  # frames that "the camera did not deliver", so that a sample has gaps as recordings have
 _START_NS = 10**9  # the clock of a camera that was switched on a second ago: no date is claimed
 _CHUNK_BYTES, _LEVEL = 1 << 20, 19  # packed once, downloaded often
 
@@ -33,9 +38,13 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
     mouse, path = virtual_mouse(), Path(path)
     path.unlink(missing_ok=True)
     origin = Provenance(
-        name=path.stem, skeleton=mouse.skeleton, camera=mouse.camera, T_arena_camera=mouse.T_arena_camera,
-        floor_distance_mm=mouse.floor.distance_mm, input_sha256="",
-    )  # fmt: skip
+        name=path.stem,
+        skeleton=mouse.skeleton,
+        camera=mouse.camera,
+        T_arena_camera=mouse.T_arena_camera,
+        floor_distance_mm=mouse.floor.distance_mm,
+        input_sha256="",
+    )
     writer = McapWriter(path, origin, level=_LEVEL, chunk_size=_CHUNK_BYTES)
     try:
         for frames in mouse.chunks(16):
@@ -54,7 +63,9 @@ def virtual_mouse() -> SyntheticSession:
     from liex_lab.simulation.locomotion import walking_session
     from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
 
-    return walking_session(SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk")
+    return walking_session(
+        SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk"
+    )
 
 
 def _card(path: Path, mouse: SyntheticSession) -> str:

@@ -65,20 +65,27 @@ def measure_session(
     from liex_lab.sessions.place import check_place, part_folder
 
     started = time.perf_counter()
-    with meanwhile(partial(build_estimator, plan)) as estimator, build_recording(recording, plan, progress) as opened:
+    with (
+        meanwhile(partial(build_estimator, plan)) as estimator,
+        build_recording(recording, plan, progress) as opened,
+    ):
         folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
         check_place(folder, overwrite)
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
         tracker = build_tracker(opened, plan, estimator)
-        build_recogniser(plan, tracker.estimator.skeleton)  # a slip in its name is told before any work is done
+        build_recogniser(
+            plan, tracker.estimator.skeleton
+        )  # a slip in its name is told before any work is done
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
         if crew is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
             whole = Stretch(str(recording), plan, tracker, provenance, folder, 0, len(opened))
             look_side_by_side(crew, whole, folder, progress)
-        with SessionWriter(folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report) as writer:
+        with SessionWriter(
+            folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report
+        ) as writer:
             writer.go_on(lambda row: opened.frame(row).depth)
             with closing(_read_ahead(opened, writer.n_frames)) as chunks:
                 for frames in chunks:
@@ -133,7 +140,9 @@ def measure_behaviour(
     named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, room)
     rows.track.rest()
     give_back()
-    return measure_rows(rows, build_rules(plan), build_surroundings(origin), room=room, **named), notes
+    return measure_rows(
+        rows, build_rules(plan), build_surroundings(origin), room=room, **named
+    ), notes
 
 
 def name_actions(
@@ -147,7 +156,11 @@ def name_actions(
     frames = rows.frames_table(_NAMED_BY)
     found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), room)
     notes = {
-        "action_model": {"skeleton": recogniser.skeleton, "clock_hz": recogniser.clock_hz, **recogniser.card},
+        "action_model": {
+            "skeleton": recogniser.skeleton,
+            "clock_hz": recogniser.clock_hz,
+            **recogniser.card,
+        },
         "unresolved_actions": found.unresolved,
     }
     actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}

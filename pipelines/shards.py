@@ -87,7 +87,7 @@ def look_side_by_side(crew: Crew, whole: Stretch, path: Path, progress: Progress
         planned = [
             replace(whole, start=start, stop=stop, folder=stretch_folder(held.folder, start, stop))
             for start, stop in _cuts(done, whole.stop)
-        ]  # fmt: skip
+        ]
         waiting, n_looked_at = list(planned), whole.stop - done
         there = [stretch for stretch in planned if is_whole(stretch.folder)]
         for stretch in _all_of(there, crew, [one for one in planned if one not in there]):

@@ -17,9 +17,19 @@ if TYPE_CHECKING:
 
 RunAgain = Callable[..., Path]  # liex_lab.api.run_session
 _NEEDED = (
-    "schema_version", "session_id", "versions", "input.sha256", "plan.seed", "camera.calibration_hash", "animal",
-    "model.sha256", "timings_s.total", "machine", "problems", "files",
-)  # fmt: skip
+    "schema_version",
+    "session_id",
+    "versions",
+    "input.sha256",
+    "plan.seed",
+    "camera.calibration_hash",
+    "animal",
+    "model.sha256",
+    "timings_s.total",
+    "machine",
+    "problems",
+    "files",
+)
 _TABLES = (".parquet", ".csv")
 
 
@@ -41,7 +51,13 @@ def verify_session(
     from liex_lab.sessions import Session
 
     session = Session.open(path, raw=True)
-    found = [*_provenance(session), *_files(session), *_logs(session), *_model(session), *_corrections(session)]
+    found = [
+        *_provenance(session),
+        *_files(session),
+        *_logs(session),
+        *_model(session),
+        *_corrections(session),
+    ]
     return [*found, *_again(session, run, recording, progress)] if recording else found
 
 
@@ -49,10 +65,15 @@ def _provenance(session: Session) -> Iterator[Finding]:
     """Whether everything is there that is needed to make the session again."""
     missing = [name for name in _NEEDED if _at(session.metadata, name) in (None, "", {})]
     if missing:
-        yield Finding("note", f"session.json does not say {', '.join(missing)}; it was written by an older liex_lab")
+        yield Finding(
+            "note",
+            f"session.json does not say {', '.join(missing)}; it was written by an older liex_lab",
+        )
     else:
         yield Finding("ok", "session.json says how the session was made")
-    if Plan.from_toml(session.plan, "plan.toml") != Plan.from_table(session.metadata.get("plan", {}), "session.json"):
+    if Plan.from_toml(session.plan, "plan.toml") != Plan.from_table(
+        session.metadata.get("plan", {}), "session.json"
+    ):
         yield Finding("wrong", "plan.toml is not the plan in session.json")
 
 
@@ -76,7 +97,9 @@ def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
         file = folder / Path(name).name
         if not file.is_file():
             wrong.append(f"{name} is missing")
-        elif file.stat().st_size != facts.get("bytes") or ("sha256" in facts and sha256(file) != facts["sha256"]):
+        elif file.stat().st_size != facts.get("bytes") or (
+            "sha256" in facts and sha256(file) != facts["sha256"]
+        ):
             wrong.append(f"{name} was changed")
     return wrong
 
@@ -93,10 +116,16 @@ def _corrections(session: Session) -> Iterator[Finding]:
     if not log.standing:
         return
     if not applies(log, session.path, session.metadata):
-        yield Finding("note", "its corrections were made on another measurement; `liex correct redo` applies them")
+        yield Finding(
+            "note",
+            "its corrections were made on another measurement; `liex correct redo` applies them",
+        )
         return
     wrong = _changed(corrected_folder(session.path), log.files)
-    yield from (Finding("wrong", f"of the corrected tables, {sentence}; see `liex correct redo`") for sentence in wrong)
+    yield from (
+        Finding("wrong", f"of the corrected tables, {sentence}; see `liex correct redo`")
+        for sentence in wrong
+    )
     if not wrong:
         authors = ", ".join(sorted({entry.author for entry in log.standing}))
         told = f"{len(log.standing)} corrections ({authors}) stand beside it"
@@ -116,9 +145,13 @@ def _logs(session: Session) -> Iterator[Finding]:
         return
     wanted = session.metadata.get("frames", {}).get("n_frames")
     if n_depth != wanted:
-        yield Finding("wrong", f"session.mcap holds {n_depth} depth pictures and the session {wanted} frames")
+        yield Finding(
+            "wrong", f"session.mcap holds {n_depth} depth pictures and the session {wanted} frames"
+        )
     else:
-        yield Finding("ok", f"session.rrd ({n} messages) and session.mcap ({n_depth} pictures) are whole")
+        yield Finding(
+            "ok", f"session.rrd ({n} messages) and session.mcap ({n_depth} pictures) are whole"
+        )
 
 
 def _depth_messages(session: Session) -> int:
@@ -133,7 +166,9 @@ def _depth_messages(session: Session) -> int:
         summary = None
     if summary is None or summary.statistics is None:
         raise SessionError("session.mcap is damaged; run `liex run` on the recording again")
-    depth = [number for number, channel in summary.channels.items() if channel.topic == "/camera/depth"]
+    depth = [
+        number for number, channel in summary.channels.items() if channel.topic == "/camera/depth"
+    ]
     return sum(summary.statistics.channel_message_counts.get(number, 0) for number in depth)
 
 
@@ -149,10 +184,15 @@ def _model(session: Session) -> Iterator[Finding]:
     if same:
         yield Finding("ok", "its model is the one that is installed")
         return
-    yield Finding("note", f"it was made with another model {stated.get('name')} than the one that is installed")
+    yield Finding(
+        "note",
+        f"it was made with another model {stated.get('name')} than the one that is installed",
+    )
 
 
-def _again(session: Session, run: RunAgain, recording: str, progress: Progress) -> Iterator[Finding]:
+def _again(
+    session: Session, run: RunAgain, recording: str, progress: Progress
+) -> Iterator[Finding]:
     """Measure the recording once more and compare the tables byte by byte."""
     from liex_lab.recordings import open_recording
     from liex_lab.sessions import Session
@@ -163,13 +203,20 @@ def _again(session: Session, run: RunAgain, recording: str, progress: Progress) 
             yield Finding("wrong", f"{recording} is not the recording that the session was made of")
             return
     with tempfile.TemporaryDirectory(prefix="liex-verify-") as scratch:
-        plan = Plan.from_table({**plan.model_dump(exclude_none=True), "session": {
-            **plan.session.model_dump(exclude_none=True), "name": session.name}})  # fmt: skip
+        plan = Plan.from_table(
+            {
+                **plan.model_dump(exclude_none=True),
+                "session": {**plan.session.model_dump(exclude_none=True), "name": session.name},
+            }
+        )
         other = Session.open(run(recording, plan, scratch, progress=progress))
-        differing = [path.name for path in _tables(session) if not _same_rows(path, other.path / path.name)]
+        differing = [
+            path.name for path in _tables(session) if not _same_rows(path, other.path / path.name)
+        ]
     if differing:
         yield Finding(
-            "wrong", f"measured again, it has other rows in {', '.join(differing)}{_versions(session, other)}"
+            "wrong",
+            f"measured again, it has other rows in {', '.join(differing)}{_versions(session, other)}",
         )
     else:
         yield Finding("ok", f"measured again, all {len(_tables(session))} tables are the same")
@@ -187,12 +234,16 @@ def _same_rows(path: Path, other: Path) -> bool:
         return False
     if path.read_bytes() == other.read_bytes():
         return True
-    return path.suffix == ".parquet" and pd.read_parquet(path).equals(pd.read_parquet(other))  # empty equals empty
+    return path.suffix == ".parquet" and pd.read_parquet(path).equals(
+        pd.read_parquet(other)
+    )  # empty equals empty
 
 
 def _versions(session: Session, other: Session) -> str:
     then, now = session.metadata.get("versions", {}), other.metadata["versions"]
-    changed = [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]
+    changed = [
+        f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]
+    ]
     return f"; versions changed: {', '.join(changed)}" if changed else ""
 
 

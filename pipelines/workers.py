@@ -58,7 +58,10 @@ def n_cores() -> int:
 
 def worker_environment(n_threads: int) -> dict[str, str]:
     """So that workers share the cores instead of each taking all of them."""
-    return {name: str(n_threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    return {
+        name: str(n_threads)
+        for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    }
 
 
 @contextmanager

@@ -10,13 +10,34 @@ from hypothesis import strategies as st
 from liex_lab.errors import LiexError
 
 _LEAVES = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.integers(-3, 3),
-    st.sampled_from(["../x", "/etc/passwd", "mouse", "\0", "=1+1", "nan", "1e999", "\ud800", 10**400, float("nan")]),
-)  # fmt: skip
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=8),
+    st.integers(-3, 3),
+    st.sampled_from(
+        [
+            "../x",
+            "/etc/passwd",
+            "mouse",
+            "\0",
+            "=1+1",
+            "nan",
+            "1e999",
+            "\ud800",
+            10**400,
+            float("nan"),
+        ]
+    ),
+)
 ANYTHING = st.recursive(
-    _LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    _LEAVES,
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=8,
-)  # fmt: skip
+)
 
 
 def damage(document: Any, data: st.DataObject) -> None:

@@ -19,7 +19,11 @@ def dispatchers() -> dict[int, tuple[str, Dispatcher]]:
         if module.name == "liex_lab.__main__":
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
-            if isinstance(value, Dispatcher) and value.targetoptions.get("nopython") and value.stats.cache_path:
+            if (
+                isinstance(value, Dispatcher)
+                and value.targetoptions.get("nopython")
+                and value.stats.cache_path
+            ):
                 found[id(value)] = (f"{value.__module__}.{name}", value)
     return found
 

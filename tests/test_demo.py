@@ -19,7 +19,9 @@ from liex_lab.simulation.agents.mouse import ACTIONS
 from tests.cli.test_cli import liex
 from tests.recordings.writers import depth_frames, write_mcap
 
-pytestmark = pytest.mark.skipif("mouse" not in catalog.bundled_models(), reason="the mouse's model is not bundled yet")
+pytestmark = pytest.mark.skipif(
+    "mouse" not in catalog.bundled_models(), reason="the mouse's model is not bundled yet"
+)
 KEPT = np.delete(np.arange(N_FRAMES), LEFT_OUT)
 
 
@@ -27,18 +29,23 @@ KEPT = np.delete(np.arange(N_FRAMES), LEFT_OUT)
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     """What `liex demo` leaves, in a process of its own."""
     out = tmp_path_factory.mktemp("demo")
-    ran = liex("demo", "--out", str(out), timeout_s=300.0)  # its first run compiles for about a minute
+    ran = liex(
+        "demo", "--out", str(out), timeout_s=300.0
+    )  # its first run compiles for about a minute
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.splitlines()[:2] == [
-        f"session: {out / 'mouse_walk.liex'}", f"report:  {out / 'mouse_walk.liex' / 'report.html'}"
-    ]  # fmt: skip
+        f"session: {out / 'mouse_walk.liex'}",
+        f"report:  {out / 'mouse_walk.liex' / 'report.html'}",
+    ]
     return Session.open(out / "mouse_walk.liex")
 
 
 def test_the_folder_is_whole(session: Session) -> None:
     assert {path.name for path in session.path.iterdir()} == {*FILES, "report.html", "thumbnails"}
     assert session.metadata["problems"] == []
-    assert session.metadata["input"]["sha256"] == catalog.sha256(catalog.find_sample("mouse_walk.mcap"))
+    assert session.metadata["input"]["sha256"] == catalog.sha256(
+        catalog.find_sample("mouse_walk.mcap")
+    )
 
 
 def test_every_frame_has_its_rows_and_every_gap_is_told(session: Session) -> None:
@@ -46,7 +53,9 @@ def test_every_frame_has_its_rows_and_every_gap_is_told(session: Session) -> Non
     joints = session.metadata["animal"]["joints"]
     assert (len(session.frames), len(session.kinematics)) == (n, n)
     assert (len(session.poses), len(session.rotations)) == (n * len(joints), n * (len(joints) + 1))
-    assert session.gaps["n_frames_missing"][session.gaps["reason"] == "camera_dropped"].tolist() == [1, 3]
+    assert session.gaps["n_frames_missing"][
+        session.gaps["reason"] == "camera_dropped"
+    ].tolist() == [1, 3]
     assert (session.frames["flag"] == "").mean() > 0.95
 
 
@@ -60,7 +69,9 @@ def test_the_skeleton_is_where_the_truth_is(session: Session) -> None:
     heading = np.sum((in_camera[:, 4] - in_camera[:, 0]) * (truth[:, 4] - truth[:, 0]), axis=-1)
     assert (heading < 0).sum() <= 2, "head and tail are told apart"
     assert session.metadata["animal"]["spine_mm"] == pytest.approx(mouse.spine_mm, rel=0.1)
-    assert session.metadata["camera"]["floor_distance_mm"] == pytest.approx(mouse.floor.distance_mm, rel=0.02)
+    assert session.metadata["camera"]["floor_distance_mm"] == pytest.approx(
+        mouse.floor.distance_mm, rel=0.02
+    )
 
 
 def test_the_tables_say_what_the_animal_did(session: Session) -> None:
@@ -86,7 +97,9 @@ def test_a_session_can_be_made_again_from_its_own_plan(session: Session, tmp_pat
 def test_a_recording_without_an_animal_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     empty = depth_frames(20, 160, 120)
     empty[:] = np.where(empty > 0, np.maximum(empty, 699), 0)
-    path = write_mcap(tmp_path / "r.mcap", empty, liex_lab.Camera(120.0, 120.0, 79.5, 59.5, 160, 120))
+    path = write_mcap(
+        tmp_path / "r.mcap", empty, liex_lab.Camera(120.0, 120.0, 79.5, 59.5, 160, 120)
+    )
     with pytest.raises(LiexError, match="no animal"):
         run_session(path, out=tmp_path / "results")
     assert not (tmp_path / "results").exists()
@@ -95,5 +108,10 @@ def test_a_recording_without_an_animal_is_told_and_leaves_nothing(tmp_path: Path
 def test_json_of_the_doctor_about_the_sample() -> None:
     ran = liex("doctor", str(catalog.find_sample("mouse_walk.mcap")), "--json")
     found = json.loads(ran.stdout)
-    assert (found["n_frames"], found["n_gaps"], found["width"], found["fx"]) == (len(KEPT), 2, 320, 287.9)
+    assert (found["n_frames"], found["n_gaps"], found["width"], found["fx"]) == (
+        len(KEPT),
+        2,
+        320,
+        287.9,
+    )
     assert found["floor_mm"] == pytest.approx(virtual_mouse().floor.distance_mm, rel=0.02)

@@ -20,10 +20,37 @@ from tests.damage import ANYTHING, check, damage
 
 _MOUSE = tomllib.loads((PRESETS / "mouse.toml").read_text(encoding="utf-8"))
 _PARTS = st.sampled_from(
-    ["[[zones]]", "[zones]", "name", "=", '"a"', "circle", "{ centre = [0, 0], radius = 80 }", "polygon", "\n",
-     "[[0,0],[9,0],[9,9]]", "[[0,0],[1,1],[2,2]]", "unit", '"px"', "1e400", "nan", "relative_to", '"centre"', "[", "]",
-     "{", "}", "-1", "jobs", "cores_per_job", "memory", "prologue", '["x"]', "99999999999999999999"]
-)  # fmt: skip
+    [
+        "[[zones]]",
+        "[zones]",
+        "name",
+        "=",
+        '"a"',
+        "circle",
+        "{ centre = [0, 0], radius = 80 }",
+        "polygon",
+        "\n",
+        "[[0,0],[9,0],[9,9]]",
+        "[[0,0],[1,1],[2,2]]",
+        "unit",
+        '"px"',
+        "1e400",
+        "nan",
+        "relative_to",
+        '"centre"',
+        "[",
+        "]",
+        "{",
+        "}",
+        "-1",
+        "jobs",
+        "cores_per_job",
+        "memory",
+        "prologue",
+        '["x"]',
+        "99999999999999999999",
+    ]
+)
 _TEXTS = st.lists(_PARTS, max_size=14).map(" ".join) | st.text(max_size=40)
 
 

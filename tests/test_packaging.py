@@ -10,7 +10,9 @@ from tests.conftest import REPOSITORY
 
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
 SETUP = PROJECT["tool"]["setuptools"]
-TEST_LINE = "python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]' && .venv/bin/python -m pytest"
+TEST_LINE = (
+    "python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]' && .venv/bin/python -m pytest"
+)
 DEMO_LINE = "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/liex demo"
 
 
@@ -31,24 +33,38 @@ def test_the_package_list_is_what_the_folders_hold() -> None:
 def test_every_package_has_its_init_and_datasets_has_none() -> None:
     for package in SETUP["packages"]:
         top = max((name for name in SETUP["package-dir"] if package.startswith(name)), key=len)
-        folder = REPOSITORY / SETUP["package-dir"][top] / package.removeprefix(top).strip(".").replace(".", "/")
+        folder = (
+            REPOSITORY
+            / SETUP["package-dir"][top]
+            / package.removeprefix(top).strip(".").replace(".", "/")
+        )
         assert (folder / "__init__.py").is_file() == (package != "liex_lab.datasets"), folder
 
 
 def test_every_data_file_of_a_package_is_shipped() -> None:
     for package, patterns in SETUP["package-data"].items():
         top = max((name for name in SETUP["package-dir"] if package.startswith(name)), key=len)
-        folder = REPOSITORY / SETUP["package-dir"][top] / package.removeprefix(top).strip(".").replace(".", "/")
+        folder = (
+            REPOSITORY
+            / SETUP["package-dir"][top]
+            / package.removeprefix(top).strip(".").replace(".", "/")
+        )
         inner = [other for other in SETUP["packages"] if other.startswith(f"{package}.")]
         shipped = {path for pattern in patterns for path in folder.glob(pattern)}
         for path in folder.rglob("*"):
-            in_other = any(path.is_relative_to(folder / other.removeprefix(package)[1:]) for other in inner)
+            in_other = any(
+                path.is_relative_to(folder / other.removeprefix(package)[1:]) for other in inner
+            )
             is_data = path.is_file() and path.suffix not in {".py", ".pyc", ".nbi", ".nbc"}
-            assert not is_data or in_other or path in shipped, f"{path} would be missing from the wheel"
+            assert not is_data or in_other or path in shipped, (
+                f"{path} would be missing from the wheel"
+            )
 
 
 def test_only_rerun_is_pinned() -> None:
-    extras = [name for group in PROJECT["project"]["optional-dependencies"].values() for name in group]
+    extras = [
+        name for group in PROJECT["project"]["optional-dependencies"].values() for name in group
+    ]
     for dependency in PROJECT["project"]["dependencies"] + extras:
         if dependency.startswith("liex_lab["):  # another of our own extras
             continue

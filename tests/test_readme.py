@@ -32,27 +32,37 @@ def blocks(language: str) -> list[str]:
 
 def test_every_file_and_every_link_is_there() -> None:
     out = section("What comes out")
-    assert set(FILES) | {"report.html"} == set(re.findall(r"`([a-z_]+\.[a-z]+)`", out.split("The columns that")[0]))
+    assert set(FILES) | {"report.html"} == set(
+        re.findall(r"`([a-z_]+\.[a-z]+)`", out.split("The columns that")[0])
+    )
     for link in re.findall(r"\]\(([^)h][^)]*)\)", TEXT):
         assert (REPOSITORY / link).exists(), link
     assert (REPOSITORY / "dashboards" / "assets" / "demo.png").stat().st_size <= 150_000
 
 
 def test_the_list_of_columns_is_the_columns_own() -> None:
-    listed = TEXT.split("<!-- columns: python -m liex_lab.behaviour.listing -->\n")[1].split("<!-- end of columns")[0]
+    listed = TEXT.split("<!-- columns: python -m liex_lab.behaviour.listing -->\n")[1].split(
+        "<!-- end of columns"
+    )[0]
     assert listed == first_columns()
     assert set(FIRST) <= set(all_columns())
 
 
 def test_every_verb_and_every_setting_exists() -> None:
-    verbs = re.findall(r"^\| `(\w+)", section("The verbs"), re.MULTILINE)[1:]  # the first is `liex ...`
+    verbs = re.findall(r"^\| `(\w+)", section("The verbs"), re.MULTILINE)[
+        1:
+    ]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
     known = "cohort compare convert correct dashboard demo doctor evaluate export info live report run show suggest "
     known += "train verify"
     assert sorted(verbs) == sorted(known.split())
     assert all(verb in told for verb in verbs)
-    plan = tomllib.loads(re.sub(r"^# (\w+) =$", r"\1 = 0", Plan.load("mouse").to_toml(), flags=re.MULTILINE))
-    for table, key in re.findall(r"`(\w+)\.(\w+)(?:=[^`]*)?`", section("The plan").split("**Size.**")[0]):
+    plan = tomllib.loads(
+        re.sub(r"^# (\w+) =$", r"\1 = 0", Plan.load("mouse").to_toml(), flags=re.MULTILINE)
+    )
+    for table, key in re.findall(
+        r"`(\w+)\.(\w+)(?:=[^`]*)?`", section("The plan").split("**Size.**")[0]
+    ):
         assert key in plan[table], f"{table}.{key}"
 
 

@@ -41,13 +41,17 @@ FISHEYE = Distortion.of("equidistant", [-0.03, 0.004])
 FLOOR_MM = 673.1
 
 
-def plates(camera: Camera, floor_mm: float, side_mm: float, high_mm: float = 20.0, n: int = 6) -> list[Plate]:
+def plates(
+    camera: Camera, floor_mm: float, side_mm: float, high_mm: float = 20.0, n: int = 6
+) -> list[Plate]:
     """A square plate at places and angles all over the picture's middle."""
     rng = np.random.default_rng(4)
     reach = 0.25 * floor_mm * np.array([camera.width / camera.fx, camera.height / camera.fy])
     return [
         Plate(floor_mm, side_mm, high_mm, (float(x), float(y)), float(turn))
-        for x, y, turn in zip(*rng.uniform(-1, 1, (2, n)) * reach[:, None], rng.uniform(0.1, 0.7, n), strict=True)
+        for x, y, turn in zip(
+            *rng.uniform(-1, 1, (2, n)) * reach[:, None], rng.uniform(0.1, 0.7, n), strict=True
+        )
     ]
 
 
@@ -55,13 +59,17 @@ def measured(
     folder: Path, camera: Camera, shown: list[Plate], water: Water | None = None
 ) -> tuple[Array, Array, Array]:
     """The product's own path, from pictures on disk to (area mm^2, sides mm (2,), centre mm (3,)) of each frame."""
-    pictures = np.rint(8.0 * np.stack([plate.depth(camera, water) for plate in shown])).astype(np.uint16)
+    pictures = np.rint(8.0 * np.stack([plate.depth(camera, water) for plate in shown])).astype(
+        np.uint16
+    )
     bent = camera.distortion
     lens: dict[str, Any] = {}
     if bent is not None:
         lens = {"distortion_model": bent.model, "distortion": list(bent.coefficients)}
     path = write_png_folder(folder, pictures, camera, unit_mm=0.125, **lens)
-    told = [] if water is None else [f"water.{key}={value}" for key, value in water.to_dict().items()]
+    told = (
+        [] if water is None else [f"water.{key}={value}" for key, value in water.to_dict().items()]
+    )
     with build_recording(path, Plan().with_settings(told)) as recording:
         scene, sample = Scene.learn(recording, (40.0, 115.0))
         crops = scene.extract(sample, 1.0)
@@ -73,7 +81,9 @@ def measured(
     return crops.moments[:, 1], crops.moments[:, 6:8] * np.sqrt(12.0), centre
 
 
-def check_square(folder: Path, camera: Camera, floor_mm: float = 650.0, water: Water | None = None) -> None:
+def check_square(
+    folder: Path, camera: Camera, floor_mm: float = 650.0, water: Water | None = None
+) -> None:
     """Area, sides, depth and place of a square within 1 %; of a single picture its sides within a pixel, too."""
     shown = plates(camera, floor_mm, 80.0)
     area, sides, centre = measured(folder, camera, shown, water)
@@ -86,11 +96,15 @@ def check_square(folder: Path, camera: Camera, floor_mm: float = 650.0, water: W
 
 
 @pytest.mark.parametrize("camera", PRESETS, ids=lambda camera: camera.source)
-def test_a_square_is_as_large_as_it_is_for_every_camera_preset(tmp_path: Path, camera: Camera) -> None:
+def test_a_square_is_as_large_as_it_is_for_every_camera_preset(
+    tmp_path: Path, camera: Camera
+) -> None:
     check_square(tmp_path / "r", camera)
 
 
-@pytest.mark.parametrize("lens", [BARREL, PINCUSHION, FISHEYE], ids=["barrel", "pincushion", "fisheye"])
+@pytest.mark.parametrize(
+    "lens", [BARREL, PINCUSHION, FISHEYE], ids=["barrel", "pincushion", "fisheye"]
+)
 @pytest.mark.parametrize("camera", [KINECT_V2, PRIMESENSE], ids=lambda camera: camera.source)
 def test_and_through_a_bent_lens(tmp_path: Path, camera: Camera, lens: Distortion) -> None:
     check_square(tmp_path / "r", replace(camera, distortion=lens))
@@ -120,12 +134,16 @@ def test_1_the_focal_length_comes_from_the_tangent_of_the_angle_of_view() -> Non
 
 
 @pytest.mark.parametrize(("focal", "expected"), [(365.0, 184.4), (504.0, 133.6)])
-def test_2_and_3_lengths_follow_the_camera_that_made_the_picture(tmp_path: Path, focal: float, expected: float) -> None:
+def test_2_and_3_lengths_follow_the_camera_that_made_the_picture(
+    tmp_path: Path, focal: float, expected: float
+) -> None:
     """100 px at 673.1 mm. One camera's constants for all would say 162 and 166 mm."""
     own = Camera(focal, focal, 255.5, 211.5, 512, 424)
     path = write_png_folder(tmp_path / "r", depth_frames(1, 512, 424), own)
     with build_recording(path, Plan()) as recording:
-        ends = recording.camera.unproject([[255.5, 211.5], [355.5, 211.5], [255.5, 311.5]], FLOOR_MM)
+        ends = recording.camera.unproject(
+            [[255.5, 211.5], [355.5, 211.5], [255.5, 311.5]], FLOOR_MM
+        )
     np.testing.assert_allclose(np.linalg.norm(ends[1:] - ends[0], axis=1), expected, atol=0.05)
 
 
@@ -154,9 +172,13 @@ def test_6_a_length_does_not_depend_on_the_way_the_animal_faces(tmp_path: Path) 
 
 def test_7_a_speed_is_per_second_and_a_lost_frame_does_not_double_it() -> None:
     """5 mm a frame at 30 frames/s with one frame lost: 150 mm/s before, across and after, not 10 mm in a frame."""
-    moved = kinematics(*tables_of(WalkingMouse(np.delete(steady(2.0), 30), speed_mm_s=150.0, radius_mm=1e5)))
+    moved = kinematics(
+        *tables_of(WalkingMouse(np.delete(steady(2.0), 30), speed_mm_s=150.0, radius_mm=1e5))
+    )
     known = moved["speed_mm_s"].dropna()
-    assert len(known) >= len(moved) - 2, "but for the frames beside the gap, across which nothing is measured"
+    assert len(known) >= len(moved) - 2, (
+        "but for the frames beside the gap, across which nothing is measured"
+    )
     np.testing.assert_allclose(known, 150.0, rtol=1e-3)
 
 
@@ -195,7 +217,9 @@ def test_11_times_have_one_unit_whatever_file_they_come_from(tmp_path: Path) -> 
             assert recording.rate_hz == pytest.approx(1000 / 33, rel=1e-5)
 
 
-@pytest.mark.parametrize(("rate", "lost", "missing"), [(60.0, (), 0), (30.0, (11, 30, 31, 77), 4), (200.0, (9,), 1)])
+@pytest.mark.parametrize(
+    ("rate", "lost", "missing"), [(60.0, (), 0), (30.0, (11, 30, 31, 77), 4), (200.0, (9,), 1)]
+)
 def test_12_lost_frames_are_counted_at_any_rate(
     tmp_path: Path, rate: float, lost: tuple[int, ...], missing: int
 ) -> None:
@@ -215,7 +239,9 @@ def test_14_the_model_sees_in_use_what_it_saw_in_training() -> None:
     floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 600.0, PRIMESENSE_QVGA)
     scene = replace(Scene.from_floor(PRIMESENSE_QVGA, floor), area_mm2=3600.0)
     used = scene.extract(picture[None].astype(np.float32), 1.0)
-    lens = np.array([[PRIMESENSE_QVGA.fx, PRIMESENSE_QVGA.fy, PRIMESENSE_QVGA.cx, PRIMESENSE_QVGA.cy]])
+    lens = np.array(
+        [[PRIMESENSE_QVGA.fx, PRIMESENSE_QVGA.fy, PRIMESENSE_QVGA.cx, PRIMESENSE_QVGA.cy]]
+    )
     windows = Windows(picture[None], bare[None], lens, np.zeros((1, 2)), floor.inverse_depth[None])
     trained, _ = windows.extract(np.ones(1), np.array([3600.0]))
     assert used.found.all()

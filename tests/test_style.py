@@ -13,7 +13,9 @@ from tests.conftest import REPOSITORY
 
 
 def run_module(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", *arguments], cwd=REPOSITORY, capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-m", *arguments], cwd=REPOSITORY, capture_output=True, text=True
+    )
 
 
 def test_ruff_finds_nothing() -> None:
@@ -30,17 +32,27 @@ def test_mypy_finds_nothing() -> None:
 def functions_without_types(path: Path) -> list[str]:
     """Those that do not state what they return, but for kernels: numba finds their types itself."""
     nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-    compiled = [ast.unparse(node) for node in nodes if isinstance(node, ast.Call) and "njit" in ast.unparse(node.func)]
+    compiled = [
+        ast.unparse(node)
+        for node in nodes
+        if isinstance(node, ast.Call) and "njit" in ast.unparse(node.func)
+    ]
     untyped = []
     for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.returns is None:
             decorators = " ".join(ast.unparse(decorator) for decorator in node.decorator_list)
-            is_kernel = "njit" in decorators or any(call.endswith(f"({node.name})") for call in compiled)
+            is_kernel = "njit" in decorators or any(
+                call.endswith(f"({node.name})") for call in compiled
+            )
             untyped += [] if is_kernel else [f"{path}:{node.lineno} {node.name}"]
     return untyped
 
 
 @pytest.mark.parametrize("folder", ["liex_lab", "pipelines", "dashboards"])
 def test_every_function_states_its_types(folder: str) -> None:
-    untyped = [line for path in sorted((REPOSITORY / folder).rglob("*.py")) for line in functions_without_types(path)]
+    untyped = [
+        line
+        for path in sorted((REPOSITORY / folder).rglob("*.py"))
+        for line in functions_without_types(path)
+    ]
     assert not untyped, "\n".join(untyped)

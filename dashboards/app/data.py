@@ -78,13 +78,19 @@ class StudyData:
     @property
     def done(self) -> list[Entry]:
         """The sessions that were measured."""
-        return [entry for entry in self.entries.values() if entry.state in DONE and entry.folder is not None]
+        return [
+            entry
+            for entry in self.entries.values()
+            if entry.state in DONE and entry.folder is not None
+        ]
 
     def session(self, key: str) -> Session:
         """An opened session; the same object until its folder changes. Raises SessionError where there is none."""
         entry = self.entries.get(key)
         if entry is None or entry.folder is None or entry.state not in DONE:
-            raise SessionError(f"the study has no measured session '{key}'; see the list of its sessions")
+            raise SessionError(
+                f"the study has no measured session '{key}'; see the list of its sessions"
+            )
         stamp = _stamp(entry.folder)
         with self._lock:
             known = self._open.pop(key, None)
@@ -99,19 +105,33 @@ class StudyData:
         """One row per session: who, state, and how good it is."""
         import pandas as pd
 
-        measured = dict(zip((entry.key for entry in self.done), self._of_all("quality", _quality), strict=True))
+        measured = dict(
+            zip((entry.key for entry in self.done), self._of_all("quality", _quality), strict=True)
+        )
         rows = [
-            {"session": entry.key, **{name: entry.who.get(name, "") for name in WHO}, "state": entry.state,
-             "reason": entry.reason, "remedy": entry.remedy, **measured.get(entry.key, {})}
+            {
+                "session": entry.key,
+                **{name: entry.who.get(name, "") for name in WHO},
+                "state": entry.state,
+                "reason": entry.reason,
+                "remedy": entry.remedy,
+                **measured.get(entry.key, {}),
+            }
             for entry in self.entries.values()
-        ]  # fmt: skip
+        ]
         return pd.DataFrame(rows, columns=["session", *WHO, "state", "reason", "remedy", *QUALITY])
 
     def ethograms(self, keys: Iterable[str]) -> dict[str, Ethogram]:
         """The ethograms of some sessions, those that cannot be read left out."""
         entries = [self.entries[key] for key in keys if key in self.entries]
-        found = self._of_all("ethogram", _ethogram, [entry for entry in entries if entry in self.done])
-        return {entry.key: one for entry, one in zip(entries, found, strict=False) if isinstance(one, Ethogram)}
+        found = self._of_all(
+            "ethogram", _ethogram, [entry for entry in entries if entry in self.done]
+        )
+        return {
+            entry.key: one
+            for entry, one in zip(entries, found, strict=False)
+            if isinstance(one, Ethogram)
+        }
 
     def collected(self) -> pd.DataFrame:
         """One row per measured session, as the comparison of groups takes it; the study's groups overrule theirs."""
@@ -123,7 +143,11 @@ class StudyData:
             if isinstance(table, pd.DataFrame):
                 stated = {name: value for name, value in entry.who.items() if value}
                 tables.append(table.assign(key=entry.key, **stated))
-        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=["key", "session_id", *WHO])
+        return (
+            pd.concat(tables, ignore_index=True)
+            if tables
+            else pd.DataFrame(columns=["key", "session_id", *WHO])
+        )
 
     def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
         """The comparison of the groups: the usual measures and this one, with p corrected for all of them."""
@@ -168,9 +192,18 @@ class StudyData:
 
 
 QUALITY = (
-    "duration_min", "n_frames", "posed_share", "doubtful_share", "n_gaps", "n_missing", "predicted_error_mm",
-    "n_flips", "flips_s", "warnings", "damage",
-)  # fmt: skip
+    "duration_min",
+    "n_frames",
+    "posed_share",
+    "doubtful_share",
+    "n_gaps",
+    "n_missing",
+    "predicted_error_mm",
+    "n_flips",
+    "flips_s",
+    "warnings",
+    "damage",
+)
 
 
 def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
@@ -198,10 +231,12 @@ def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
     return list(dict.fromkeys(word for one in ethograms for word in one.vocabulary))
 
 
-def raster(one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int) -> np.ndarray:
+def raster(
+    one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int
+) -> np.ndarray:
     """(n,) for each of n equal parts of a span: the place of the word with the most time in it, -1 for none, -2 where
     there is mostly no pose.
-    """  # fmt: skip
+    """
     place = {word: k for k, word in enumerate(words)}
     seconds = np.zeros((len(words) + 1, n))
     step = (stop_s - start_s) / n
@@ -238,12 +273,18 @@ def _quality(session: Session) -> dict[str, Any]:
     error = session.table("frames", ["predicted_error_mm"])["predicted_error_mm"]
     flips = session.table("flips", ["start_s", "stop_s"])
     return {
-        "duration_min": frames["duration_s"] / 60.0, "n_frames": frames["n_frames"],
-        "posed_share": frames["n_observed"] / n, "doubtful_share": frames["flags"].get("doubtful", 0) / n,
-        "n_gaps": frames["n_gaps"], "n_missing": frames["n_missing"], "predicted_error_mm": float(error.median()),
-        "n_flips": len(flips), "flips_s": float((flips["stop_s"] - flips["start_s"]).sum()),
-        "warnings": len(session.metadata["problems"]), "damage": "",
-    }  # fmt: skip
+        "duration_min": frames["duration_s"] / 60.0,
+        "n_frames": frames["n_frames"],
+        "posed_share": frames["n_observed"] / n,
+        "doubtful_share": frames["flags"].get("doubtful", 0) / n,
+        "n_gaps": frames["n_gaps"],
+        "n_missing": frames["n_missing"],
+        "predicted_error_mm": float(error.median()),
+        "n_flips": len(flips),
+        "flips_s": float((flips["stop_s"] - flips["start_s"]).sum()),
+        "warnings": len(session.metadata["problems"]),
+        "damage": "",
+    }
 
 
 def _ethogram(session: Session) -> Ethogram:
@@ -251,10 +292,12 @@ def _ethogram(session: Session) -> Ethogram:
     gaps = session.table("gaps", ["start_s", "stop_s", "n_frames_missing"])
     lost = gaps[gaps["n_frames_missing"] > 0]
     return Ethogram(
-        bouts[["start_s", "stop_s"]].to_numpy(float), [str(word) for word in bouts["action"]],
-        lost[["start_s", "stop_s"]].to_numpy(float), float(session.metadata["frames"]["duration_s"]),
+        bouts[["start_s", "stop_s"]].to_numpy(float),
+        [str(word) for word in bouts["action"]],
+        lost[["start_s", "stop_s"]].to_numpy(float),
+        float(session.metadata["frames"]["duration_s"]),
         tuple(session.metadata.get("actions") or {}),
-    )  # fmt: skip
+    )
 
 
 def _summary(session: Session) -> pd.DataFrame | None:

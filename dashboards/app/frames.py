@@ -66,10 +66,19 @@ class Frames:
         names = [str(name) for name in joints["joint"]] if posed else []
         shown = plots.frame_picture(cut, uv if posed else uv[:0], names, bones, left, top, reach_mm)
         if not posed:
-            shown["layout"]["annotations"] = [{
-                "text": "no pose in this frame", "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5,
-                "y": 0.97, "font": {"color": "#fff", "size": 13}, "bgcolor": "rgba(0,0,0,0.6)", "borderpad": 4,
-            }]  # fmt: skip
+            shown["layout"]["annotations"] = [
+                {
+                    "text": "no pose in this frame",
+                    "showarrow": False,
+                    "xref": "paper",
+                    "yref": "paper",
+                    "x": 0.5,
+                    "y": 0.97,
+                    "font": {"color": "#fff", "size": 13},
+                    "bgcolor": "rgba(0,0,0,0.6)",
+                    "borderpad": 4,
+                }
+            ]
         return shown
 
 
@@ -98,7 +107,10 @@ def _kept(session: Session, row: int) -> NDArray[np.uint16] | None:
             depth = np.zeros((session.camera.height, session.camera.width), np.uint16)
             left, top = int(entry["left_px"]), int(entry["top_px"])
             x0, y0 = max(left, 0), max(top, 0)
-            x1, y1 = min(left + cut.shape[1], depth.shape[1]), min(top + cut.shape[0], depth.shape[0])
+            x1, y1 = (
+                min(left + cut.shape[1], depth.shape[1]),
+                min(top + cut.shape[0], depth.shape[0]),
+            )
             depth[y0:y1, x0:x1] = cut[y0 - top : y1 - top, x0 - left : x1 - left]
             return depth
     return None

@@ -36,7 +36,11 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
             abort(Response("This dashboard answers on 127.0.0.1 only.", 403, mimetype="text/plain"))
         origin = request.headers.get("Origin")
         if origin and urlsplit(origin).netloc != request.host:
-            abort(Response("This dashboard takes no requests from other sites.", 403, mimetype="text/plain"))
+            abort(
+                Response(
+                    "This dashboard takes no requests from other sites.", 403, mimetype="text/plain"
+                )
+            )
         if not token:
             return None
         told = request.args.get("token", "")
@@ -85,7 +89,9 @@ def _csv(find: Callable[[], pd.DataFrame], name: str) -> Response:
     except LiexError as error:
         return Response(str(error), 404, mimetype="text/plain")
     pieces: Iterator[str] = tables.as_csv(rows)
-    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in name) or "table"
+    safe = (
+        "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in name) or "table"
+    )
     answer = Response(stream_with_context(pieces), mimetype="text/csv")
     answer.headers["Content-Disposition"] = f'attachment; filename="{safe}.csv"'
     return answer

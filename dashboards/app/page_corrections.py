@@ -17,9 +17,15 @@ from .parts import aria
 from .tables import session_address
 
 Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
-_DEEDS = (("flip", "Exchange head and tail in the span"), ("rename", "Rename the bout at this moment"),
-          ("recut", "Cut that bout to the span"), ("delete", "Delete that bout"), ("add", "Add a bout in the span"),
-          ("pixel", "Put it under the pixel"), ("place", "Put it at the place"))  # fmt: skip
+_DEEDS = (
+    ("flip", "Exchange head and tail in the span"),
+    ("rename", "Rename the bout at this moment"),
+    ("recut", "Cut that bout to the span"),
+    ("delete", "Delete that bout"),
+    ("add", "Add a bout in the span"),
+    ("pixel", "Put it under the pixel"),
+    ("place", "Put it at the place"),
+)
 _PLACE = ("u", "v", "x", "y", "z")
 
 
@@ -28,10 +34,14 @@ def panel(session: Session, opened: bool) -> html.Details:
     titles = dict(_DEEDS)
 
     def do(what: str) -> html.Button:
-        return html.Button(titles[what], id={"part": "correct", "what": what}, n_clicks=0, type="button")
+        return html.Button(
+            titles[what], id={"part": "correct", "what": what}, n_clicks=0, type="button"
+        )
 
     def field(name: str, title: str) -> html.Label:
-        return html.Label([html.Span(title), dcc.Input(id=f"correct-{name}", type="number", step="any")])
+        return html.Label(
+            [html.Span(title), dcc.Input(id=f"correct-{name}", type="number", step="any")]
+        )
 
     def choice(name: str, title: str, words: list[str]) -> html.Label:
         options = [{"label": word.replace("_", " "), "value": word} for word in words]
@@ -40,24 +50,67 @@ def panel(session: Session, opened: bool) -> html.Details:
 
     words = list(session.metadata.get("actions") or {})
     here = [
-        html.Button(f"{word} here", id=f"correct-{word}-here", n_clicks=0, type="button") for word in ("from", "to")
+        html.Button(f"{word} here", id=f"correct-{word}-here", n_clicks=0, type="button")
+        for word in ("from", "to")
     ]
-    return html.Details(id="correct", className="correct", open=opened, children=[
-        html.Summary("Correct this session"),
-        html.P("Corrections lie beside the session, never over it, and are applied whenever it is read.",
-               className="muted"),
-        _row("a span of time", field("from", "Span from, s"), here[0], field("to", "to, s"), here[1], do("flip")),
-        _row("bouts", choice("action", "Action", words),
-             html.Label([html.Span("or a new word"), dcc.Input(id="correct-new", type="text")]),
-             do("rename"), do("recut"), do("delete"), do("add")),
-        html.P("A click on the picture fills in the pixel for the joint that is chosen here.", className="muted"),
-        _row("a joint by its pixel", choice("joint", "Joint", list(session.metadata["animal"]["joints"])),
-             field("u", "pixel u"), field("v", "v"), do("pixel")),
-        _row("a joint by its place", field("x", "Place x, mm"), field("y", "y"), field("z", "z"), do("place")),
-        _row("who", html.Label([html.Span("Made by"), dcc.Input(id="correct-by", type="text", value=author_name())])),
-        html.P(id="correct-said", className="problems", role="alert", hidden=True),
-        _made(session),
-    ])  # fmt: skip
+    return html.Details(
+        id="correct",
+        className="correct",
+        open=opened,
+        children=[
+            html.Summary("Correct this session"),
+            html.P(
+                "Corrections lie beside the session, never over it, and are applied whenever it is read.",
+                className="muted",
+            ),
+            _row(
+                "a span of time",
+                field("from", "Span from, s"),
+                here[0],
+                field("to", "to, s"),
+                here[1],
+                do("flip"),
+            ),
+            _row(
+                "bouts",
+                choice("action", "Action", words),
+                html.Label([html.Span("or a new word"), dcc.Input(id="correct-new", type="text")]),
+                do("rename"),
+                do("recut"),
+                do("delete"),
+                do("add"),
+            ),
+            html.P(
+                "A click on the picture fills in the pixel for the joint that is chosen here.",
+                className="muted",
+            ),
+            _row(
+                "a joint by its pixel",
+                choice("joint", "Joint", list(session.metadata["animal"]["joints"])),
+                field("u", "pixel u"),
+                field("v", "v"),
+                do("pixel"),
+            ),
+            _row(
+                "a joint by its place",
+                field("x", "Place x, mm"),
+                field("y", "y"),
+                field("z", "z"),
+                do("place"),
+            ),
+            _row(
+                "who",
+                html.Label(
+                    [
+                        html.Span("Made by"),
+                        dcc.Input(id="correct-by", type="text", value=author_name()),
+                    ]
+                ),
+            ),
+            html.P(id="correct-said", className="problems", role="alert", hidden=True),
+            _made(session),
+        ],
+    )
 
 
 def _row(name: str, *parts: Any) -> html.Div:
@@ -70,12 +123,19 @@ def _made(session: Session) -> html.Div:
     if not standing:
         return html.Div(html.P("No corrections so far.", className="muted"))
     lines = [
-        html.Li([
-            f"{entry.number}: {entry.what} ({entry.author}, {entry.made_at}) ",
-            html.Button("Take back", id={"part": "undo", "number": entry.number}, n_clicks=0, type="button"),
-        ])
+        html.Li(
+            [
+                f"{entry.number}: {entry.what} ({entry.author}, {entry.made_at}) ",
+                html.Button(
+                    "Take back",
+                    id={"part": "undo", "number": entry.number},
+                    n_clicks=0,
+                    type="button",
+                ),
+            ]
+        )
         for entry in standing
-    ]  # fmt: skip
+    ]
     return html.Div([html.H3("Corrections"), html.Ul(lines, className="made")])
 
 
@@ -89,7 +149,9 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
     def number(*names: str) -> list[float]:
         missing = [name for name in names if not isinstance(told.get(name), int | float)]
         if missing:
-            raise SessionError(f"this needs a number in each of {', '.join(names)}; fill in {', '.join(missing)}")
+            raise SessionError(
+                f"this needs a number in each of {', '.join(names)}; fill in {', '.join(missing)}"
+            )
         return [float(told[name]) for name in names]
 
     def word(name: str) -> str:
@@ -100,7 +162,9 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
     def action() -> tuple[str, bool]:
         new = str(told.get("new") or "").strip()
         if new and told.get("action"):
-            raise SessionError(f"this needs one action, got {told['action']} and the new word {new}; empty one of them")
+            raise SessionError(
+                f"this needs one action, got {told['action']} and the new word {new}; empty one of them"
+            )
         return (new, True) if new else (word("action"), False)
 
     if what in ("rename", "add"):
@@ -115,7 +179,9 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
     if what == "delete":
         return correcting.delete_bout(session, at_s)
     frames = session.frames
-    frame = int(frames["frame_index"].iloc[int((frames["time_s"] - at_s).abs().to_numpy().argmin())])
+    frame = int(
+        frames["frame_index"].iloc[int((frames["time_s"] - at_s).abs().to_numpy().argmin())]
+    )
     if what == "pixel":
         return correcting.joint_move_at_pixel(session, frame, word("joint"), *number("u", "v"))
     return correcting.joint_move(session, frame, word("joint"), number("x", "y", "z"))
@@ -126,14 +192,21 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
     names = ("from", "to", "action", "new", "joint", *_PLACE)
 
     @app.callback(
-        Output("url", "href", allow_duplicate=True), Output("correct-said", "children"),
+        Output("url", "href", allow_duplicate=True),
+        Output("correct-said", "children"),
         Output("correct-said", "hidden"),
-        Input({"part": "correct", "what": ALL}, "n_clicks"), Input({"part": "undo", "number": ALL}, "n_clicks"),
-        State("moment", "value"), State("session-key", "data"), State("correct-by", "value"),
+        Input({"part": "correct", "what": ALL}, "n_clicks"),
+        Input({"part": "undo", "number": ALL}, "n_clicks"),
+        State("moment", "value"),
+        State("session-key", "data"),
+        State("correct-by", "value"),
         *(State(f"correct-{name}", "value") for name in names),
-        running=[(Output("correct", "className"), "correct busy", "correct")], prevent_initial_call=True,
-    )  # fmt: skip
-    def do(_deeds: Any, _undone: Any, at_s: float | None, key: str, by: str | None, *values: Any) -> Any:
+        running=[(Output("correct", "className"), "correct busy", "correct")],
+        prevent_initial_call=True,
+    )
+    def do(
+        _deeds: Any, _undone: Any, at_s: float | None, key: str, by: str | None, *values: Any
+    ) -> Any:
         asked = ctx.triggered_id
         if not isinstance(asked, dict) or not ctx.triggered[0]["value"]:
             return no_update, no_update, no_update
@@ -144,16 +217,22 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
                 correct(session.path, (), (int(asked["number"]),), by or "")
             else:
                 told = dict(zip(names, values, strict=True))
-                correct(session.path, (asked_for(session, asked["what"], moment, told),), (), by or "")
+                correct(
+                    session.path, (asked_for(session, asked["what"], moment, told),), (), by or ""
+                )
         except LiexError as error:
             return no_update, str(error), False
-        made = len(read_log(session.path).entries)  # so that the address is another one and the page is made anew
+        made = len(
+            read_log(session.path).entries
+        )  # so that the address is another one and the page is made anew
         return f"{session_address(key, moment)}&corrections={made}", "", True
 
     @app.callback(
-        Output("correct-u", "value"), Output("correct-v", "value"), Input("frame-picture", "clickData"),
+        Output("correct-u", "value"),
+        Output("correct-v", "value"),
+        Input("frame-picture", "clickData"),
         prevent_initial_call=True,
-    )  # fmt: skip
+    )
     def point(click: dict[str, Any] | None) -> Any:
         if not click:
             return no_update, no_update
@@ -162,8 +241,10 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
     for word in ("from", "to"):
 
         @app.callback(
-            Output(f"correct-{word}", "value"), Input(f"correct-{word}-here", "n_clicks"), State("moment", "value"),
+            Output(f"correct-{word}", "value"),
+            Input(f"correct-{word}-here", "n_clicks"),
+            State("moment", "value"),
             prevent_initial_call=True,
-        )  # fmt: skip
+        )
         def here(n_clicks: int, at_s: float | None) -> Any:
             return at_s if n_clicks else no_update

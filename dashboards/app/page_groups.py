@@ -27,40 +27,89 @@ def groups_page(data: StudyData) -> list[Any]:
     if not ordered or len(names) < 2:
         said = f"{len(table)} measured sessions have {', '.join(names) or 'no group'}"
         return [
-            html.P("Study", className="kind"), html.H1("Groups"),
-            html.P(f"A comparison needs two groups of animals, and these {said}. State `group` for the animals in the "
-                   "study file, or session.group in the plan."),
-        ]  # fmt: skip
+            html.P("Study", className="kind"),
+            html.H1("Groups"),
+            html.P(
+                f"A comparison needs two groups of animals, and these {said}. State `group` for the animals in the "
+                "study file, or session.group in the plan."
+            ),
+        ]
     return [
         html.P("Study", className="kind"),
         html.H1("Groups"),
-        html.Div(className="tools", children=[
-            html.Label([html.Span("Measure"), dcc.Dropdown(
-                id="measure", options=[{"label": name.replace("_", " "), "value": name} for name in ordered],
-                value=ordered[0], clearable=False,
-            )]),
-            html.Label([html.Span("Compare"), dcc.Dropdown(
-                id="reference", clearable=False, value=ALL,
-                options=[{"label": ALL, "value": ALL}, *({"label": f"with {one}", "value": one} for one in names)],
-            )]),
-        ]),
+        html.Div(
+            className="tools",
+            children=[
+                html.Label(
+                    [
+                        html.Span("Measure"),
+                        dcc.Dropdown(
+                            id="measure",
+                            options=[
+                                {"label": name.replace("_", " "), "value": name} for name in ordered
+                            ],
+                            value=ordered[0],
+                            clearable=False,
+                        ),
+                    ]
+                ),
+                html.Label(
+                    [
+                        html.Span("Compare"),
+                        dcc.Dropdown(
+                            id="reference",
+                            clearable=False,
+                            value=ALL,
+                            options=[
+                                {"label": ALL, "value": ALL},
+                                *({"label": f"with {one}", "value": one} for one in names),
+                            ],
+                        ),
+                    ]
+                ),
+            ],
+        ),
         html.P(id="measure-meaning", className="muted"),
-        html.Div(className="pair", children=[
-            html.Div([html.H2("Animals"), graph("group-points", plots.empty("Comparing ..."),
-                                                "each animal's mean and its sessions, by group"),
-                      html.P("Large marks are animals, small ones their sessions, the line is the mean of the animals. "
-                             "A click opens the session.", className="muted")]),
-            html.Div([html.H2("Differences"), graph("group-differences", plots.empty("Comparing ..."),
-                                                    "differences of the groups with their intervals"),
-                      html.Div(id="verdicts")]),
-        ]),
+        html.Div(
+            className="pair",
+            children=[
+                html.Div(
+                    [
+                        html.H2("Animals"),
+                        graph(
+                            "group-points",
+                            plots.empty("Comparing ..."),
+                            "each animal's mean and its sessions, by group",
+                        ),
+                        html.P(
+                            "Large marks are animals, small ones their sessions, the line is the mean of the animals. "
+                            "A click opens the session.",
+                            className="muted",
+                        ),
+                    ]
+                ),
+                html.Div(
+                    [
+                        html.H2("Differences"),
+                        graph(
+                            "group-differences",
+                            plots.empty("Comparing ..."),
+                            "differences of the groups with their intervals",
+                        ),
+                        html.Div(id="verdicts"),
+                    ]
+                ),
+            ],
+        ),
         html.H2("Every comparison"),
-        html.P("All that was compared stands here, tested or not; p is corrected for the whole table.",
-               className="muted"),
+        html.P(
+            "All that was compared stands here, tested or not; p is corrected for the whole table.",
+            className="muted",
+        ),
         html.Div(id="stats-table"),
         html.H2("For the methods section"),
         html.P(id="stats-methods", className="paste"),
-    ]  # fmt: skip
+    ]
 
 
 def verdict(row: dict[str, Any], unit: str) -> html.Div:
@@ -79,18 +128,30 @@ def verdict(row: dict[str, Any], unit: str) -> html.Div:
         f"{row['n_without_value']} sessions without a value."
     )
     kind = "verdict" if row["test"] else "verdict is-refused"
-    return html.Div([html.H3(row["contrast"]), html.P(sized), html.P(tested, className="tested"),
-                     html.P(counts, className="muted")], className=kind)  # fmt: skip
+    return html.Div(
+        [
+            html.H3(row["contrast"]),
+            html.P(sized),
+            html.P(tested, className="tested"),
+            html.P(counts, className="muted"),
+        ],
+        className=kind,
+    )
 
 
 def register(app: Dash, data: StudyData) -> None:
     """What happens when a measure is chosen or an animal clicked."""
 
     @app.callback(
-        Output("group-points", "figure"), Output("group-differences", "figure"), Output("verdicts", "children"),
-        Output("stats-table", "children"), Output("stats-methods", "children"), Output("measure-meaning", "children"),
-        Input("measure", "value"), Input("reference", "value"),
-    )  # fmt: skip
+        Output("group-points", "figure"),
+        Output("group-differences", "figure"),
+        Output("verdicts", "children"),
+        Output("stats-table", "children"),
+        Output("stats-methods", "children"),
+        Output("measure-meaning", "children"),
+        Input("measure", "value"),
+        Input("reference", "value"),
+    )
     def compare(measure: str, reference: str) -> tuple[Any, ...]:
         against = None if reference == ALL else reference
         unit, meaning = data.described(measure)
@@ -100,13 +161,18 @@ def register(app: Dash, data: StudyData) -> None:
             return plots.empty(str(error)), plots.empty(""), [], [], "", meaning
         own = stats[stats["measure"] == measure]
         return (
-            plots.groups(data.collected(), measure, unit), plots.differences(own, unit),
+            plots.groups(data.collected(), measure, unit),
+            plots.differences(own, unit),
             [verdict(row, unit) for row in records(own)],
-            block(f"stats/{measure}/{against or ''}", "Every comparison"), cohort.methods(stats), meaning,
-        )  # fmt: skip
+            block(f"stats/{measure}/{against or ''}", "Every comparison"),
+            cohort.methods(stats),
+            meaning,
+        )
 
     @app.callback(
-        Output("url", "href", allow_duplicate=True), Input("group-points", "clickData"), prevent_initial_call=True
+        Output("url", "href", allow_duplicate=True),
+        Input("group-points", "clickData"),
+        prevent_initial_call=True,
     )
     def open_session(click: dict[str, Any] | None) -> Any:
         return session_address(str(click["points"][0]["customdata"])) if click else no_update

@@ -26,103 +26,228 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Session
 
 ShowReplay = Callable[[Path, float], object]
-_STEPS = (("frame", -1, "◀ frame"), ("frame", 1, "frame ▶"), ("bout", -1, "◀ bout"), ("bout", 1, "bout ▶"),
-          ("flag", -1, "◀ flagged"), ("flag", 1, "flagged ▶"))  # fmt: skip
+_STEPS = (
+    ("frame", -1, "◀ frame"),
+    ("frame", 1, "frame ▶"),
+    ("bout", -1, "◀ bout"),
+    ("bout", 1, "bout ▶"),
+    ("flag", -1, "◀ flagged"),
+    ("flag", 1, "flagged ▶"),
+)
 _HALF_S = 4.0
-_FACTS = (("frame_index", "frame", ""), ("time_s", "time", "s"), ("flag", "flag", ""),
-          ("predicted_error_mm", "error to be expected", "mm"), ("p_flip", "head and tail exchanged, p", ""),
-          ("gap_before", "frames missing before", ""), ("zone", "zone", ""))  # fmt: skip
-_MOVED = (("speed_mm_s", "speed", "mm/s"), ("heading_rad", "heading", "rad"), ("nose_height_mm", "nose height", "mm"),
-          ("bend_rad", "bend", "rad"), ("tail_beat_hz", "tail beat", "Hz"), ("length_mm", "length", "mm"))  # fmt: skip
+_FACTS = (
+    ("frame_index", "frame", ""),
+    ("time_s", "time", "s"),
+    ("flag", "flag", ""),
+    ("predicted_error_mm", "error to be expected", "mm"),
+    ("p_flip", "head and tail exchanged, p", ""),
+    ("gap_before", "frames missing before", ""),
+    ("zone", "zone", ""),
+)
+_MOVED = (
+    ("speed_mm_s", "speed", "mm/s"),
+    ("heading_rad", "heading", "rad"),
+    ("nose_height_mm", "nose height", "mm"),
+    ("bend_rad", "bend", "rad"),
+    ("tail_beat_hz", "tail beat", "Hz"),
+    ("length_mm", "length", "mm"),
+)
 
 
 def session_page(
-    data: StudyData, key: str, at_s: float, *, may_show: bool, may_correct: bool, correcting: bool = False
+    data: StudyData,
+    key: str,
+    at_s: float,
+    *,
+    may_show: bool,
+    may_correct: bool,
+    correcting: bool = False,
 ) -> list[Any]:
     """A session at a moment (s since its first frame). correcting: the form for corrections is open."""
     session, one = data.session(key), data.ethograms([key])[key]
     entry, curves = data.entries[key], traces(session)
     coloured = colours_of(shown_words([one]), one.vocabulary)
-    who = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in entry.who.items() if value)
+    who = ", ".join(
+        f"{name.replace('_', ' ')} {value}" for name, value in entry.who.items() if value
+    )
     frames = session.metadata["frames"]
     size = plots.time_unit(one.duration_s)[1]
     whole = plots.whole_session(one, coloured, curves)
     said = [html.Li(sentence) for sentence in warnings(session)]
     return [
-        html.P([dcc.Link("Sessions", href="/"), " / ", entry.who.get("group") or "session"], className="kind"),
+        html.P(
+            [dcc.Link("Sessions", href="/"), " / ", entry.who.get("group") or "session"],
+            className="kind",
+        ),
         html.H1(key),
-        html.P(f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s",
-               className="muted"),
-        *([html.Details([html.Summary(f"{len(said)} things to know first"), html.Ul(said)], className="problems")]
-          if said else []),
-        dcc.Store(id="session-key", data=key), dcc.Store(id="session-unit-s", data=size),
+        html.P(
+            f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s",
+            className="muted",
+        ),
+        *(
+            [
+                html.Details(
+                    [html.Summary(f"{len(said)} things to know first"), html.Ul(said)],
+                    className="problems",
+                )
+            ]
+            if said
+            else []
+        ),
+        dcc.Store(id="session-key", data=key),
+        dcc.Store(id="session-unit-s", data=size),
         html.H2("The whole session"),
         html.P("A click goes to that moment.", className="muted"),
         graph("whole", whole, "actions, speed and predicted error over the whole session"),
         _steps(at_s),
-        html.Div(className="pair moment", children=[
-            html.Div([
-                dcc.RadioItems(id="picture-of", value="animal", inline=True, className="choice", options=[
-                    {"label": "around the animal", "value": "animal"}, {"label": "whole picture", "value": "frame"},
-                ]),
-                graph("frame-picture", plots.empty("Reading the frame ...", 380), "depth picture with the skeleton"),
-                html.Dl(id="frame-facts", className="facts"),
-            ]),
-            html.Div([graph("around", plots.empty("Reading the frames ...", 380), "curves around the moment"),
-                      _replay(may_show)]),
-        ]),
+        html.Div(
+            className="pair moment",
+            children=[
+                html.Div(
+                    [
+                        dcc.RadioItems(
+                            id="picture-of",
+                            value="animal",
+                            inline=True,
+                            className="choice",
+                            options=[
+                                {"label": "around the animal", "value": "animal"},
+                                {"label": "whole picture", "value": "frame"},
+                            ],
+                        ),
+                        graph(
+                            "frame-picture",
+                            plots.empty("Reading the frame ...", 380),
+                            "depth picture with the skeleton",
+                        ),
+                        html.Dl(id="frame-facts", className="facts"),
+                    ]
+                ),
+                html.Div(
+                    [
+                        graph(
+                            "around",
+                            plots.empty("Reading the frames ...", 380),
+                            "curves around the moment",
+                        ),
+                        _replay(may_show),
+                    ]
+                ),
+            ],
+        ),
         *([app_correct.panel(session, correcting)] if may_correct else []),
-        html.H2("Bouts"), block(f"bouts/{key}", "Bouts of the session"),
+        html.H2("Bouts"),
+        block(f"bouts/{key}", "Bouts of the session"),
         *_more(data, key, session),
-    ]  # fmt: skip
+    ]
 
 
 def failed_page(data: StudyData, key: str) -> list[Any]:
     """What there is to say of a session that was not measured."""
     entry = data.entries.get(key)
     if entry is None:
-        return [html.H1("No such session"), html.P(["The study has no session of this name. ",
-                                                    dcc.Link("All sessions", href="/")])]  # fmt: skip
+        return [
+            html.H1("No such session"),
+            html.P(["The study has no session of this name. ", dcc.Link("All sessions", href="/")]),
+        ]
     said = "; ".join(filter(None, (entry.reason, entry.remedy))) or "it has not been measured yet"
-    return [html.P(dcc.Link("Sessions", href="/"), className="kind"), html.H1(key),
-            html.P([html.Span(entry.state, className=f"state is-{entry.state}"), f" {said}"])]  # fmt: skip
+    return [
+        html.P(dcc.Link("Sessions", href="/"), className="kind"),
+        html.H1(key),
+        html.P([html.Span(entry.state, className=f"state is-{entry.state}"), f" {said}"]),
+    ]
 
 
 def _steps(at_s: float) -> html.Div:
     buttons = [
-        html.Button(label, id={"part": "step", "by": by, "to": to}, n_clicks=0, type="button",
-                    title=f"{'next' if to > 0 else 'previous'} {'frame with a flag' if by == 'flag' else by}")
+        html.Button(
+            label,
+            id={"part": "step", "by": by, "to": to},
+            n_clicks=0,
+            type="button",
+            title=f"{'next' if to > 0 else 'previous'} {'frame with a flag' if by == 'flag' else by}",
+        )
         for by, to, label in _STEPS
-    ]  # fmt: skip
-    time = html.Label([html.Span("Moment, s "), dcc.Input(id="moment", type="number", value=at_s, step="any",
-                                                          debounce=True)])  # fmt: skip
-    return html.Div([time, *buttons, html.Span(id="moment-link")], className="tools stick", role="toolbar",
-                    **aria(label="go through the frames"))  # fmt: skip
+    ]
+    time = html.Label(
+        [
+            html.Span("Moment, s "),
+            dcc.Input(id="moment", type="number", value=at_s, step="any", debounce=True),
+        ]
+    )
+    return html.Div(
+        [time, *buttons, html.Span(id="moment-link")],
+        className="tools stick",
+        role="toolbar",
+        **aria(label="go through the frames"),
+    )
 
 
 def _replay(may_show: bool) -> html.Div:
-    shown = html.Button("Open the replay here", id="open-replay", n_clicks=0, type="button", className="main",
-                        disabled=not may_show)  # fmt: skip
-    return html.Div(className="replay", children=[
-        html.H3("Replay"), shown if may_show else html.Div(shown, hidden=True),
-        html.P(["Or in a terminal: ", html.Code(id="replay-command"), " ",
-                dcc.Clipboard(target_id="replay-command", title="copy the command", className="copy")]),
-        html.P(id="replay-said", className="muted", role="status"),
-    ])  # fmt: skip
+    shown = html.Button(
+        "Open the replay here",
+        id="open-replay",
+        n_clicks=0,
+        type="button",
+        className="main",
+        disabled=not may_show,
+    )
+    return html.Div(
+        className="replay",
+        children=[
+            html.H3("Replay"),
+            shown if may_show else html.Div(shown, hidden=True),
+            html.P(
+                [
+                    "Or in a terminal: ",
+                    html.Code(id="replay-command"),
+                    " ",
+                    dcc.Clipboard(
+                        target_id="replay-command", title="copy the command", className="copy"
+                    ),
+                ]
+            ),
+            html.P(id="replay-said", className="muted", role="status"),
+        ],
+    )
 
 
 def _more(data: StudyData, key: str, session: Session) -> list[Any]:
-    links = [html.Li(download(f"{name}.csv", f"/session-csv/{quote(key, safe='')}/{name}.csv", ""))
-             for name in session_tables(data, key)]  # fmt: skip
-    report = [html.A("The session's report", href=f"/report/{quote(key, safe='')}", target="_blank",
-                     className="button")] if (session.path / "report.html").is_file() else []  # fmt: skip
+    links = [
+        html.Li(download(f"{name}.csv", f"/session-csv/{quote(key, safe='')}/{name}.csv", ""))
+        for name in session_tables(data, key)
+    ]
+    report = (
+        [
+            html.A(
+                "The session's report",
+                href=f"/report/{quote(key, safe='')}",
+                target="_blank",
+                className="button",
+            )
+        ]
+        if (session.path / "report.html").is_file()
+        else []
+    )
     return [
-        html.Div(className="pair", children=[
-            html.Div([html.H2("Gaps"), block(f"gaps/{key}", "Gaps of the session", searched=False)]),
-            html.Div([html.H2("Head and tail perhaps exchanged"), block(f"flips/{key}", "Flips", searched=False)]),
-        ]),
-        html.H2("Every table"), html.P(report), html.Ul(links, className="files"),
-    ]  # fmt: skip
+        html.Div(
+            className="pair",
+            children=[
+                html.Div(
+                    [html.H2("Gaps"), block(f"gaps/{key}", "Gaps of the session", searched=False)]
+                ),
+                html.Div(
+                    [
+                        html.H2("Head and tail perhaps exchanged"),
+                        block(f"flips/{key}", "Flips", searched=False),
+                    ]
+                ),
+            ],
+        ),
+        html.H2("Every table"),
+        html.P(report),
+        html.Ul(links, className="files"),
+    ]
 
 
 def nearest_row(session: Session, at_s: float) -> int:
@@ -137,9 +262,10 @@ def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
     if by == "frame":
         return float(time_s[min(max(row + to, 0), len(time_s) - 1)])
     places = (
-        session.bouts["start_s"].to_numpy(float) if by == "bout"
+        session.bouts["start_s"].to_numpy(float)
+        if by == "bout"
         else time_s[(session.frames["flag"].fillna("") != "").to_numpy()]
-    )  # fmt: skip
+    )
     beyond = places[places > at_s + 1e-4] if to > 0 else places[places < at_s - 1e-4]
     return at_s if not len(beyond) else float(beyond.min() if to > 0 else beyond.max())
 
@@ -167,12 +293,17 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
 
     @app.callback(
         Output("moment", "value"),
-        Input("whole", "clickData"), Input("around", "clickData"),
+        Input("whole", "clickData"),
+        Input("around", "clickData"),
         Input({"part": "step", "by": ALL, "to": ALL}, "n_clicks"),
-        State("moment", "value"), State("session-key", "data"), State("session-unit-s", "data"),
+        State("moment", "value"),
+        State("session-key", "data"),
+        State("session-unit-s", "data"),
         prevent_initial_call=True,
-    )  # fmt: skip
-    def move(whole: Any, around: Any, _steps: Any, at_s: float | None, key: str, unit_s: float) -> Any:
+    )
+    def move(
+        whole: Any, around: Any, _steps: Any, at_s: float | None, key: str, unit_s: float
+    ) -> Any:
         asked = ctx.triggered_id
         if not ctx.triggered[0]["value"]:
             return no_update
@@ -183,10 +314,15 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         return round(moved_to(data.session(key), at_s or 0.0, asked["by"], int(asked["to"])), 4)
 
     @app.callback(
-        Output("around", "figure"), Output("frame-facts", "children"), Output("whole", "figure"),
-        Output("replay-command", "children"), Output("moment-link", "children"),
-        Input("moment", "value"), State("session-key", "data"), State("session-unit-s", "data"),
-    )  # fmt: skip
+        Output("around", "figure"),
+        Output("frame-facts", "children"),
+        Output("whole", "figure"),
+        Output("replay-command", "children"),
+        Output("moment-link", "children"),
+        Input("moment", "value"),
+        State("session-key", "data"),
+        State("session-unit-s", "data"),
+    )
     def follow(at_s: float | None, key: str, unit_s: float) -> tuple[Any, ...]:
         session, moment = data.session(key), float(at_s or 0.0)
         row = nearest_row(session, moment)
@@ -194,20 +330,33 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         marked["layout"]["shapes"] = [plots.cursor(moment / unit_s)]
         command = f"liex show {shlex.quote(str(session.path))} --at {moment:.3f}"
         link = html.A("link to this moment", href=session_address(key, moment))
-        return plots.around(traces(session), moment, _HALF_S), facts(session, row), marked, command, link
+        return (
+            plots.around(traces(session), moment, _HALF_S),
+            facts(session, row),
+            marked,
+            command,
+            link,
+        )
 
     @app.callback(
-        Output("frame-picture", "figure"), Input("moment", "value"), Input("picture-of", "value"),
+        Output("frame-picture", "figure"),
+        Input("moment", "value"),
+        Input("picture-of", "value"),
         State("session-key", "data"),
-    )  # fmt: skip
+    )
     def show(at_s: float | None, of: str, key: str) -> Any:
         session = data.session(key)
-        return frames.figure(key, session, nearest_row(session, float(at_s or 0.0)), whole=of == "frame")
+        return frames.figure(
+            key, session, nearest_row(session, float(at_s or 0.0)), whole=of == "frame"
+        )
 
     @app.callback(
-        Output("replay-said", "children"), Input("open-replay", "n_clicks"), State("moment", "value"),
-        State("session-key", "data"), prevent_initial_call=True,
-    )  # fmt: skip
+        Output("replay-said", "children"),
+        Input("open-replay", "n_clicks"),
+        State("moment", "value"),
+        State("session-key", "data"),
+        prevent_initial_call=True,
+    )
     def replay(n_clicks: int, at_s: float | None, key: str) -> Any:
         if not n_clicks or show_replay is None:
             return no_update

@@ -23,20 +23,38 @@ def sessions_page(data: StudyData) -> list[Any]:
         counts[entry.state] = counts.get(entry.state, 0) + 1
     chips = [
         html.Li([html.B(f"{counts[state]:,}"), f" {title}"], className=f"state is-{state}")
-        for state, title in STATES.items() if counts.get(state)
-    ]  # fmt: skip
+        for state, title in STATES.items()
+        if counts.get(state)
+    ]
     return [
-        html.Div(className="head", children=[
-            html.Div([html.P("Study", className="kind"), html.H1(data.name)]),
-            html.Button("Look again", id="look-again", n_clicks=0, type="button", title="read the folders again"),
-        ]),
+        html.Div(
+            className="head",
+            children=[
+                html.Div([html.P("Study", className="kind"), html.H1(data.name)]),
+                html.Button(
+                    "Look again",
+                    id="look-again",
+                    n_clicks=0,
+                    type="button",
+                    title="read the folders again",
+                ),
+            ],
+        ),
         html.Ul(chips, className="chips", id="state-counts"),
-        html.P("A session's name opens it. Error is the joint error to be expected, median over its frames; flips are "
-               "stretches in which head and tail may have been exchanged.", className="muted"),
+        html.P(
+            "A session's name opens it. Error is the joint error to be expected, median over its frames; flips are "
+            "stretches in which head and tail may have been exchanged.",
+            className="muted",
+        ),
         block("sessions", "Sessions of the study"),
-        html.P([download("All summaries as CSV", csv_address("summaries"), ""),
-                ": one row per session with every measure."], className="muted"),
-    ]  # fmt: skip
+        html.P(
+            [
+                download("All summaries as CSV", csv_address("summaries"), ""),
+                ": one row per session with every measure.",
+            ],
+            className="muted",
+        ),
+    ]
 
 
 def ethograms_page(data: StudyData) -> list[Any]:
@@ -46,29 +64,61 @@ def ethograms_page(data: StudyData) -> list[Any]:
     return [
         html.P("Study", className="kind"),
         html.H1("Ethograms side by side"),
-        html.Div(className="tools", children=[
-            html.Label([html.Span("Groups"), dcc.Dropdown(
-                id="ethogram-groups", options=[{"label": name, "value": name} for name in names], multi=True,
-                placeholder="all groups",
-            )]),
-            html.Label([html.Span("Sessions"), dcc.Dropdown(
-                id="ethogram-sessions", options=[{"label": key, "value": key} for key in keys], multi=True,
-                placeholder="all sessions of these groups",
-            )]),
-        ]),
+        html.Div(
+            className="tools",
+            children=[
+                html.Label(
+                    [
+                        html.Span("Groups"),
+                        dcc.Dropdown(
+                            id="ethogram-groups",
+                            options=[{"label": name, "value": name} for name in names],
+                            multi=True,
+                            placeholder="all groups",
+                        ),
+                    ]
+                ),
+                html.Label(
+                    [
+                        html.Span("Sessions"),
+                        dcc.Dropdown(
+                            id="ethogram-sessions",
+                            options=[{"label": key, "value": key} for key in keys],
+                            multi=True,
+                            placeholder="all sessions of these groups",
+                        ),
+                    ]
+                ),
+            ],
+        ),
         html.Ul(id="ethogram-key", className="key"),
         dcc.Store(id="ethogram-unit-s", data=1.0),
         html.H2("Over time"),
-        html.P("Every row is a session. A click opens the session at that moment.", className="muted"),
-        graph("ethograms", plots.empty("Reading the sessions ..."), "actions of each session over time"),
+        html.P(
+            "Every row is a session. A click opens the session at that moment.", className="muted"
+        ),
+        graph(
+            "ethograms",
+            plots.empty("Reading the sessions ..."),
+            "actions of each session over time",
+        ),
         html.H2("Time budget"),
-        graph("budgets", plots.empty("Reading the sessions ..."), "share of the time in each action, by session"),
-        html.P("Shares are of the observed time and add up to one, so they are not independent.", className="muted"),
+        graph(
+            "budgets",
+            plots.empty("Reading the sessions ..."),
+            "share of the time in each action, by session",
+        ),
+        html.P(
+            "Shares are of the observed time and add up to one, so they are not independent.",
+            className="muted",
+        ),
         html.P([download("All shares as CSV", csv_address("summaries"))]),
-    ]  # fmt: skip
+    ]
 
 
-def chosen_keys(data: StudyData, names: Sequence[str] | None, sessions: Sequence[str] | None) -> list[str]:
+def chosen_keys(
+    data: StudyData, names: Sequence[str] | None, sessions: Sequence[str] | None
+) -> list[str]:
     """The sessions that are named, or those of the groups, or all; by group, then as in the study."""
     done = data.done
     if sessions:
@@ -81,26 +131,37 @@ def register(app: Dash, data: StudyData) -> None:
     """What happens when something is chosen or clicked on these pages."""
 
     @app.callback(
-        Output("ethograms", "figure"), Output("budgets", "figure"), Output("ethogram-key", "children"),
+        Output("ethograms", "figure"),
+        Output("budgets", "figure"),
+        Output("ethogram-key", "children"),
         Output("ethogram-unit-s", "data"),
-        Input("ethogram-groups", "value"), Input("ethogram-sessions", "value"),
-    )  # fmt: skip
+        Input("ethogram-groups", "value"),
+        Input("ethogram-sessions", "value"),
+    )
     def draw(names: list[str] | None, sessions: list[str] | None) -> tuple[Any, Any, Any, float]:
         ones = data.ethograms(chosen_keys(data, names, sessions))
         words = shown_words(ones.values())
         coloured = colours_of(words[:MOST_COLOURS], vocabulary_of(ones.values()))
         table = data.collected()
         table = table[table["key"].isin(ones)].set_index("key").reindex(list(ones)).reset_index()
-        marks = [*coloured.items(), *([(OTHER, GREY)] if len(words) > MOST_COLOURS else []),
-                 (NO_POSE, plots.NO_POSE_COLOUR)]  # fmt: skip
-        key = [html.Li([html.I(style={"background": colour}), word.replace("_", " ")]) for word, colour in marks]
+        marks = [
+            *coloured.items(),
+            *([(OTHER, GREY)] if len(words) > MOST_COLOURS else []),
+            (NO_POSE, plots.NO_POSE_COLOUR),
+        ]
+        key = [
+            html.Li([html.I(style={"background": colour}), word.replace("_", " ")])
+            for word, colour in marks
+        ]
         size = plots.time_unit(max((one.duration_s for one in ones.values()), default=0.0))[1]
         return plots.ethograms(ones, coloured), plots.time_budgets(table, coloured), key, size
 
     @app.callback(
-        Output("url", "href", allow_duplicate=True), Input("ethograms", "clickData"),
-        State("ethogram-unit-s", "data"), prevent_initial_call=True,
-    )  # fmt: skip
+        Output("url", "href", allow_duplicate=True),
+        Input("ethograms", "clickData"),
+        State("ethogram-unit-s", "data"),
+        prevent_initial_call=True,
+    )
     def open_moment(click: dict[str, Any] | None, unit_s: float) -> Any:
         if not click:
             return no_update
@@ -109,14 +170,20 @@ def register(app: Dash, data: StudyData) -> None:
         key = by_label.get(str(point["y"]))
         return no_update if key is None else session_address(key, float(point["x"]) * unit_s)
 
-    @app.callback(Output("url", "href", allow_duplicate=True), Input("budgets", "clickData"), prevent_initial_call=True)
+    @app.callback(
+        Output("url", "href", allow_duplicate=True),
+        Input("budgets", "clickData"),
+        prevent_initial_call=True,
+    )
     def open_session(click: dict[str, Any] | None) -> Any:
         return session_address(str(click["points"][0]["customdata"])) if click else no_update
 
     @app.callback(
-        Output("url", "href", allow_duplicate=True), Input("look-again", "n_clicks"), State("url", "href"),
+        Output("url", "href", allow_duplicate=True),
+        Input("look-again", "n_clicks"),
+        State("url", "href"),
         prevent_initial_call=True,
-    )  # fmt: skip
+    )
     def look_again(n_clicks: int, href: str) -> Any:
         if not n_clicks:
             return no_update

@@ -7,8 +7,13 @@ from typing import Any
 from dash import dcc, html
 
 # Plotly's toolbar has a button that sends the figure to its makers: it is taken out, and has no address to send it to
-_GRAPH = {"displaylogo": False, "responsive": True, "showSendToCloud": False, "plotlyServerURL": "",
-          "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d", "sendDataToCloud"]}  # fmt: skip
+_GRAPH = {
+    "displaylogo": False,
+    "responsive": True,
+    "showSendToCloud": False,
+    "plotlyServerURL": "",
+    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d", "sendDataToCloud"],
+}
 
 
 def aria(**names: str) -> dict[str, Any]:

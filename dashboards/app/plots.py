@@ -26,8 +26,15 @@ GROUP_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 GROUP_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star")
 NO_POSE_COLOUR = "#3a3f45"
 FEW = 60  # sessions; with more, rows are thin
-_COLUMNS, _MOST_CELLS = 800, 40_000  # parts of the time that a row of an ethogram shows; of all rows together
-_FONT = {"family": 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", sans-serif', "size": 13, "color": INK}
+_COLUMNS, _MOST_CELLS = (
+    800,
+    40_000,
+)  # parts of the time that a row of an ethogram shows; of all rows together
+_FONT = {
+    "family": 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", sans-serif',
+    "size": 13,
+    "color": INK,
+}
 
 
 def text(name: str) -> str:
@@ -37,7 +44,14 @@ def text(name: str) -> str:
 
 def empty(sentence: str, height: int = 160) -> dict[str, Any]:
     """A figure that says why there is none."""
-    note = {"text": escape(sentence), "showarrow": False, "x": 0.5, "y": 0.5, "xref": "paper", "yref": "paper"}
+    note = {
+        "text": escape(sentence),
+        "showarrow": False,
+        "x": 0.5,
+        "y": 0.5,
+        "xref": "paper",
+        "yref": "paper",
+    }
     hidden = {"visible": False}
     return {"data": [], "layout": _layout(height, annotations=[note], xaxis=hidden, yaxis=hidden)}
 
@@ -60,14 +74,24 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
     place = np.where(rows == -1, 0, np.where(rows == -2, 1, rows + 2))
     colours = [NO_POSE_COLOUR, GREY, *coloured.values()]
     trace = {
-        "type": "heatmap", "z": shown.astype(np.float32), "x": (time_s / size).astype(np.float32),
-        "y": [text(key) for key in ones], "text": np.array([text(name) for name in named])[place].tolist(),
-        "showscale": False, "zmin": -0.5, "zmax": len(colours) - 0.5, "colorscale": _steps(colours),
-        "ygap": 2 if len(ones) <= FEW else 1, "hoverongaps": False,
+        "type": "heatmap",
+        "z": shown.astype(np.float32),
+        "x": (time_s / size).astype(np.float32),
+        "y": [text(key) for key in ones],
+        "text": np.array([text(name) for name in named])[place].tolist(),
+        "showscale": False,
+        "zmin": -0.5,
+        "zmax": len(colours) - 0.5,
+        "colorscale": _steps(colours),
+        "ygap": 2 if len(ones) <= FEW else 1,
+        "hoverongaps": False,
         "hovertemplate": f"%{{y}}<br>%{{x:.2f}} {unit}: %{{text}}<extra></extra>",
-    }  # fmt: skip
+    }
     x = {"title": {"text": f"time, {unit}"}, "range": [0, stop_s / size], "showgrid": False}
-    return {"data": [trace], "layout": _layout(_rows_height(len(ones)), xaxis=x, yaxis=_session_axis(len(ones)))}
+    return {
+        "data": [trace],
+        "layout": _layout(_rows_height(len(ones)), xaxis=x, yaxis=_session_axis(len(ones))),
+    }
 
 
 def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str, Any]:
@@ -75,23 +99,40 @@ def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str,
     if shares.empty:
         return empty("No session is chosen, or none of those has a summary.")
     actions = [str(name).removesuffix("_share") for name in shares if str(name).endswith("_share")]
-    actions = [word for word in actions if f"{word}_s" in shares]  # other columns are shares of something else
+    actions = [
+        word for word in actions if f"{word}_s" in shares
+    ]  # other columns are shares of something else
     known = {word: colour for word, colour in coloured.items() if word in actions}
     rest = [f"{word}_share" for word in actions if word not in known]
     parts = [(word, shares[f"{word}_share"].fillna(0.0), colour) for word, colour in known.items()]
     parts.append((OTHER, shares[rest].fillna(0.0).sum(axis=1), GREY))
     keys = [str(key) for key in shares["key"]]
     data = [
-        {"type": "bar", "orientation": "h", "y": [text(key) for key in keys], "x": 100.0 * values.to_numpy(float),
-         "name": text(word), "marker": {"color": colour, "line": {"width": 0.5, "color": "#fff"}},
-         "customdata": keys, "hovertemplate": f"%{{y}}<br>{_plain(word)}: %{{x:.1f}} %<extra></extra>"}
-        for word, values, colour in parts if values.any()
-    ]  # fmt: skip
+        {
+            "type": "bar",
+            "orientation": "h",
+            "y": [text(key) for key in keys],
+            "x": 100.0 * values.to_numpy(float),
+            "name": text(word),
+            "marker": {"color": colour, "line": {"width": 0.5, "color": "#fff"}},
+            "customdata": keys,
+            "hovertemplate": f"%{{y}}<br>{_plain(word)}: %{{x:.1f}} %<extra></extra>",
+        }
+        for word, values, colour in parts
+        if values.any()
+    ]
     x = {"title": {"text": "share of the observed time, %"}, "range": [0, 100]}
-    return {"data": data, "layout": _layout(
-        _rows_height(len(keys)), xaxis=x, yaxis=_session_axis(len(keys)), barmode="stack", bargap=0.25,
-        showlegend=False,
-    )}  # fmt: skip
+    return {
+        "data": data,
+        "layout": _layout(
+            _rows_height(len(keys)),
+            xaxis=x,
+            yaxis=_session_axis(len(keys)),
+            barmode="stack",
+            bargap=0.25,
+            showlegend=False,
+        ),
+    }
 
 
 def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
@@ -110,29 +151,75 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
         colour, mark = GROUP_COLOURS[k % len(GROUP_COLOURS)], GROUP_MARKS[k % len(GROUP_MARKS)]
         n_of = np.bincount(animal)
         label = text(name or "no group")
-        data.append({
-            "type": "scatter", "mode": "markers", "x": k + beside[animal] + 0.02, "y": values, "name": "sessions",
-            "customdata": [str(key) for key in own["key"]], "text": [text(key) for key in own["key"]],
-            "marker": {"color": colour, "size": 6, "opacity": 0.45, "symbol": mark}, "showlegend": False,
-            "hovertemplate": "session %{text}: %{y:.4g}<extra></extra>",
-        })  # fmt: skip
-        first = [str(own["key"].iloc[int(np.flatnonzero(animal == a)[0])]) for a in range(len(animals))]
-        data.append({
-            "type": "scatter", "mode": "markers", "x": k + beside, "y": means, "name": label, "showlegend": False,
-            "customdata": first,
-            "text": [f"{text(a)}, {n} session{'s' if n > 1 else ''}" for a, n in zip(animals, n_of, strict=True)],
-            "marker": {"color": colour, "size": 12, "symbol": mark, "line": {"color": "#fff", "width": 1.2}},
-            "hovertemplate": "animal %{text}: %{y:.4g}<extra></extra>",
-        })  # fmt: skip
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": k + beside[animal] + 0.02,
+                "y": values,
+                "name": "sessions",
+                "customdata": [str(key) for key in own["key"]],
+                "text": [text(key) for key in own["key"]],
+                "marker": {"color": colour, "size": 6, "opacity": 0.45, "symbol": mark},
+                "showlegend": False,
+                "hovertemplate": "session %{text}: %{y:.4g}<extra></extra>",
+            }
+        )
+        first = [
+            str(own["key"].iloc[int(np.flatnonzero(animal == a)[0])]) for a in range(len(animals))
+        ]
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": k + beside,
+                "y": means,
+                "name": label,
+                "showlegend": False,
+                "customdata": first,
+                "text": [
+                    f"{text(a)}, {n} session{'s' if n > 1 else ''}"
+                    for a, n in zip(animals, n_of, strict=True)
+                ],
+                "marker": {
+                    "color": colour,
+                    "size": 12,
+                    "symbol": mark,
+                    "line": {"color": "#fff", "width": 1.2},
+                },
+                "hovertemplate": "animal %{text}: %{y:.4g}<extra></extra>",
+            }
+        )
         mean = float(means.mean())
-        lines.append({"type": "line", "x0": k - 0.3, "x1": k + 0.3, "y0": mean, "y1": mean,
-                      "line": {"color": colour, "width": 2.5}})  # fmt: skip
-    counts = [f"{text(name or 'no group')}<br>{own['subject_id'].nunique()} animals, {len(own)} sessions"
-              for name in names for own in [known[known["group"].fillna("") == name]]]  # fmt: skip
-    x = {"tickvals": list(range(len(names))), "ticktext": counts, "range": [-0.6, len(names) - 0.4], "showgrid": False,
-         "zeroline": False}  # fmt: skip
-    title = text(measure) if not unit or measure.endswith(unit) else f"{text(measure)}, {escape(unit)}"
-    return {"data": data, "layout": _layout(380, xaxis=x, yaxis={"title": {"text": title}}, shapes=lines)}
+        lines.append(
+            {
+                "type": "line",
+                "x0": k - 0.3,
+                "x1": k + 0.3,
+                "y0": mean,
+                "y1": mean,
+                "line": {"color": colour, "width": 2.5},
+            }
+        )
+    counts = [
+        f"{text(name or 'no group')}<br>{own['subject_id'].nunique()} animals, {len(own)} sessions"
+        for name in names
+        for own in [known[known["group"].fillna("") == name]]
+    ]
+    x = {
+        "tickvals": list(range(len(names))),
+        "ticktext": counts,
+        "range": [-0.6, len(names) - 0.4],
+        "showgrid": False,
+        "zeroline": False,
+    }
+    title = (
+        text(measure) if not unit or measure.endswith(unit) else f"{text(measure)}, {escape(unit)}"
+    )
+    return {
+        "data": data,
+        "layout": _layout(380, xaxis=x, yaxis={"title": {"text": title}}, shapes=lines),
+    }
 
 
 def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
@@ -141,19 +228,45 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
     if known.empty:
         return empty("No difference can be given; the table below says why.", 220)
     places = list(range(len(known)))
-    low, high = (known[name].astype(float).fillna(known["estimate"]) for name in ("ci_low", "ci_high"))
+    low, high = (
+        known[name].astype(float).fillna(known["estimate"]) for name in ("ci_low", "ci_high")
+    )
     tested = (known["test"] != "").to_numpy()
     trace = {
-        "type": "scatter", "mode": "markers", "x": known["estimate"].to_numpy(float), "y": places,
-        "error_x": {"type": "data", "symmetric": False, "array": (high - known["estimate"]).to_numpy(float),
-                    "arrayminus": (known["estimate"] - low).to_numpy(float), "color": INK, "thickness": 1.6},
-        "marker": {"size": 11, "color": INK, "symbol": ["circle" if one else "circle-open" for one in tested]},
+        "type": "scatter",
+        "mode": "markers",
+        "x": known["estimate"].to_numpy(float),
+        "y": places,
+        "error_x": {
+            "type": "data",
+            "symmetric": False,
+            "array": (high - known["estimate"]).to_numpy(float),
+            "arrayminus": (known["estimate"] - low).to_numpy(float),
+            "color": INK,
+            "thickness": 1.6,
+        },
+        "marker": {
+            "size": 11,
+            "color": INK,
+            "symbol": ["circle" if one else "circle-open" for one in tested],
+        },
         "hovertemplate": "%{x:.4g}<extra></extra>",
-    }  # fmt: skip
-    y = {"tickvals": places, "ticktext": [text(name) for name in known["contrast"]], "automargin": True,
-         "autorange": "reversed", "showgrid": False}  # fmt: skip
-    x = {"title": {"text": f"difference{f', {escape(unit)}' if unit else ''}, with its 95 % interval"},
-         "zeroline": True, "zerolinecolor": MUTED, "zerolinewidth": 1.5}  # fmt: skip
+    }
+    y = {
+        "tickvals": places,
+        "ticktext": [text(name) for name in known["contrast"]],
+        "automargin": True,
+        "autorange": "reversed",
+        "showgrid": False,
+    }
+    x = {
+        "title": {
+            "text": f"difference{f', {escape(unit)}' if unit else ''}, with its 95 % interval"
+        },
+        "zeroline": True,
+        "zerolinecolor": MUTED,
+        "zerolinewidth": 1.5,
+    }
     return {"data": [trace], "layout": _layout(150 + 44 * len(places), xaxis=x, yaxis=y)}
 
 
@@ -168,34 +281,69 @@ def whole_session(
     z = np.full((len(lanes), n), np.nan, np.float32)
     for k, word in enumerate(words):
         z[k, raster(_only(one, word), [word], 0.0, stop_s, n) == 0] = k
-    z[-1, raster(Ethogram(one.spans_s[:0], [], one.lost_s, one.duration_s), [], 0.0, stop_s, n) == -2] = len(words)
+    z[
+        -1,
+        raster(Ethogram(one.spans_s[:0], [], one.lost_s, one.duration_s), [], 0.0, stop_s, n) == -2,
+    ] = len(words)
     unit, size = time_unit(stop_s)
     x = (np.arange(n) + 0.5) * stop_s / n / size
-    data: list[dict[str, Any]] = [{
-        "type": "heatmap", "z": z, "x": x.astype(np.float32), "y": list(range(len(lanes))), "showscale": False,
-        "zmin": -0.5, "zmax": len(lanes) - 0.5, "hoverongaps": False, "ygap": 3, "xaxis": "x", "yaxis": "y",
-        "colorscale": _steps([*coloured.values(), NO_POSE_COLOUR]),
-        "hovertemplate": f"%{{x:.2f}} {unit}<extra></extra>",
-    }]  # fmt: skip
+    data: list[dict[str, Any]] = [
+        {
+            "type": "heatmap",
+            "z": z,
+            "x": x.astype(np.float32),
+            "y": list(range(len(lanes))),
+            "showscale": False,
+            "zmin": -0.5,
+            "zmax": len(lanes) - 0.5,
+            "hoverongaps": False,
+            "ygap": 3,
+            "xaxis": "x",
+            "yaxis": "y",
+            "colorscale": _steps([*coloured.values(), NO_POSE_COLOUR]),
+            "hovertemplate": f"%{{x:.2f}} {unit}<extra></extra>",
+        }
+    ]
     heights = [22 * len(lanes) + 20, *[96] * len(traces)]
     domains, notes = _domains(heights), []
-    layout: dict[str, Any] = {"yaxis": {
-        "tickvals": list(range(len(lanes))), "ticktext": [text(word) for word in lanes], "domain": domains[0],
-        "autorange": "reversed", "showgrid": False, "automargin": True, "zeroline": False,
-    }}  # fmt: skip
+    layout: dict[str, Any] = {
+        "yaxis": {
+            "tickvals": list(range(len(lanes))),
+            "ticktext": [text(word) for word in lanes],
+            "domain": domains[0],
+            "autorange": "reversed",
+            "showgrid": False,
+            "automargin": True,
+            "zeroline": False,
+        }
+    }
     for k, (name, time_s, values, colour) in enumerate(traces):
         rows = kept_rows(values, n)
         axis = f"y{k + 2}"
-        data.append({
-            "type": "scatter", "mode": "lines", "x": time_s[rows] / size, "y": values[rows],
-            "line": {"color": colour, "width": 1.2}, "xaxis": "x", "yaxis": axis, "connectgaps": False,
-            "hovertemplate": f"%{{x:.2f}} {unit}: %{{y:.4g}}<extra>{text(name)}</extra>",
-        })  # fmt: skip
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "x": time_s[rows] / size,
+                "y": values[rows],
+                "line": {"color": colour, "width": 1.2},
+                "xaxis": "x",
+                "yaxis": axis,
+                "connectgaps": False,
+                "hovertemplate": f"%{{x:.2f}} {unit}: %{{y:.4g}}<extra>{text(name)}</extra>",
+            }
+        )
         layout[f"yaxis{k + 2}"] = _curve_axis(domains[k + 1], values)
         notes.append(_title(name, domains[k + 1]))
-    layout["xaxis"] = {"title": {"text": f"time, {unit}"}, "range": [0, stop_s / size], "anchor": f"y{len(traces) + 1}"
-                       if traces else "y"}  # fmt: skip
-    return {"data": data, "layout": _layout(sum(heights) + 70, **layout, annotations=notes, showlegend=False)}
+    layout["xaxis"] = {
+        "title": {"text": f"time, {unit}"},
+        "range": [0, stop_s / size],
+        "anchor": f"y{len(traces) + 1}" if traces else "y",
+    }
+    return {
+        "data": data,
+        "layout": _layout(sum(heights) + 70, **layout, annotations=notes, showlegend=False),
+    }
 
 
 def _only(one: Ethogram, word: str) -> Ethogram:
@@ -203,7 +351,9 @@ def _only(one: Ethogram, word: str) -> Ethogram:
     return Ethogram(one.spans_s[chosen], [word] * int(chosen.sum()), one.lost_s[:0], one.duration_s)
 
 
-def around(traces: Sequence[tuple[str, Array, Array, str]], moment_s: float, half_s: float) -> dict[str, Any]:
+def around(
+    traces: Sequence[tuple[str, Array, Array, str]], moment_s: float, half_s: float
+) -> dict[str, Any]:
     """The curves near a moment, every frame a point: (name with unit, time s (n,), values (n,), colour)."""
     if not traces:
         return empty("This session has no kinematics.")
@@ -214,36 +364,68 @@ def around(traces: Sequence[tuple[str, Array, Array, str]], moment_s: float, hal
     for k, (name, time_s, values, colour) in enumerate(traces):
         near = np.abs(time_s - moment_s) <= half_s
         axis = "y" if k == 0 else f"y{k + 1}"
-        data.append({
-            "type": "scatter", "mode": "lines+markers", "x": time_s[near], "y": values[near], "yaxis": axis,
-            "line": {"color": colour, "width": 1.4}, "marker": {"size": 4, "color": colour}, "connectgaps": False,
-            "hovertemplate": "%{x:.3f} s: %{y:.4g}<extra></extra>",
-        })  # fmt: skip
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines+markers",
+                "x": time_s[near],
+                "y": values[near],
+                "yaxis": axis,
+                "line": {"color": colour, "width": 1.4},
+                "marker": {"size": 4, "color": colour},
+                "connectgaps": False,
+                "hovertemplate": "%{x:.3f} s: %{y:.4g}<extra></extra>",
+            }
+        )
         layout[f"yaxis{'' if k == 0 else k + 1}"] = _curve_axis(domains[k], values)
         notes.append(_title(name, domains[k]))
-    layout["xaxis"] = {"title": {"text": "time, s"}, "range": [moment_s - half_s, moment_s + half_s],
-                       "anchor": f"y{len(traces)}" if len(traces) > 1 else "y"}  # fmt: skip
+    layout["xaxis"] = {
+        "title": {"text": "time, s"},
+        "range": [moment_s - half_s, moment_s + half_s],
+        "anchor": f"y{len(traces)}" if len(traces) > 1 else "y",
+    }
     more = {"shapes": [cursor(moment_s)], "annotations": notes, "showlegend": False}
     return {"data": data, "layout": _layout(sum(heights) + 70, **layout, **more)}
 
 
 def cursor(at: float) -> dict[str, Any]:
     """The line that marks the moment, through all curves; `at` in the axis' own unit."""
-    return {"type": "line", "x0": at, "x1": at, "y0": 0, "y1": 1, "yref": "paper",
-            "line": {"color": INK, "width": 1.4, "dash": "dot"}}  # fmt: skip
+    return {
+        "type": "line",
+        "x0": at,
+        "x1": at,
+        "y0": 0,
+        "y1": 1,
+        "yref": "paper",
+        "line": {"color": INK, "width": 1.4, "dash": "dot"},
+    }
 
 
 def frame_picture(
-    depth: NDArray[np.uint16], uv: Array, names: Sequence[str], bones: Sequence[tuple[int, int]], left: int, top: int,
+    depth: NDArray[np.uint16],
+    uv: Array,
+    names: Sequence[str],
+    bones: Sequence[tuple[int, int]],
+    left: int,
+    top: int,
     reach_mm: float,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) px over it.
 
     The axes count the whole frame's pixels, (0, 0) the centre of the first.
     """
     h, w = depth.shape
-    picture = {"source": png_uri(shade(depth, reach_mm)), "xref": "x", "yref": "y", "x": left - 0.5, "y": top - 0.5,
-               "sizex": w, "sizey": h, "sizing": "stretch", "layer": "below"}  # fmt: skip
+    picture = {
+        "source": png_uri(shade(depth, reach_mm)),
+        "xref": "x",
+        "yref": "y",
+        "x": left - 0.5,
+        "y": top - 0.5,
+        "sizex": w,
+        "sizey": h,
+        "sizing": "stretch",
+        "layer": "below",
+    }
     x: list[float | None] = []
     y: list[float | None] = []
     for a, b in bones:
@@ -251,20 +433,53 @@ def frame_picture(
         y += [uv[a, 1], uv[b, 1], None]
     fill = ["#ffffff"] * (len(uv) - 1) + [RED]
     data = [
-        {"type": "heatmap", "z": np.zeros((h, w), np.uint8), "x0": left, "dx": 1, "y0": top, "dy": 1, "opacity": 0,
-         "showscale": False, "hoverinfo": "none"},  # so that every pixel can be clicked
-        {"type": "scatter", "mode": "lines", "x": x, "y": y, "line": {"color": "#fff", "width": 2},
-         "hoverinfo": "skip"},
-        {"type": "scatter", "mode": "markers", "x": uv[:, 0], "y": uv[:, 1], "text": [text(name) for name in names],
-         "marker": {"color": fill, "size": 9, "line": {"color": "#222", "width": 1}},
-         "hovertemplate": "%{text}: u %{x:.1f}, v %{y:.1f} px<extra></extra>"},
-    ]  # fmt: skip
+        {
+            "type": "heatmap",
+            "z": np.zeros((h, w), np.uint8),
+            "x0": left,
+            "dx": 1,
+            "y0": top,
+            "dy": 1,
+            "opacity": 0,
+            "showscale": False,
+            "hoverinfo": "none",
+        },  # so that every pixel can be clicked
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": x,
+            "y": y,
+            "line": {"color": "#fff", "width": 2},
+            "hoverinfo": "skip",
+        },
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "x": uv[:, 0],
+            "y": uv[:, 1],
+            "text": [text(name) for name in names],
+            "marker": {"color": fill, "size": 9, "line": {"color": "#222", "width": 1}},
+            "hovertemplate": "%{text}: u %{x:.1f}, v %{y:.1f} px<extra></extra>",
+        },
+    ]
     hidden = {"showgrid": False, "zeroline": False, "showticklabels": False, "ticks": ""}
-    return {"data": data, "layout": _layout(
-        380, images=[picture], showlegend=False, hoverdistance=5, margin={"l": 4, "r": 4, "t": 4, "b": 4},
-        xaxis={**hidden, "range": [left - 0.5, left + w - 0.5], "constrain": "domain"},
-        yaxis={**hidden, "range": [top + h - 0.5, top - 0.5], "scaleanchor": "x", "constrain": "domain"},
-    )}  # fmt: skip
+    return {
+        "data": data,
+        "layout": _layout(
+            380,
+            images=[picture],
+            showlegend=False,
+            hoverdistance=5,
+            margin={"l": 4, "r": 4, "t": 4, "b": 4},
+            xaxis={**hidden, "range": [left - 0.5, left + w - 0.5], "constrain": "domain"},
+            yaxis={
+                **hidden,
+                "range": [top + h - 0.5, top - 0.5],
+                "scaleanchor": "x",
+                "constrain": "domain",
+            },
+        ),
+    }
 
 
 def time_unit(stop_s: float) -> tuple[str, float]:
@@ -283,8 +498,14 @@ def _rows_height(n: int) -> int:
 
 def _session_axis(n: int) -> dict[str, Any]:
     """An upward axis with a session in each row, the first on top."""
-    return {"type": "category", "autorange": "reversed", "automargin": True, "showgrid": False, "nticks": n,
-            "tickfont": {"size": 12 if n <= FEW else 9}}  # fmt: skip
+    return {
+        "type": "category",
+        "autorange": "reversed",
+        "automargin": True,
+        "showgrid": False,
+        "nticks": n,
+        "tickfont": {"size": 12 if n <= FEW else 9},
+    }
 
 
 def _domains(heights: Sequence[int]) -> list[list[float]]:
@@ -301,13 +522,27 @@ def _domains(heights: Sequence[int]) -> list[list[float]]:
 def _curve_axis(domain: list[float], values: Array) -> dict[str, Any]:
     """The upward axis of one of several curves; from zero where nothing is below it."""
     positive = not (values[np.isfinite(values)] < 0).any()
-    return {"domain": domain, "automargin": True, "nticks": 4, "rangemode": "tozero" if positive else "normal"}
+    return {
+        "domain": domain,
+        "automargin": True,
+        "nticks": 4,
+        "rangemode": "tozero" if positive else "normal",
+    }
 
 
 def _title(name: str, domain: list[float]) -> dict[str, Any]:
     """A curve's name above it, on the left."""
-    return {"text": text(name), "showarrow": False, "xref": "paper", "yref": "paper", "x": 0, "y": domain[1],
-            "xanchor": "left", "yanchor": "bottom", "font": {"size": 12, "color": MUTED}}  # fmt: skip
+    return {
+        "text": text(name),
+        "showarrow": False,
+        "xref": "paper",
+        "yref": "paper",
+        "x": 0,
+        "y": domain[1],
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "font": {"size": 12, "color": MUTED},
+    }
 
 
 def _steps(colours: Sequence[str]) -> list[list[Any]]:
@@ -318,11 +553,26 @@ def _steps(colours: Sequence[str]) -> list[list[Any]]:
 
 def _layout(height: int, **more: Any) -> dict[str, Any]:
     """What all figures share: our ink, no background, no toolbar's clutter."""
-    axis = {"gridcolor": LINE, "linecolor": LINE, "zerolinecolor": LINE, "ticks": "outside", "tickcolor": LINE}
+    axis = {
+        "gridcolor": LINE,
+        "linecolor": LINE,
+        "zerolinecolor": LINE,
+        "ticks": "outside",
+        "tickcolor": LINE,
+    }
     base: dict[str, Any] = {
-        "height": height, "font": _FONT, "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 60, "r": 16, "t": 12, "b": 50}, "hoverlabel": {"bgcolor": "#fff", "font": {"color": INK}},
-        "dragmode": "zoom", "hovermode": "closest",
-    }  # fmt: skip
-    axes = {name: {**axis, **value} for name, value in more.items() if name.startswith(("xaxis", "yaxis"))}
+        "height": height,
+        "font": _FONT,
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "margin": {"l": 60, "r": 16, "t": 12, "b": 50},
+        "hoverlabel": {"bgcolor": "#fff", "font": {"color": INK}},
+        "dragmode": "zoom",
+        "hovermode": "closest",
+    }
+    axes = {
+        name: {**axis, **value}
+        for name, value in more.items()
+        if name.startswith(("xaxis", "yaxis"))
+    }
     return {**base, **more, **axes}

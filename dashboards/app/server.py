@@ -12,21 +12,11 @@ from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc
 
 from liex_lab.errors import LiexError
 
-from . import (
-    page_corrections as app_correct,
-)
-from . import (
-    page_groups as app_groups,
-)
-from . import (
-    page_session as app_session,
-)
-from . import (
-    page_study as app_study,
-)
-from . import (
-    tables as app_tables,
-)
+from . import page_corrections as app_correct
+from . import page_groups as app_groups
+from . import page_session as app_session
+from . import page_study as app_study
+from . import tables as app_tables
 from .data import StudyData
 from .frames import Frames
 from .guard import LOOPBACK, add_downloads, guard
@@ -49,7 +39,11 @@ _POLICY = (
 
 
 def make_app(
-    data: StudyData, *, token: str = "", show_replay: ShowReplay | None = None, correct: Correct | None = None
+    data: StudyData,
+    *,
+    token: str = "",
+    show_replay: ShowReplay | None = None,
+    correct: Correct | None = None,
 ) -> Dash:
     """The dashboard of a study, not yet served. token: what every visitor has to know; empty on this machine alone.
 
@@ -57,10 +51,16 @@ def make_app(
     correct: adds corrections to the session in a folder, or takes some back; None: the pages only show.
     """
     app = Dash(
-        "liex_lab_dashboard", assets_folder=str(_ASSETS), serve_locally=True, suppress_callback_exceptions=True,
-        title=f"{data.name} · liex_lab", update_title="", index_string=_INDEX, add_log_handler=False,
+        "liex_lab_dashboard",
+        assets_folder=str(_ASSETS),
+        serve_locally=True,
+        suppress_callback_exceptions=True,
+        title=f"{data.name} · liex_lab",
+        update_title="",
+        index_string=_INDEX,
+        add_log_handler=False,
         compress=False,
-    )  # fmt: skip
+    )
     app.layout = _shell(data)
     _register(app, data, may_show=show_replay is not None, may_correct=correct is not None)
     app_study.register(app, data)
@@ -105,18 +105,29 @@ def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
 def address(host: str, port: int, token: str) -> str:
     """What to type into a browser."""
     shown = "127.0.0.1" if host in (*LOOPBACK, "") else host
-    return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (f"?token={token}" if token else "")
+    return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
+        f"?token={token}" if token else ""
+    )
 
 
 def _shell(data: StudyData) -> html.Div:
     links = [dcc.Link(title, href=href, id={"part": "tab", "href": href}) for href, title in _PAGES]
-    return html.Div([
-        dcc.Location(id="url", refresh="callback-nav"),
-        html.A("Skip to the content", href="#page", className="skip"),
-        html.Header(html.Div([html.Span("liex_lab", className="brand"), html.Nav(links, **aria(label="pages"))],
-                             className="bar")),
-        html.Main(id="page", tabIndex=-1),
-    ])  # fmt: skip
+    return html.Div(
+        [
+            dcc.Location(id="url", refresh="callback-nav"),
+            html.A("Skip to the content", href="#page", className="skip"),
+            html.Header(
+                html.Div(
+                    [
+                        html.Span("liex_lab", className="brand"),
+                        html.Nav(links, **aria(label="pages")),
+                    ],
+                    className="bar",
+                )
+            ),
+            html.Main(id="page", tabIndex=-1),
+        ]
+    )
 
 
 def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
@@ -131,7 +142,9 @@ def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
             key = unquote(path.removeprefix("/session/"))
             if key not in {entry.key for entry in data.done}:
                 return app_session.failed_page(data, key)
-            return app_session.session_page(data, key, _moment(search), correcting="corrections=" in search, **may)
+            return app_session.session_page(
+                data, key, _moment(search), correcting="corrections=" in search, **may
+            )
     except LiexError as error:
         return [html.H1("This cannot be shown"), html.P(str(error))]
     return [html.H1("No such page"), html.P(dcc.Link("Sessions", href="/"))]
@@ -149,19 +162,25 @@ def _register(app: Dash, data: StudyData, **may: bool) -> None:
     """The pages themselves, and the sorting and filtering of every table."""
 
     @app.callback(
-        Output("page", "children"), Output({"part": "tab", "href": ALL}, "className"),
-        Input("url", "pathname"), Input("url", "search"), State({"part": "tab", "href": ALL}, "id"),
-    )  # fmt: skip
-    def route(path: str | None, search: str | None, tabs: list[dict[str, str]]) -> tuple[Any, list[str]]:
+        Output("page", "children"),
+        Output({"part": "tab", "href": ALL}, "className"),
+        Input("url", "pathname"),
+        Input("url", "search"),
+        State({"part": "tab", "href": ALL}, "id"),
+    )
+    def route(
+        path: str | None, search: str | None, tabs: list[dict[str, str]]
+    ) -> tuple[Any, list[str]]:
         here = "/" if (path or "/").startswith("/session") else path or "/"
         marks = ["here" if tab["href"] == here else "" for tab in tabs]
         return _page(data, path or "/", search or "", **may), marks
 
     @app.callback(
         Output({"part": "cells", "table": MATCH}, "data"),
-        Input({"part": "filter", "table": MATCH}, "value"), Input({"part": "order", "table": MATCH}, "data"),
+        Input({"part": "filter", "table": MATCH}, "value"),
+        Input({"part": "order", "table": MATCH}, "data"),
         State({"part": "filter", "table": MATCH}, "id"),
-    )  # fmt: skip
+    )
     def fill(words: str | None, order: dict[str, Any], asked: dict[str, str]) -> Any:
         name = asked["table"]
         try:
@@ -170,6 +189,7 @@ def _register(app: Dash, data: StudyData, **may: bool) -> None:
             return app_tables.sentence(name, str(error))
 
     app.clientside_callback(
-        ClientsideFunction("liex", "draw"), Output({"part": "rows", "table": MATCH}, "className"),
+        ClientsideFunction("liex", "draw"),
+        Output({"part": "rows", "table": MATCH}, "className"),
         Input({"part": "cells", "table": MATCH}, "data"),
-    )  # fmt: skip
+    )

@@ -34,31 +34,77 @@ class Table:
 
 
 SESSIONS = {
-    "session": "session", "group": "group", "state": "state", "duration_min": "min", "posed_share": "with a pose",
-    "doubtful_share": "doubtful", "n_gaps": "gaps", "n_missing": "not delivered", "predicted_error_mm": "error, mm",
-    "n_flips": "flips", "flips_s": "flips, s", "warnings": "warnings", "reason": "what is to be said",
-}  # fmt: skip
+    "session": "session",
+    "group": "group",
+    "state": "state",
+    "duration_min": "min",
+    "posed_share": "with a pose",
+    "doubtful_share": "doubtful",
+    "n_gaps": "gaps",
+    "n_missing": "not delivered",
+    "predicted_error_mm": "error, mm",
+    "n_flips": "flips",
+    "flips_s": "flips, s",
+    "warnings": "warnings",
+    "reason": "what is to be said",
+}
 STATS = {
-    "measure": "measure", "contrast": "contrast", "estimate": "difference", "ci_low": "from", "ci_high": "to",
-    "effect_size": "Hedges' g", "effect_low": "from", "effect_high": "to", "p": "p", "p_fdr": "p, corrected",
-    "test": "test", "refused": "not tested, because", "unit": "unit", "n_units_first": "units, first",
-    "n_units_second": "units, second", "n_animals": "animals", "n_cages": "cages", "n_sessions": "sessions",
-    "n_bouts": "bouts", "observed_min": "observed, min", "n_without_value": "without value",
-}  # fmt: skip
-BOUTS = {"action": "action", "start_s": "from, s", "stop_s": "to, s", "duration_s": "lasts, s", "score": "score",
-         "source": "by", "peak_speed_mm_s": "peak, mm/s", "path_mm": "way, mm"}  # fmt: skip
+    "measure": "measure",
+    "contrast": "contrast",
+    "estimate": "difference",
+    "ci_low": "from",
+    "ci_high": "to",
+    "effect_size": "Hedges' g",
+    "effect_low": "from",
+    "effect_high": "to",
+    "p": "p",
+    "p_fdr": "p, corrected",
+    "test": "test",
+    "refused": "not tested, because",
+    "unit": "unit",
+    "n_units_first": "units, first",
+    "n_units_second": "units, second",
+    "n_animals": "animals",
+    "n_cages": "cages",
+    "n_sessions": "sessions",
+    "n_bouts": "bouts",
+    "observed_min": "observed, min",
+    "n_without_value": "without value",
+}
+BOUTS = {
+    "action": "action",
+    "start_s": "from, s",
+    "stop_s": "to, s",
+    "duration_s": "lasts, s",
+    "score": "score",
+    "source": "by",
+    "peak_speed_mm_s": "peak, mm/s",
+    "path_mm": "way, mm",
+}
 GAPS = {"start_s": "from, s", "stop_s": "to, s", "n_frames_missing": "frames", "reason": "reason"}
-FLIPS = {"start_s": "from, s", "stop_s": "to, s", "p_flip": "probability", "applied": "put right", "source": "by"}
+FLIPS = {
+    "start_s": "from, s",
+    "stop_s": "to, s",
+    "p_flip": "probability",
+    "applied": "put right",
+    "source": "by",
+}
 _LONG = ("test", "refused")
-STATES = {"done": "done", "changed": "changed since", "failed": "failed", "new": "waiting", "begun": "interrupted",
-          "excluded": "left out"}  # fmt: skip
+STATES = {
+    "done": "done",
+    "changed": "changed since",
+    "failed": "failed",
+    "new": "waiting",
+    "begun": "interrupted",
+    "excluded": "left out",
+}
 _OF_SESSION = {"bouts": BOUTS, "gaps": GAPS, "flips": FLIPS}
 
 
 def find(data: StudyData, name: str) -> Table:
     """A table by its name: sessions, summaries, stats?MEASURE?REFERENCE, or bouts, gaps, flips of a session
     (bouts/KEY). Raises SessionError where there is none.
-    """  # fmt: skip
+    """
     what, _, rest = name.partition("/")
     if name == "sessions":
         return Table(data.overview(), SESSIONS, "session")
@@ -84,7 +130,9 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
         lines = texts[0]
         for more in texts[1:]:
             lines = lines + "\n" + more
-        rows = rows[np.logical_and.reduce([lines.str.contains(word, regex=False) for word in wanted])]
+        rows = rows[
+            np.logical_and.reduce([lines.str.contains(word, regex=False) for word in wanted])
+        ]
     if column in rows:
         rows = rows.sort_values(column, ascending=not down, kind="stable", na_position="last")
     return rows
@@ -99,21 +147,39 @@ def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
     """A table with its filter and its download; `fill` is what comes into it."""
     tools: list[Any] = []
     if searched:
-        tools.append(html.Label([
-            html.Span("Show rows with "),
-            dcc.Input(id={"part": "filter", "table": name}, type="text", value="", debounce=0.25,
-                      placeholder="any word", className="filter"),
-        ]))  # fmt: skip
+        tools.append(
+            html.Label(
+                [
+                    html.Span("Show rows with "),
+                    dcc.Input(
+                        id={"part": "filter", "table": name},
+                        type="text",
+                        value="",
+                        debounce=0.25,
+                        placeholder="any word",
+                        className="filter",
+                    ),
+                ]
+            )
+        )
     else:
         tools.append(dcc.Input(id={"part": "filter", "table": name}, type="hidden", value=""))
     tools.append(download("Download CSV", csv_address(name)))
-    return html.Div(className="table-block", children=[
-        html.Div(tools, className="tools"),
-        dcc.Store(id={"part": "order", "table": name}, data={"column": "", "down": False}),
-        dcc.Store(id={"part": "cells", "table": name}),
-        html.Div(id={"part": "rows", "table": name}, className="scroll", role="region", tabIndex="0",
-                 **aria(label=caption)),
-    ])  # fmt: skip
+    return html.Div(
+        className="table-block",
+        children=[
+            html.Div(tools, className="tools"),
+            dcc.Store(id={"part": "order", "table": name}, data={"column": "", "down": False}),
+            dcc.Store(id={"part": "cells", "table": name}),
+            html.Div(
+                id={"part": "rows", "table": name},
+                className="scroll",
+                role="region",
+                tabIndex="0",
+                **aria(label=caption),
+            ),
+        ],
+    )
 
 
 def csv_address(name: str) -> str:
@@ -125,16 +191,27 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
     """What the page's script draws: headings that sort, cells as texts with what they are, and how many rows."""
     rows = arranged(table, words, order["column"], order["down"])
     heads = [
-        {"column": column, "title": title, "sort": _sorted(column, order), "numeric": _numeric(table.rows, column)}
+        {
+            "column": column,
+            "title": title,
+            "sort": _sorted(column, order),
+            "numeric": _numeric(table.rows, column),
+        }
         for column, title in table.shown.items()
     ]
     n, total = len(rows), len(table.rows)
     said = f"{n:,} rows" if n == total else f"{n:,} of {total:,} rows"
     said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {
-        "name": name, "place": _place(name), "heads": heads, "said": said,
-        "rows": [[_cell(table, row, column) for column in table.shown] for row in records(rows.head(MOST_ROWS))],
-    }  # fmt: skip
+        "name": name,
+        "place": _place(name),
+        "heads": heads,
+        "said": said,
+        "rows": [
+            [_cell(table, row, column) for column in table.shown]
+            for row in records(rows.head(MOST_ROWS))
+        ],
+    }
 
 
 def sentence(name: str, text: str) -> dict[str, Any]:
@@ -144,7 +221,9 @@ def sentence(name: str, text: str) -> dict[str, Any]:
 
 def _place(name: str) -> str:
     """The id of a table's element on the page, as Dash writes it."""
-    return json.dumps({"part": "rows", "table": name}, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return json.dumps(
+        {"part": "rows", "table": name}, sort_keys=True, separators=(",", ":"), ensure_ascii=False
+    )
 
 
 def as_csv(table: pd.DataFrame) -> Iterator[str]:
@@ -186,7 +265,9 @@ def number(value: Any) -> str:
     if isinstance(value, float | np.floating):
         if not np.isfinite(value):
             return "–"
-        shown = 0.0 if abs(float(value)) < 1e-12 else float(value)  # what is left of a sum that is none
+        shown = (
+            0.0 if abs(float(value)) < 1e-12 else float(value)
+        )  # what is left of a sum that is none
         return f"{shown:,.0f}" if abs(shown) >= 1000 or shown == int(shown) else f"{shown:.3g}"
     return str(value)
 
@@ -203,10 +284,15 @@ def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
         return {"kind": "state", "text": STATES.get(str(value), str(value)), "to": str(value)}
     if column == "reason" and "remedy" in row:
         texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
-        return {"kind": "said", "text": "; ".join(one for one in texts if one not in ("", "nan", "new"))}
+        return {
+            "kind": "said",
+            "text": "; ".join(one for one in texts if one not in ("", "nan", "new")),
+        }
     if column in _LONG:
         return {"kind": "said", "text": str(value)}
-    known = f"{100 * value:.3g} %" if column.endswith("_share") and _finite(value) else number(value)
+    known = (
+        f"{100 * value:.3g} %" if column.endswith("_share") and _finite(value) else number(value)
+    )
     if column == table.link and column == "start_s":
         return {"kind": "moment", "text": known, "to": round(float(value), 4)}
     if column == table.link and row.get("state", "done") in DONE:
@@ -230,5 +316,11 @@ def columns_of(data: StudyData) -> Sequence[str]:
     """The measures that groups can be compared by: the numbers of the summaries."""
     rows = data.collected()
     left_out = {"n_frames", "n_frames_observed", "fps_median", "n_bouts", "n_frames_summary"}
-    return [str(name) for name in rows if rows[name].dtype.kind in "iuf" and str(name) not in left_out
-            and rows[name].notna().any() and not str(name).endswith("_summary")]  # fmt: skip
+    return [
+        str(name)
+        for name in rows
+        if rows[name].dtype.kind in "iuf"
+        and str(name) not in left_out
+        and rows[name].notna().any()
+        and not str(name).endswith("_summary")
+    ]

@@ -11,7 +11,11 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_PANELS = {"tangent": "paper's, tangent vectors", "joints": "paper's, joint positions", "default": "default"}
+_PANELS = {
+    "tangent": "paper's, tangent vectors",
+    "joints": "paper's, joint positions",
+    "default": "default",
+}
 _DPI = 110
 
 
@@ -26,7 +30,9 @@ def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
     shares = [result[f"{name}_accuracy"] for name in ("tangent", "joint", "default")]
     for k, ((name, title), share) in enumerate(zip(_PANELS.items(), shares, strict=True)):
         low, high = result["accuracy_interval95"][name]
-        panels[k].set_title(f"{title}: {share:.1%} ({100 * low:.1f} to {100 * high:.1f})", fontsize=9)
+        panels[k].set_title(
+            f"{title}: {share:.1%} ({100 * low:.1f} to {100 * high:.1f})", fontsize=9
+        )
         _matrix(panels[k], np.asarray(result["confusion"][name], float), words, first=k == 0)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DPI, bbox_inches="tight")
@@ -39,9 +45,18 @@ def _matrix(panel: Axes, counts: np.ndarray, words: list[str], first: bool) -> N
     panel.imshow(share, cmap="Blues", vmin=0.0, vmax=100.0)
     for row, column in zip(*np.nonzero(counts), strict=True):
         value = share[row, column]
-        panel.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7,
-                   color="white" if value > 55.0 else "black")  # fmt: skip
-    panel.set_xticks(range(len(words)), words, rotation=60, ha="right", rotation_mode="anchor", fontsize=7)
+        panel.text(
+            column,
+            row,
+            f"{value:.0f}",
+            ha="center",
+            va="center",
+            fontsize=7,
+            color="white" if value > 55.0 else "black",
+        )
+    panel.set_xticks(
+        range(len(words)), words, rotation=60, ha="right", rotation_mode="anchor", fontsize=7
+    )
     panel.set_yticks(range(len(words)), words if first else [""] * len(words), fontsize=7)
     panel.set_xlabel("taken for", fontsize=8)
     if first:

@@ -36,8 +36,12 @@ def draw_figures(results: Mapping[str, Mapping[str, Any]], folder: Path) -> list
         _save(_joint_errors(results), folder / "error_per_joint.png"),
     ]
     for animal, one in results.items():
-        written.append(_save(_candidates(one["illustration"]), folder / f"fig13_candidates_{animal}.png"))
-        written.append(_save(_convergence(one["illustration"]), folder / f"fig16_convergence_{animal}.png"))
+        written.append(
+            _save(_candidates(one["illustration"]), folder / f"fig13_candidates_{animal}.png")
+        )
+        written.append(
+            _save(_convergence(one["illustration"]), folder / f"fig16_convergence_{animal}.png")
+        )
     return written
 
 
@@ -46,7 +50,9 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _sheet(n_rows: int, n_columns: int, width: float, height: float) -> tuple[Figure, list[list[Axes]]]:
+def _sheet(
+    n_rows: int, n_columns: int, width: float, height: float
+) -> tuple[Figure, list[list[Axes]]]:
     """A figure with a grid of panels, each `width` x `height` inches."""
     from matplotlib.figure import Figure
 
@@ -70,8 +76,13 @@ def _cumulative(results: Mapping[str, Mapping[str, Any]]) -> Figure:
                 name, colour, style = _METHODS[variant]
                 panel.plot(error, share, style, color=colour, label=name, lw=1.6)
                 farthest = max(farthest, float(error[round(0.85 * (len(error) - 1))]))
-            panel.set(title=f"{animal}, {split}", xlabel="mean joint error within, mm", ylabel="frames, %",
-                      xlim=(0, farthest), ylim=(0, 100))  # fmt: skip
+            panel.set(
+                title=f"{animal}, {split}",
+                xlabel="mean joint error within, mm",
+                ylabel="frames, %",
+                xlim=(0, farthest),
+                ylim=(0, 100),
+            )
             panel.grid(alpha=0.3)
     grid[0][0].legend(fontsize=7, loc="lower right")
     return figure
@@ -86,9 +97,18 @@ def _joint_errors(results: Mapping[str, Mapping[str, Any]]) -> Figure:
         for panel, split in zip(line, one["splits"], strict=False):
             for variant, row in one["rows"].items():
                 name, colour, style = _METHODS[variant]
-                panel.plot(joints, row["splits"][split]["joint_mm"], style, marker=".", color=colour, label=name)
+                panel.plot(
+                    joints,
+                    row["splits"][split]["joint_mm"],
+                    style,
+                    marker=".",
+                    color=colour,
+                    label=name,
+                )
             panel.set(title=f"{animal}, {split}", ylabel="mean error, mm")
-            panel.set_xticks(joints, one["joints"], rotation=60 if len(joints) > 6 else 0, fontsize=7)
+            panel.set_xticks(
+                joints, one["joints"], rotation=60 if len(joints) > 6 else 0, fontsize=7
+            )
             panel.set_ylim(bottom=0)
             panel.grid(alpha=0.3)
     grid[0][0].legend(fontsize=7)
@@ -106,9 +126,21 @@ def _sensitivity(results: Mapping[str, Mapping[str, Any]]) -> Figure:
             for variant, curve in one["sensitivity"].items():
                 points = curve["curves"].get(number, [])
                 name, colour, _ = _METHODS[variant]
-                panel.plot([p["value"] for p in points], [p["mean_mm"] for p in points], ".-", color=colour, label=name)
+                panel.plot(
+                    [p["value"] for p in points],
+                    [p["mean_mm"] for p in points],
+                    ".-",
+                    color=colour,
+                    label=name,
+                )
                 used = [p for p in points if p["value"] == curve["chosen"][number]]
-                panel.plot([p["value"] for p in used], [p["mean_mm"] for p in used], "o", color=_CHOSEN, ms=6)
+                panel.plot(
+                    [p["value"] for p in used],
+                    [p["mean_mm"] for p in used],
+                    "o",
+                    color=_CHOSEN,
+                    ms=6,
+                )
             panel.set(xlabel=number, ylabel="mm")
             panel.locator_params(axis="x", integer=True)
             panel.margins(y=0.1)
@@ -119,7 +151,9 @@ def _sensitivity(results: Mapping[str, Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _animal(panel: Axes, heights: NDArray[np.int16], view: tuple[float, float, float, float]) -> None:
+def _animal(
+    panel: Axes, heights: NDArray[np.int16], view: tuple[float, float, float, float]
+) -> None:
     """The height map, grey, cut to a view (left, right, bottom, top) in its pixels."""
     shown = np.where(heights > 0, heights.astype(float), np.nan)
     darkest = np.nanmin(shown) - 0.5 * np.ptp(heights[heights > 0])
@@ -127,9 +161,18 @@ def _animal(panel: Axes, heights: NDArray[np.int16], view: tuple[float, float, f
     panel.set(xlim=view[:2], ylim=view[2:], xticks=[], yticks=[])
 
 
-def _skeleton(panel: Axes, joints_px: Array, edges: Sequence[tuple[int, int]], colour: str, width: float) -> None:
+def _skeleton(
+    panel: Axes, joints_px: Array, edges: Sequence[tuple[int, int]], colour: str, width: float
+) -> None:
     for a, b in edges:
-        panel.plot(joints_px[[a, b], 0], joints_px[[a, b], 1], "-", color=colour, lw=width, solid_capstyle="round")
+        panel.plot(
+            joints_px[[a, b], 0],
+            joints_px[[a, b], 1],
+            "-",
+            color=colour,
+            lw=width,
+            solid_capstyle="round",
+        )
     panel.plot(*joints_px[0], "o", color=colour, ms=3 * width)
 
 
@@ -156,12 +199,15 @@ def _candidates(illustration: Mapping[str, Any]) -> Figure:
         _skeleton(panel, illustration["true_px"], illustration["edges"], _TRUE, 1.0)
         _skeleton(panel, ranked["joints_px"][k], illustration["edges"], _POSE, 1.5)
         panel.set_title(f"{k + 1}: {ranked['score_mm'][k]:.2f} mm", color="#117733", fontsize=8)
-        panel.set_xlabel(f"{true_rank[k]}: {ranked['error_mm'][k]:.2f} mm", color="#CC3311", fontsize=8)
+        panel.set_xlabel(
+            f"{true_rank[k]}: {ranked['error_mm'][k]:.2f} mm", color="#CC3311", fontsize=8
+        )
     figure.suptitle(
         f"{illustration['animal']}: candidates of one picture, red; truth, blue. Above: rank and predicted error; "
         f"below: true rank and error.\nRank correlation of the two, mean of {illustration['n_images']} pictures: "
-        f"{illustration['rank_correlation']:.2f}", fontsize=8,
-    )  # fmt: skip
+        f"{illustration['rank_correlation']:.2f}",
+        fontsize=8,
+    )
     return figure
 
 
@@ -183,15 +229,25 @@ def _convergence(illustration: Mapping[str, Any]) -> Figure:
         panel.set_xlabel(f"{steps['example_mm'][step]:.1f} mm", fontsize=8)
     panel = figure.add_subplot(grid[1, :])
     at = np.arange(n)
-    panel.fill_between(at, steps["low_mm"], steps["high_mm"], color=_METHODS["paper"][1], alpha=0.2, lw=0,
-                       label="middle half of all candidates")  # fmt: skip
+    panel.fill_between(
+        at,
+        steps["low_mm"],
+        steps["high_mm"],
+        color=_METHODS["paper"][1],
+        alpha=0.2,
+        lw=0,
+        label="middle half of all candidates",
+    )
     panel.plot(at, steps["median_mm"], color=_METHODS["paper"][1], label="median of all candidates")
-    panel.plot(at, steps["best_mm"], color=_METHODS["default"][1], label="the candidate ranked first, mean")
+    panel.plot(
+        at, steps["best_mm"], color=_METHODS["default"][1], label="the candidate ranked first, mean"
+    )
     shown = at if n <= 40 else at[:: -(-n // 40)]
     panel.set_xticks(shown, [steps["names"][k] for k in shown], rotation=60, fontsize=7, ha="right")
     panel.set(ylabel="mean joint error, mm", ylim=(0, None))
     panel.set_title(
-        f"{illustration['animal']}: after every joint and round, {illustration['n_images']} pictures", fontsize=8
+        f"{illustration['animal']}: after every joint and round, {illustration['n_images']} pictures",
+        fontsize=8,
     )
     panel.legend(fontsize=7)
     panel.grid(alpha=0.3)

@@ -57,9 +57,13 @@ def _over_time(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed]
     seconds = (sequence.times_ns - sequence.times_ns[0]) * 1e-9
     for event in sequence.events:
         if event.kind not in ("hidden", "dropped"):
-            panel.axvspan(seconds[event.start], seconds[event.stop - 1], color="#000000", alpha=0.05, lw=0)
+            panel.axvspan(
+                seconds[event.start], seconds[event.stop - 1], color="#000000", alpha=0.05, lw=0
+            )
             where = panel.get_xaxis_transform()
-            panel.text(seconds[event.start], 0.98, event.kind, fontsize=7, va="top", transform=where)
+            panel.text(
+                seconds[event.start], 0.98, event.kind, fontsize=7, va="top", transform=where
+            )
     for name, (label, colour, width) in _LINES.items():
         if name not in rows:
             continue
@@ -82,9 +86,18 @@ def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], f
     u, v = camera.project(middle)
     reach = 0.9 * sequence.spine_mm * camera.fx / middle[2]
     near = middle[2] - 0.6 * sequence.spine_mm
-    panel.imshow(np.where(depth > 0, depth, np.nan), cmap="Greys", vmin=near, vmax=middle[2] + 0.6 * sequence.spine_mm)
+    panel.imshow(
+        np.where(depth > 0, depth, np.nan),
+        cmap="Greys",
+        vmin=near,
+        vmax=middle[2] + 0.6 * sequence.spine_mm,
+    )
     skeletons = {"truth": (sequence.joints_arena[frame], _TRUTH)}
-    skeletons |= {name: (rows[name].joints[frame], _LINES[name][1]) for name in ("single", "smoothed") if name in rows}
+    skeletons |= {
+        name: (rows[name].joints[frame], _LINES[name][1])
+        for name in ("single", "smoothed")
+        if name in rows
+    }
     for joints, colour in skeletons.values():
         uv = camera.project(T_camera_arena @ joints)
         for a, b in sequence.skeleton.edges:

@@ -11,8 +11,12 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Session
 
 FILE = "replay.rbl"
-_NAMES = {"speed_mm_s": "speed", "nose_height_mm": "nose above the floor", "bend_rad": "bend of the body",
-          "tail_beat_hz": "tail beat"}  # fmt: skip
+_NAMES = {
+    "speed_mm_s": "speed",
+    "nose_height_mm": "nose above the floor",
+    "bend_rad": "bend of the body",
+    "tail_beat_hz": "tail beat",
+}
 
 
 def write_blueprint(session: Session) -> Path:
@@ -36,11 +40,17 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     corrected = bool(session.get("corrections"))
     at = corrected_entity if corrected else str
     measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []
-    body_m = float(session["animal"].get("spine_mm") or session["animal"]["home_length_mm"]) / 1000.0
+    body_m = (
+        float(session["animal"].get("spine_mm") or session["animal"]["home_length_mm"]) / 1000.0
+    )
     scene = rrb.Spatial3DView(
         origin="arena",
-        contents=["$origin/**", f"- /{OVERLAY}/**", f"- /{corrected_entity(OVERLAY)}/**",
-                  *(f"- /arena/{name}/**" for name in measured)],
+        contents=[
+            "$origin/**",
+            f"- /{OVERLAY}/**",
+            f"- /{corrected_entity(OVERLAY)}/**",
+            *(f"- /arena/{name}/**" for name in measured),
+        ],
         name="3D: the animal, followed (metres)",
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
@@ -53,12 +63,19 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     )
     picture = rrb.Spatial2DView(
         origin="arena/camera/image",
-        contents=["$origin/**", *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected)],
+        contents=[
+            "$origin/**",
+            *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
+        ],
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
-    lanes = rrb.StateTimelineView(origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)")
+    lanes = rrb.StateTimelineView(
+        origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
+    )
     swims = session["animal"]["joints"][0] == "head"
-    shown = ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
+    shown = (
+        ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
+    )
     curves = rrb.Horizontal(
         *(rrb.TimeSeriesView(origin=at(f"kinematics/{name}"), name=_NAMES[name]) for name in shown),
         rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),

@@ -26,7 +26,10 @@ _CURVES = (  # column of the kinematics, title, what it is, unit, colour, whethe
     ("tail_beat_hz", "Tail beat", "frequency, Hz", "Hz", _PURPLE, True),
     ("bend_rad", "Bend", "of the whole body, rad; positive to the left", "rad", _PURPLE, False),
 )
-_WALKING, _SWIMMING = ("speed_mm_s", "nose_height_mm"), ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
+_WALKING, _SWIMMING = (
+    ("speed_mm_s", "nose_height_mm"),
+    ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz"),
+)
 _AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz")
 # columns that are drawn
 FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
@@ -37,9 +40,14 @@ _CERTAIN = 0.05  # of p, corrected
 def charts(session: Session, words: list[str]) -> dict[str, str]:
     """All single figures, by name; empty where the session has no numbers for one."""
     frames, bouts = session.frames, session.bouts
-    time_s, time = frames["time_s"].to_numpy(float), figures.time_scale(session.metadata["frames"]["duration_s"])
+    time_s, time = (
+        frames["time_s"].to_numpy(float),
+        figures.time_scale(session.metadata["frames"]["duration_s"]),
+    )
     spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
-    empty = session.gaps[session.gaps["n_frames_missing"] > 0]  # the others are stamps that were moved
+    empty = session.gaps[
+        session.gaps["n_frames_missing"] > 0
+    ]  # the others are stamps that were moved
     lost = list(zip(empty["start_s"], empty["stop_s"], strict=True))
     error = frames["predicted_error_mm"]
     drawn = dict.fromkeys(("lanes", "way", "error", "errors", "budget", "matrix", "activity"), "")
@@ -53,8 +61,11 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
         drawn["way"] = figures.trajectory(x_mm, y_mm, time_s, outlines(session))
     if session.has("summary.csv"):
         row = session.summary.iloc[0]
-        shares = [(word, float(row[f"{word}_share"]), figures.action_colour(k)) for k, word in enumerate(words)
-                  if f"{word}_share" in row]  # fmt: skip
+        shares = [
+            (word, float(row[f"{word}_share"]), figures.action_colour(k))
+            for k, word in enumerate(words)
+            if f"{word}_share" in row
+        ]
         drawn["budget"] = figures.budget(shares)
     if session.has("transitions.parquet"):
         drawn["matrix"] = _matrix(session.table("transitions"), words)
@@ -68,7 +79,10 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
     if not session.has("kinematics.parquet"):
         return []
     frames, moved, bouts = session.frames, session.kinematics, session.bouts
-    time_s, time = frames["time_s"].to_numpy(float), figures.time_scale(session.metadata["frames"]["duration_s"])
+    time_s, time = (
+        frames["time_s"].to_numpy(float),
+        figures.time_scale(session.metadata["frames"]["duration_s"]),
+    )
     rears = bouts.loc[bouts["action"] == "rear", ["start_s", "stop_s"]].to_numpy(float)
     shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
     made = []
@@ -76,7 +90,9 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
         if name in shown and name in moved:
             shaded = [(float(a), float(b)) for a, b in rears] if name == "nose_height_mm" else []
             values = _across_gaps(moved[name], frames)
-            made.append((title, what, figures.curve(time_s, values, time, unit, colour, shaded, from_zero)))
+            made.append(
+                (title, what, figures.curve(time_s, values, time, unit, colour, shaded, from_zero))
+            )
     return made
 
 
@@ -88,9 +104,15 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
     if session.has("kinematics.parquet"):
         moved = session.kinematics
         shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
-        made = [(f"{title}, {unit}", time_s, _across_gaps(moved[name], frames), colour)
-                for name, title, _, unit, colour, _ in _CURVES if name in shown and name in moved]  # fmt: skip
-    return [*made, ("Predicted error, mm", time_s, _across_gaps(frames["predicted_error_mm"], frames), _RED)]
+        made = [
+            (f"{title}, {unit}", time_s, _across_gaps(moved[name], frames), colour)
+            for name, title, _, unit, colour, _ in _CURVES
+            if name in shown and name in moved
+        ]
+    return [
+        *made,
+        ("Predicted error, mm", time_s, _across_gaps(frames["predicted_error_mm"], frames), _RED),
+    ]
 
 
 def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
@@ -126,7 +148,9 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
     made = []
     kept = session.metadata.get("thumbnails", [])
     frames = session.frames.set_index("frame_index")
-    poses = session.table("poses", ["frame_index", "u_px", "v_px"], [entry["frame_index"] for entry in kept])
+    poses = session.table(
+        "poses", ["frame_index", "u_px", "v_px"], [entry["frame_index"] for entry in kept]
+    )
     bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
     words = list(session.metadata.get("actions", {}))
     for entry in kept:
@@ -135,8 +159,12 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
             continue
         index = entry["frame_index"]
         uv = poses.loc[poses["frame_index"] == index, ["u_px", "v_px"]].to_numpy(float)
-        reach_mm = 0.9 * float(frames["spine_mm"].median())  # an animal on its feet is about half its length high
-        drawn = figures.picture(np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm)
+        reach_mm = 0.9 * float(
+            frames["spine_mm"].median()
+        )  # an animal on its feet is about half its length high
+        drawn = figures.picture(
+            np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm
+        )
         time_s = float(frames.loc[index, "time_s"])
         word = _word_at(session.bouts, time_s)
         colour = figures.action_colour(words.index(word)) if word in words else ""
@@ -146,7 +174,9 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
 
 def _word_at(bouts: pd.DataFrame, time_s: float) -> str:
     """The action at a moment, empty where none is named."""
-    here = bouts.loc[(bouts["start_s"] <= time_s + 1e-6) & (bouts["stop_s"] > time_s + 1e-6), "action"]
+    here = bouts.loc[
+        (bouts["start_s"] <= time_s + 1e-6) & (bouts["stop_s"] > time_s + 1e-6), "action"
+    ]
     return str(here.iloc[0]) if len(here) else ""
 
 
@@ -159,8 +189,12 @@ def outlines(session: Session) -> list[tuple[str, Array]]:
 
 def _matrix(table: pd.DataFrame, words: list[str]) -> str:
     """The transitions as a matrix of the words that occur."""
-    seen = [word for word in words if (table.loc[table["from_action"] == word, "n_from"] > 0).any()
-            or (table.loc[table["to_action"] == word, "n"] > 0).any()]  # fmt: skip
+    seen = [
+        word
+        for word in words
+        if (table.loc[table["from_action"] == word, "n_from"] > 0).any()
+        or (table.loc[table["to_action"] == word, "n"] > 0).any()
+    ]
     if len(seen) < 2:
         return ""
     place = {word: k for k, word in enumerate(seen)}
@@ -179,8 +213,11 @@ def _matrix(table: pd.DataFrame, words: list[str]) -> str:
 
 
 def _activity(table: pd.DataFrame, words: list[str]) -> str:
-    parts = [(word, table[f"{word}_s"].to_numpy(float), figures.action_colour(k)) for k, word in enumerate(words)
-             if f"{word}_s" in table]  # fmt: skip
+    parts = [
+        (word, table[f"{word}_s"].to_numpy(float), figures.action_colour(k))
+        for k, word in enumerate(words)
+        if f"{word}_s" in table
+    ]
     numbers = (table[name].to_numpy(float) for name in ("start_s", "stop_s", "observed_s"))
     start_s, stop_s, observed_s = numbers
     return figures_sums.activity(start_s, stop_s, parts, observed_s)

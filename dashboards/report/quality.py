@@ -11,7 +11,12 @@ _LOST_SHARE, _DOUBTFUL_SHARE, _ERROR_SHARE, _NOISE_SHARE = 0.02, 0.05, 0.1, 1.0
 
 def warnings(session: Session) -> list[str]:
     """Sentences, the recording's own problems first; empty where there is nothing to warn of."""
-    return [*session.metadata["problems"], *_of_frames(session), *_of_flips(session), *_of_measures(session)]
+    return [
+        *session.metadata["problems"],
+        *_of_frames(session),
+        *_of_flips(session),
+        *_of_measures(session),
+    ]
 
 
 def _of_frames(session: Session) -> list[str]:
@@ -24,10 +29,17 @@ def _of_frames(session: Session) -> list[str]:
             "measured across them."
         )
     if lost > _LOST_SHARE * n:
-        found.append(f"{lost:,} frames ({lost / n:.1%}) have no pose; times and shares are of the rest.")
+        found.append(
+            f"{lost:,} frames ({lost / n:.1%}) have no pose; times and shares are of the rest."
+        )
     if doubtful > _DOUBTFUL_SHARE * n:
-        found.append(f"{doubtful:,} frames ({doubtful / n:.1%}) are doubtful: their predicted error is large.")
-    error, spine = session.frames["predicted_error_mm"].median(), session.frames["spine_mm"].median()
+        found.append(
+            f"{doubtful:,} frames ({doubtful / n:.1%}) are doubtful: their predicted error is large."
+        )
+    error, spine = (
+        session.frames["predicted_error_mm"].median(),
+        session.frames["spine_mm"].median(),
+    )
     if np.isfinite(error) and np.isfinite(spine) and error > _ERROR_SHARE * spine:
         found.append(
             f"The predicted joint error is {error:.1f} mm in the median, {error / spine:.0%} of the animal's length."
@@ -60,7 +72,9 @@ def _of_measures(session: Session) -> list[str]:
         )
     described = session.columns
     fps = session.metadata["frames"]["fps_median"] or 0.0
-    slow = described[(described["unreliable_below_fps"] > fps) & described["table"].isin(["kinematics", "bouts"])]
+    slow = described[
+        (described["unreliable_below_fps"] > fps) & described["table"].isin(["kinematics", "bouts"])
+    ]
     if len(slow):
         names = ", ".join(dict.fromkeys(slow["name"]))
         found.append(f"At {fps:.0f} frames/s these cannot be measured and are empty: {names}.")
@@ -70,17 +84,29 @@ def _of_measures(session: Session) -> list[str]:
 def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
     """What became of all frames that the camera should have taken: (what, share, number, class for its colour)."""
     frames = session.metadata["frames"]
-    doubtful, lost = int(frames["flags"].get("doubtful", 0)), frames["n_frames"] - frames["n_observed"]
+    doubtful, lost = (
+        int(frames["flags"].get("doubtful", 0)),
+        frames["n_frames"] - frames["n_observed"],
+    )
     parts = [
-        ("trusted pose", frames["n_observed"] - doubtful, "good"), ("doubtful pose", doubtful, "doubt"),
-        ("no pose", lost, "lost"), ("not delivered", frames["n_missing"], "gone"),
-    ]  # fmt: skip
+        ("trusted pose", frames["n_observed"] - doubtful, "good"),
+        ("doubtful pose", doubtful, "doubt"),
+        ("no pose", lost, "lost"),
+        ("not delivered", frames["n_missing"], "gone"),
+    ]
     total = max(sum(count for _, count, _ in parts), 1)
     return [(what, count / total, int(count), kind) for what, count, kind in parts]
 
 
 def flip_rows(session: Session) -> list[tuple[str, str, str, str]]:
     """The stretches in which head and tail may have been exchanged, at most twelve: (from, to, probability, what)."""
-    shown = session.flips.nlargest(12, "p_flip").sort_values("start_s") if len(session.flips) else session.flips
+    shown = (
+        session.flips.nlargest(12, "p_flip").sort_values("start_s")
+        if len(session.flips)
+        else session.flips
+    )
     rows = zip(shown["start_s"], shown["stop_s"], shown["p_flip"], shown["applied"], strict=True)
-    return [(f"{a:.2f}", f"{b:.2f}", f"{p:.2f}", "put right" if done else "left as it was") for a, b, p, done in rows]
+    return [
+        (f"{a:.2f}", f"{b:.2f}", f"{p:.2f}", "put right" if done else "left as it was")
+        for a, b, p, done in rows
+    ]

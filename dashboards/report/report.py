@@ -17,11 +17,19 @@ from .quality import flip_rows, frame_account, warnings
 
 TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = {
-    "frames": "frames.parquet", "poses": "poses.parquet", "rotations": "rotations.parquet",
-    "kinematics": "kinematics.parquet", "bouts": "bouts.parquet", "gaps": "gaps.parquet", "flips": "flips.parquet",
-    "sessions": "sessions.parquet", "summary": "summary.csv", "transitions": "transitions.parquet",
-    "activity": "activity.parquet", "zones": "zones.parquet",
-}  # fmt: skip
+    "frames": "frames.parquet",
+    "poses": "poses.parquet",
+    "rotations": "rotations.parquet",
+    "kinematics": "kinematics.parquet",
+    "bouts": "bouts.parquet",
+    "gaps": "gaps.parquet",
+    "flips": "flips.parquet",
+    "sessions": "sessions.parquet",
+    "summary": "summary.csv",
+    "transitions": "transitions.parquet",
+    "activity": "activity.parquet",
+    "zones": "zones.parquet",
+}
 
 
 def write_report(folder: str | Path) -> Path:
@@ -36,16 +44,22 @@ def render(session: Session) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     pages = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
         lstrip_blocks=True,
-    )  # fmt: skip
+    )
     words = list(session.metadata.get("actions", {}))
     return pages.get_template("report.html.j2").render(
         name=session.name,
         animal=session.metadata["animal"]["name"],
         headline=headline(session),
         cards=cards(session),
-        subject=", ".join(f"{name.replace('_', ' ')} {value}" for name, value in session.metadata["subject"].items()),
+        subject=", ".join(
+            f"{name.replace('_', ' ')} {value}"
+            for name, value in session.metadata["subject"].items()
+        ),
         warnings=warnings(session),
         account=frame_account(session),
         flips=flip_rows(session),
@@ -67,8 +81,15 @@ def render(session: Session) -> str:
 def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
     """The vocabulary: word, colour, meaning, and what the recording's frame rate cannot tell of it."""
     unresolved = session.metadata.get("unresolved_actions") or {}
-    return [(word, figures.action_colour(k), session.metadata["actions"][word], str(unresolved.get(word, "")))
-            for k, word in enumerate(words)]  # fmt: skip
+    return [
+        (
+            word,
+            figures.action_colour(k),
+            session.metadata["actions"][word],
+            str(unresolved.get(word, "")),
+        )
+        for k, word in enumerate(words)
+    ]
 
 
 def headline(session: Session) -> str:
@@ -92,7 +113,10 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
     if not session.has("summary.csv"):
         return good
     row = session.summary.iloc[0]
-    shown = [(f"{row['distance_m']:.2f}", "m", "distance"), (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed")]
+    shown = [
+        (f"{row['distance_m']:.2f}", "m", "distance"),
+        (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed"),
+    ]
     if "rear_count" in row and "tail_beat_hz" not in row:
         shown.append((f"{int(row['rear_count'])}", "", f"rears, {row['rear_s']:.1f} s in all"))
     elif np.isfinite(row.get("tail_beat_hz", np.nan)):
@@ -106,17 +130,32 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
         return []
     described = session.columns[session.columns["table"] == "summary"].set_index("name")
     row = session.summary.iloc[0]
-    elsewhere = {"session_id", "individual", *(f"{word}_{what}" for word in words for what, _ in _BUDGET)}
+    elsewhere = {
+        "session_id",
+        "individual",
+        *(f"{word}_{what}" for word in words for what, _ in _BUDGET),
+    }
     elsewhere |= {f"zone_{zone.name}_{what}" for zone in session.zones for what in ("s", "share")}
     return [
-        (name, f"{row[name]:.1%}" if name.endswith("_share") else _number(row[name]),
-         "" if name.endswith("_share") else str(described.loc[name, "unit"]), str(described.loc[name, "meaning"]))
-        for name in session.summary.columns if name not in elsewhere
-    ]  # fmt: skip
+        (
+            name,
+            f"{row[name]:.1%}" if name.endswith("_share") else _number(row[name]),
+            "" if name.endswith("_share") else str(described.loc[name, "unit"]),
+            str(described.loc[name, "meaning"]),
+        )
+        for name in session.summary.columns
+        if name not in elsewhere
+    ]
 
 
-_BUDGET = (("count", "bouts"), ("s", "time, s"), ("share", "share"), ("mean_s", "mean, s"),
-           ("per_min", "per minute"), ("latency_s", "first after, s"))  # fmt: skip
+_BUDGET = (
+    ("count", "bouts"),
+    ("s", "time, s"),
+    ("share", "share"),
+    ("mean_s", "mean, s"),
+    ("per_min", "per minute"),
+    ("latency_s", "first after, s"),
+)
 
 
 def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
@@ -128,8 +167,10 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
     for k, word in enumerate(words):
         if f"{word}_s" in row:  # sessions of an older version lack some of the others
             values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
-            texts = [f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
-                     for value, (what, _) in zip(values, _BUDGET, strict=True)]  # fmt: skip
+            texts = [
+                f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
+                for value, (what, _) in zip(values, _BUDGET, strict=True)
+            ]
             rows.append((word, figures.action_colour(k), texts))
     return rows
 
@@ -139,9 +180,19 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
     if not session.has("zones.parquet"):
         return []
     table = session.table("zones")
-    numbers = table[["time_s", "n_visits", "latency_s", "mean_visit_s", "distance_mm"]].to_numpy(float)
+    numbers = table[["time_s", "n_visits", "latency_s", "mean_visit_s", "distance_mm"]].to_numpy(
+        float
+    )
     return [
-        (str(name), [_number(row[0]), f"{share:.1%}", f"{row[1]:.0f}", *(_number(value) for value in row[2:])])
+        (
+            str(name),
+            [
+                _number(row[0]),
+                f"{share:.1%}",
+                f"{row[1]:.0f}",
+                *(_number(value) for value in row[2:]),
+            ],
+        )
         for name, share, row in zip(table["zone"], table["share"], numbers, strict=True)
     ]
 
@@ -150,24 +201,44 @@ def facts(session: Session) -> list[tuple[str, str]]:
     """Where the numbers come from: recording, camera, animal, software, cost."""
     about = session.metadata
     camera, frames, animal = about["camera"], about["frames"], about["animal"]
-    flags = ", ".join(f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items())
+    flags = ", ".join(
+        f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items()
+    )
     size = f"{animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else "unknown"
     memory, zones = about.get("peak_memory_mb"), ", ".join(zone.name for zone in session.zones)
     known = [
         ("Recording", f"{about['input']['name']} ({about['input']['format']})"),
         ("Input, sha256", about["input"]["sha256"]),
-        ("Animal", f"{about['individual']}, {animal['name']}, spine {size} ({animal.get('origin', 'origin unknown')})"),
-        ("Frames", f"{frames['n_frames']:,} recorded ({flags}); {frames['n_missing']} not delivered, in "
-         f"{frames['n_gaps']} gaps"),
-        ("Camera", f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy {camera['fy']:.1f}, "
-         f"cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px ({camera['source']}), {camera['floor_distance_mm']:.0f} mm "
-         "from the floor"),
+        (
+            "Animal",
+            f"{about['individual']}, {animal['name']}, spine {size} ({animal.get('origin', 'origin unknown')})",
+        ),
+        (
+            "Frames",
+            f"{frames['n_frames']:,} recorded ({flags}); {frames['n_missing']} not delivered, in "
+            f"{frames['n_gaps']} gaps",
+        ),
+        (
+            "Camera",
+            f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy {camera['fy']:.1f}, "
+            f"cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px ({camera['source']}), {camera['floor_distance_mm']:.0f} mm "
+            "from the floor",
+        ),
         ("Arena", f"{session.arena}{f'; zones: {zones}' if zones else ''}"),
-        ("Model", f"{about['model'].get('name', 'none')} {about['model'].get('sha256', '')[:16]}".strip()),
-        ("Software", ", ".join(f"{name} {v}" for name, v in about["versions"].items() if v != "unknown")),
-        ("Run", f"{about['timings_s']['total']:.1f} s, {about['frames_per_s']:.0f} frames/s"
-         + (f", peak memory {memory:.0f} MB" if memory else "")),
-    ]  # fmt: skip
+        (
+            "Model",
+            f"{about['model'].get('name', 'none')} {about['model'].get('sha256', '')[:16]}".strip(),
+        ),
+        (
+            "Software",
+            ", ".join(f"{name} {v}" for name, v in about["versions"].items() if v != "unknown"),
+        ),
+        (
+            "Run",
+            f"{about['timings_s']['total']:.1f} s, {about['frames_per_s']:.0f} frames/s"
+            + (f", peak memory {memory:.0f} MB" if memory else ""),
+        ),
+    ]
     if undone := _optics(session):
         known.insert(5, ("Optics", undone))
     subject = ", ".join(f"{name} {value}" for name, value in about["subject"].items())
@@ -179,7 +250,9 @@ def _optics(session: Session) -> str:
     optics = session.metadata["camera"].get("optics", {})
     undone = []
     if bent := optics.get("distortion"):
-        undone.append(f"the lens distortion ({bent['model']} {', '.join(f'{k:g}' for k in bent['coefficients'])})")
+        undone.append(
+            f"the lens distortion ({bent['model']} {', '.join(f'{k:g}' for k in bent['coefficients'])})"
+        )
     if water := optics.get("water"):
         undone.append(
             f"the refraction at a water surface {water['height_mm']:g} mm below the lens (index "
@@ -188,14 +261,21 @@ def _optics(session: Session) -> str:
     if optics.get("mirrored"):
         undone.append("the mirroring of the pictures")
     what = " and ".join(undone)
-    return f"{what} undone; camera and pictures are those of an ideal camera in air" if undone else ""
+    return (
+        f"{what} undone; camera and pictures are those of an ideal camera in air" if undone else ""
+    )
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
     """The longest gaps, at most twelve, in order of time: (from, to, frames, reason)."""
     shown = session.gaps.nlargest(12, "n_frames_missing").sort_values("start_s")
     return [
-        (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", str(row.n_frames_missing), str(row.reason).replace("_", " "))
+        (
+            f"{row.start_s:.2f}",
+            f"{row.stop_s:.2f}",
+            str(row.n_frames_missing),
+            str(row.reason).replace("_", " "),
+        )
         for row in shown.itertuples()
     ]
 
@@ -203,13 +283,30 @@ def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
 def methods(session: Session) -> list[str]:
     """Paragraphs for a methods section, from the run's own record."""
     about = session.metadata
-    camera, frames, animal, model = about["camera"], about["frames"], about["animal"], about["model"]
+    camera, frames, animal, model = (
+        about["camera"],
+        about["frames"],
+        about["animal"],
+        about["model"],
+    )
     error = session.frames["predicted_error_mm"].median()
     rate = f" at {frames['fps_median']:.1f} frames/s" if frames["fps_median"] else ""
-    learned = f" with the model {model['name']} (sha256 {model.get('sha256', '')[:16]})" if model.get("name") else ""
-    size = f"; the animal's length along them is {animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else ""
+    learned = (
+        f" with the model {model['name']} (sha256 {model.get('sha256', '')[:16]})"
+        if model.get("name")
+        else ""
+    )
+    size = (
+        f"; the animal's length along them is {animal['spine_mm']:.1f} mm"
+        if animal.get("spine_mm")
+        else ""
+    )
     origin = f" ({animal['origin']})" if size and animal.get("origin") else ""
-    known = f" The median joint error that the model predicts is {error:.1f} mm." if np.isfinite(error) else ""
+    known = (
+        f" The median joint error that the model predicts is {error:.1f} mm."
+        if np.isfinite(error)
+        else ""
+    )
     first = (
         f"Depth images of one {animal['name']} ({camera['width']} x {camera['height']} pixels, {frames['n_frames']:,} "
         f"frames{rate}, camera {camera['floor_distance_mm']:.0f} mm from the floor) were analysed with liex_lab "
@@ -229,9 +326,15 @@ def _by_hand(session: Session) -> list[str]:
     told = session.metadata.get("corrections")
     if not told:
         return []
-    kinds = {"flip": "head and tail exchanged over a stretch", "joint": "joints placed", "bout": "edits of bouts"}
+    kinds = {
+        "flip": "head and tail exchanged over a stretch",
+        "joint": "joints placed",
+        "bout": "edits of bouts",
+    }
     parts = ", ".join(f"{text}: {told[kind]}" for kind, text in kinds.items() if told.get(kind))
-    return [f"After measurement, {told['n']} corrections were made by hand by {', '.join(told['authors'])} ({parts})."]
+    return [
+        f"After measurement, {told['n']} corrections were made by hand by {', '.join(told['authors'])} ({parts})."
+    ]
 
 
 def _behaviour_methods(session: Session) -> list[str]:
@@ -254,8 +357,9 @@ def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
     columns = session.columns.astype(object).where(session.columns.notna(), "")
     return [
         (file, columns[columns["table"] == table].to_dict("records"))
-        for table, file in _TABLES.items() if session.has(file)
-    ]  # fmt: skip
+        for table, file in _TABLES.items()
+        if session.has(file)
+    ]
 
 
 def _number(value: Any) -> str:

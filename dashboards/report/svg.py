@@ -17,16 +17,42 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-WIDTH, LEFT, RIGHT = 920, 116, 22  # shared by all figures over time, so that their axes stand below each other
+WIDTH, LEFT, RIGHT = (
+    920,
+    116,
+    22,
+)  # shared by all figures over time, so that their axes stand below each other
 ARENA = "the arena"  # the outline that needs no name
 _MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
-ACTION_COLOURS = ("#EE6677", "#CCBB44", "#4477AA", "#BBBBBB", "#228833", "#66CCEE", "#AA3377", "#332288", "#999933",
-                  "#EE8866", "#44BB99", "#882255")  # fmt: skip
+ACTION_COLOURS = (
+    "#EE6677",
+    "#CCBB44",
+    "#4477AA",
+    "#BBBBBB",
+    "#228833",
+    "#66CCEE",
+    "#AA3377",
+    "#332288",
+    "#999933",
+    "#EE8866",
+    "#44BB99",
+    "#882255",
+)
 _VIRIDIS = np.array(
-    [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
-     [170, 220, 50], [253, 231, 37]], float
-)  # fmt: skip
+    [
+        [68, 1, 84],
+        [71, 44, 122],
+        [59, 81, 139],
+        [44, 113, 142],
+        [33, 144, 141],
+        [39, 173, 129],
+        [92, 200, 99],
+        [170, 220, 50],
+        [253, 231, 37],
+    ],
+    float,
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +75,9 @@ class Scale:
         power = 10.0 ** np.floor(np.log10(step))
         step = power * next(m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= 0.999 * step)
         first = np.ceil(self.low / step - 1e-9)
-        return [float(k * step) + 0.0 for k in np.arange(first, np.floor(self.high / step + 1e-9) + 1)]
+        return [
+            float(k * step) + 0.0 for k in np.arange(first, np.floor(self.high / step + 1e-9) + 1)
+        ]
 
 
 def time_scale(duration_s: float) -> Scale:
@@ -58,9 +86,15 @@ def time_scale(duration_s: float) -> Scale:
 
 
 def curve(
-    time_s: Array, values: Array, time: Scale, unit: str, colour: str, shaded: Sequence[tuple[float, float]] = (),
-    from_zero: bool = True, last: bool = False,
-) -> str:  # fmt: skip
+    time_s: Array,
+    values: Array,
+    time: Scale,
+    unit: str,
+    colour: str,
+    shaded: Sequence[tuple[float, float]] = (),
+    from_zero: bool = True,
+    last: bool = False,
+) -> str:
     """Values over time, broken where they are unknown; `shaded` spans (start, stop) in s; `last` writes the times."""
     top, bottom = 10.0, 110.0
     height = bottom + (34 if last else 10)
@@ -72,14 +106,22 @@ def curve(
     parts = [y_axis(scale, unit, 4), x_axis(time, bottom, top, last)]
     for start, stop in shaded:
         x0, x1 = float(time(start)), float(time(stop))
-        parts.append(f'<rect class="shade" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 0.5):.1f}" '
-                     f'height="{bottom - top}"/>')  # fmt: skip
-    parts += [f'<path class="curve" stroke="{colour}" d="{d}"/>' for d in _paths(time(time_s), scale(values))]
+        parts.append(
+            f'<rect class="shade" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 0.5):.1f}" '
+            f'height="{bottom - top}"/>'
+        )
+    parts += [
+        f'<path class="curve" stroke="{colour}" d="{d}"/>'
+        for d in _paths(time(time_s), scale(values))
+    ]
     return svg(WIDTH, height, parts)
 
 
 def lanes(
-    spans: Sequence[tuple[float, float, str]], words: Sequence[str], lost: Sequence[tuple[float, float]], time: Scale
+    spans: Sequence[tuple[float, float, str]],
+    words: Sequence[str],
+    lost: Sequence[tuple[float, float]],
+    time: Scale,
 ) -> str:
     """One row per word of the ethogram, its bouts as bars (start, stop, word) in s; times without a pose hatched."""
     row, top = 18.0, 6.0
@@ -89,11 +131,23 @@ def lanes(
         parts.append(_bar(time, start, stop, top, bottom - top, "url(#hatch)", "no pose"))
     for k, word in enumerate(words):
         y = top + k * row
-        parts.append(f'<text class="label" x="{LEFT - 8}" y="{y + row / 2 + 4:.1f}" text-anchor="end">'
-                     f"{escape(word.replace('_', ' '))}</text>")  # fmt: skip
+        parts.append(
+            f'<text class="label" x="{LEFT - 8}" y="{y + row / 2 + 4:.1f}" text-anchor="end">'
+            f"{escape(word.replace('_', ' '))}</text>"
+        )
         own = [(start, stop) for start, stop, action in spans if action == word]
         for start, stop in _merged(own, time):
-            parts.append(_bar(time, start, stop, y + 2, row - 4, action_colour(k), f"{word} {stop - start:.2f} s"))
+            parts.append(
+                _bar(
+                    time,
+                    start,
+                    stop,
+                    y + 2,
+                    row - 4,
+                    action_colour(k),
+                    f"{word} {stop - start:.2f} s",
+                )
+            )
     return svg(WIDTH, bottom + 8, [_HATCH, *parts])
 
 
@@ -110,7 +164,11 @@ def _merged(spans: Sequence[tuple[float, float]], time: Scale) -> list[tuple[flo
 
 
 def trajectory(
-    x_mm: Array, y_mm: Array, time_s: Array, outlines: Sequence[tuple[str, Array]] = (), size: int = 420
+    x_mm: Array,
+    y_mm: Array,
+    time_s: Array,
+    outlines: Sequence[tuple[str, Array]] = (),
+    size: int = 420,
 ) -> str:
     """The way over the floor seen from above, coloured by time from dark to light; y points up in the picture.
 
@@ -120,8 +178,14 @@ def trajectory(
     if not known.any():
         return svg(size, 40, ['<text class="label" x="10" y="24">no position is known</text>'])
     margin, plot = 52.0, size - 64.0
-    shown = [np.column_stack([x_mm[known], y_mm[known]]), *(corners for _, corners in outlines if len(corners))]
-    low, high = np.min([p.min(axis=0) for p in shown], axis=0), np.max([p.max(axis=0) for p in shown], axis=0)
+    shown = [
+        np.column_stack([x_mm[known], y_mm[known]]),
+        *(corners for _, corners in outlines if len(corners)),
+    ]
+    low, high = (
+        np.min([p.min(axis=0) for p in shown], axis=0),
+        np.max([p.max(axis=0) for p in shown], axis=0),
+    )
     middle = 0.5 * (low + high)
     reach = 0.55 * max(float((high - low).max()), 20.0)
     across = Scale(middle[0] - reach, middle[0] + reach, margin, margin + plot)
@@ -129,25 +193,33 @@ def trajectory(
     parts = [_frame(across, up)]
     for name, corners in outlines:
         places = " ".join(f"{float(across(x)):.1f},{float(up(y)):.1f}" for x, y in corners)
-        parts.append(f'<polygon class="outline" points="{places}"><title>{escape(name)}</title></polygon>')
+        parts.append(
+            f'<polygon class="outline" points="{places}"><title>{escape(name)}</title></polygon>'
+        )
     keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), _MAX_PLACES)).astype(int))
     x, y, t = across(x_mm)[keep], up(y_mm)[keep], time_s[keep]
     span = max(float(t[-1] - t[0]), 1e-9)
     for piece in np.array_split(np.arange(len(keep)), min(64, max(1, len(keep) // 2))):
         rows = np.append(piece, piece[-1] + 1)[: len(keep) - piece[0]]
         colour = viridis(0.92 * float(t[piece[0]] - t[0]) / span)
-        parts += [f'<path class="way" stroke="{colour}" d="{d}"/>' for d in _broken(x[rows], y[rows])]
+        parts += [
+            f'<path class="way" stroke="{colour}" d="{d}"/>' for d in _broken(x[rows], y[rows])
+        ]
     first, final = np.flatnonzero(known)[[0, -1]]
     for row, colour, word in ((first, viridis(0.0), "start"), (final, viridis(0.92), "end")):
         px, py = float(across(x_mm[row])), float(up(y_mm[row]))
-        parts.append(f'<circle class="mark" fill="{colour}" cx="{px:.1f}" cy="{py:.1f}" r="5">'
-                     f"<title>{word}</title></circle>")  # fmt: skip
+        parts.append(
+            f'<circle class="mark" fill="{colour}" cx="{px:.1f}" cy="{py:.1f}" r="5">'
+            f"<title>{word}</title></circle>"
+        )
         parts.append(_label_beside(px, py - 6.0, word, size - 52.0, 8.0))
     for name, corners in outlines:  # last, so that the way does not hide them
         if name != ARENA and len(corners):
             place = float(across(corners[:, 0].mean())), float(up(corners[:, 1].max())) + 13.0
-            parts.append(f'<text class="label halo" x="{place[0]:.1f}" y="{place[1]:.1f}" text-anchor="middle">'
-                         f"{escape(name)}</text>")  # fmt: skip
+            parts.append(
+                f'<text class="label halo" x="{place[0]:.1f}" y="{place[1]:.1f}" text-anchor="middle">'
+                f"{escape(name)}</text>"
+            )
     return svg(size, size, parts)
 
 
@@ -164,11 +236,15 @@ def histogram(values: Array, unit: str, colour: str, width: int = 420, height: i
     parts = [y_axis(up, "frames", 3, 52.0, width - 12.0), x_ticks(across, bottom, unit, 5)]
     for count, a, b in zip(counts, edges[:-1], edges[1:], strict=True):
         x0, x1, y = float(across(a)), float(across(b)), float(up(float(count)))
-        parts.append(f'<rect fill="{colour}" x="{x0 + 0.5:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 1, 0.5):.1f}" '
-                     f'height="{bottom - y:.1f}"/>')  # fmt: skip
+        parts.append(
+            f'<rect fill="{colour}" x="{x0 + 0.5:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 1, 0.5):.1f}" '
+            f'height="{bottom - y:.1f}"/>'
+        )
     at = float(across(float(np.median(known))))
     parts.append(f'<line class="median" x1="{at:.1f}" x2="{at:.1f}" y1="8" y2="{bottom}"/>')
-    parts.append(_label_beside(at, 18.0, f"median {float(np.median(known)):.2f} {unit}", width - 120.0, 5.0))
+    parts.append(
+        _label_beside(at, 18.0, f"median {float(np.median(known)):.2f} {unit}", width - 120.0, 5.0)
+    )
     return svg(width, height, parts)
 
 
@@ -177,31 +253,44 @@ def budget(shares: Sequence[tuple[str, float, str]]) -> str:
     parts, at = [], 0.0
     for word, share, colour in shares:
         if share > 0:
-            parts.append(f'<rect fill="{colour}" x="{at * WIDTH:.1f}" y="0" width="{share * WIDTH:.1f}" height="26">'
-                         f"<title>{escape(word)} {share:.1%}</title></rect>")  # fmt: skip
+            parts.append(
+                f'<rect fill="{colour}" x="{at * WIDTH:.1f}" y="0" width="{share * WIDTH:.1f}" height="26">'
+                f"<title>{escape(word)} {share:.1%}</title></rect>"
+            )
         at += share
     return svg(WIDTH, 26, parts)
 
 
 def picture(
-    depth: NDArray[np.uint16], uv: Array, bones: Sequence[tuple[int, int]], left: int, top: int, reach_mm: float
+    depth: NDArray[np.uint16],
+    uv: Array,
+    bones: Sequence[tuple[int, int]],
+    left: int,
+    top: int,
+    reach_mm: float,
 ) -> str:
     """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) over it.
 
     Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not take all the colours.
     """
     h, w = depth.shape
-    points = uv - [left, top] + 0.5  # the paper counts from the corner of the picture, we from a pixel's centre
+    points = (
+        uv - [left, top] + 0.5
+    )  # the paper counts from the corner of the picture, we from a pixel's centre
     r = w / 70.0
     parts = [f'<image href="{png_uri(shade(depth, reach_mm))}" width="{w}" height="{h}"/>']
     for a, b in bones:
         (x0, y0), (x1, y1) = points[a], points[b]
-        parts.append(f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="#fff" '
-                     f'stroke-width="{0.8 * r:.2f}"/>')  # fmt: skip
+        parts.append(
+            f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="#fff" '
+            f'stroke-width="{0.8 * r:.2f}"/>'
+        )
     for k, (x, y) in enumerate(points):
         fill = "#fff" if k < len(points) - 1 else "#EE6677"
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.2f}" fill="{fill}" stroke="#222" '
-                     f'stroke-width="{0.25 * r:.2f}"/>')  # fmt: skip
+        parts.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.2f}" fill="{fill}" stroke="#222" '
+            f'stroke-width="{0.25 * r:.2f}"/>'
+        )
     return svg(w, h, parts)
 
 
@@ -255,13 +344,19 @@ def _label_beside(x: float, y: float, text: str, right_until: float, away: float
     """A label to the right of x, or to the left of it where it would run out of the paper."""
     right = x <= right_until
     at, anchor = (x + away, "start") if right else (x - away, "end")
-    return f'<text class="label" x="{at:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+    return (
+        f'<text class="label" x="{at:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+    )
 
 
-def _bar(time: Scale, start: float, stop: float, y: float, height: float, fill: str, title: str) -> str:
+def _bar(
+    time: Scale, start: float, stop: float, y: float, height: float, fill: str, title: str
+) -> str:
     x0, x1 = float(time(start)), float(time(stop))
-    return (f'<rect fill="{fill}" x="{x0:.2f}" y="{y:.1f}" width="{max(x1 - x0, 0.5):.2f}" height="{height:.1f}">'
-            f"<title>{escape(title)}</title></rect>")  # fmt: skip
+    return (
+        f'<rect fill="{fill}" x="{x0:.2f}" y="{y:.1f}" width="{max(x1 - x0, 0.5):.2f}" height="{height:.1f}">'
+        f"<title>{escape(title)}</title></rect>"
+    )
 
 
 def y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WIDTH - RIGHT) -> str:
@@ -270,10 +365,14 @@ def y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WI
     for tick in scale.ticks(about):
         y = float(scale(tick))
         marks.append(f'<line class="grid" x1="{x0}" x2="{x1}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        marks.append(f'<text class="tick" x="{x0 - 6}" y="{y + 3.5:.1f}" text-anchor="end">{tick:g}</text>')
+        marks.append(
+            f'<text class="tick" x="{x0 - 6}" y="{y + 3.5:.1f}" text-anchor="end">{tick:g}</text>'
+        )
     middle = 0.5 * (scale.start + scale.stop)
-    label = (f'<text class="label" transform="translate({x0 - 42:.0f} {middle:.0f}) rotate(-90)" text-anchor="middle">'
-             f"{escape(unit)}</text>")  # fmt: skip
+    label = (
+        f'<text class="label" transform="translate({x0 - 42:.0f} {middle:.0f}) rotate(-90)" text-anchor="middle">'
+        f"{escape(unit)}</text>"
+    )
     return "".join(marks) + label
 
 
@@ -287,13 +386,17 @@ def x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
         marks.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>')
         if last:
             text = f"{tick:g} {unit}"
-            marks.append(f'<text class="tick" x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{text}</text>')
+            marks.append(
+                f'<text class="tick" x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{text}</text>'
+            )
     return "".join(marks)
 
 
 def x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
     """Ticks below a figure, with their unit."""
-    marks = [f'<line class="axis" x1="{scale.start}" x2="{scale.stop}" y1="{bottom}" y2="{bottom}"/>']
+    marks = [
+        f'<line class="axis" x1="{scale.start}" x2="{scale.stop}" y1="{bottom}" y2="{bottom}"/>'
+    ]
     marks += [
         f'<text class="tick" x="{float(scale(tick)):.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>'
         for tick in scale.ticks(about)
@@ -306,8 +409,10 @@ def x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
 def _frame(across: Scale, up: Scale) -> str:
     """A square plot's frame with millimetres on both sides."""
     bottom, top = up.start, up.stop
-    box = (f'<rect class="box" x="{across.start}" y="{top}" width="{across.stop - across.start}" '
-           f'height="{bottom - top}"/>')  # fmt: skip
+    box = (
+        f'<rect class="box" x="{across.start}" y="{top}" width="{across.stop - across.start}" '
+        f'height="{bottom - top}"/>'
+    )
     return box + y_axis(up, "mm", 5, across.start, across.stop) + x_ticks(across, bottom, "mm", 5)
 
 

@@ -12,7 +12,9 @@ from .svg import Array, Scale, svg, time_scale, x_axis, x_ticks, y_axis
 _WIDTH = 300.0
 
 
-def matrix(words: Sequence[str], probability: Array, chance: Array, significant: Array, counts: Array) -> str:
+def matrix(
+    words: Sequence[str], probability: Array, chance: Array, significant: Array, counts: Array
+) -> str:
     """From a row's action to a column's: the darker, the more probable; ▲ above and ▼ below chance where certain.
 
     All (k, k), NaN on the diagonal and where nothing followed.
@@ -22,9 +24,13 @@ def matrix(words: Sequence[str], probability: Array, chance: Array, significant:
     parts = []
     for k, word in enumerate(words):
         label, at = escape(word.replace("_", " ")), (k + 0.5) * cell
-        parts.append(f'<text class="label" x="{left - 8}" y="{top + at + 4:.1f}" text-anchor="end">{label}</text>')
+        parts.append(
+            f'<text class="label" x="{left - 8}" y="{top + at + 4:.1f}" text-anchor="end">{label}</text>'
+        )
         x, y = left + at, top - 8
-        parts.append(f'<text class="label" x="{x:.1f}" y="{y}" transform="rotate(-40 {x:.1f} {y})">{label}</text>')
+        parts.append(
+            f'<text class="label" x="{x:.1f}" y="{y}" transform="rotate(-40 {x:.1f} {y})">{label}</text>'
+        )
     for i, word in enumerate(words):
         for j, other in enumerate(words):
             x, y, p = left + j * cell, top + i * cell, probability[i, j]
@@ -34,37 +40,51 @@ def matrix(words: Sequence[str], probability: Array, chance: Array, significant:
                 continue
             mark = "" if not significant[i, j] else " ▲" if p > chance[i, j] else " ▼"
             title = f"{word} to {other}: {int(counts[i, j])} times, {p:.0%}; by chance {chance[i, j]:.0%}"
-            parts.append(f'<rect class="cell" fill-opacity="{0.06 + 0.94 * p:.3f}" {box}><title>{escape(title)}</title>'
-                         f'</rect><text class="{"inside" if p > 0.45 else "tick"}" x="{x + cell / 2:.1f}" '
-                         f'y="{y + cell / 2 + 4:.1f}" text-anchor="middle">{p:.0%}{mark}</text>')  # fmt: skip
+            parts.append(
+                f'<rect class="cell" fill-opacity="{0.06 + 0.94 * p:.3f}" {box}><title>{escape(title)}</title>'
+                f'</rect><text class="{"inside" if p > 0.45 else "tick"}" x="{x + cell / 2:.1f}" '
+                f'y="{y + cell / 2 + 4:.1f}" text-anchor="middle">{p:.0%}{mark}</text>'
+            )
     parts.append(f'<text class="tick" x="{left - 8}" y="14" text-anchor="end">followed by</text>')
     return svg(max(left + size + 70, 400.0), top + size + 6, parts)  # few words are not blown up
 
 
 def around(
-    time_s: Array, low: Array, median: Array, high: Array, unit: str, colour: str, limits: tuple[float, float]
+    time_s: Array,
+    low: Array,
+    median: Array,
+    high: Array,
+    unit: str,
+    colour: str,
+    limits: tuple[float, float],
 ) -> str:
     """Median and quartiles of a measure around the onset of an action, at 0 s."""
     width, bottom = _WIDTH, 110.0
     across = Scale(float(time_s[0]), float(time_s[-1]), 52.0, width - 8.0)
     up = Scale(limits[0], limits[1], bottom, 8.0)
     known = np.isfinite(median)
-    x, upper, lower, middle = (values[known] for values in (across(time_s), up(high), up(low), up(median)))
+    x, upper, lower, middle = (
+        values[known] for values in (across(time_s), up(high), up(low), up(median))
+    )
     band = " ".join(
-        f"{a:.1f},{b:.1f}" for a, b in [*zip(x, upper, strict=True), *zip(x[::-1], lower[::-1], strict=True)]
+        f"{a:.1f},{b:.1f}"
+        for a, b in [*zip(x, upper, strict=True), *zip(x[::-1], lower[::-1], strict=True)]
     )
     line = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, middle, strict=True))
     zero = float(across(0.0))
     parts = [
-        y_axis(up, unit, 3, 52.0, width - 8.0), x_ticks(across, bottom, "s from the onset", 6),
+        y_axis(up, unit, 3, 52.0, width - 8.0),
+        x_ticks(across, bottom, "s from the onset", 6),
         f'<polygon fill="{colour}" opacity="0.22" points="{band}"/>',
         f'<path class="curve thick" stroke="{colour}" d="M{line}"/>',
         f'<line class="median" x1="{zero:.1f}" x2="{zero:.1f}" y1="8" y2="{bottom}"/>',
-    ]  # fmt: skip
+    ]
     return svg(width, bottom + 34, parts)
 
 
-def activity(start_s: Array, stop_s: Array, parts_s: Sequence[tuple[str, Array, str]], observed_s: Array) -> str:
+def activity(
+    start_s: Array, stop_s: Array, parts_s: Sequence[tuple[str, Array, str]], observed_s: Array
+) -> str:
     """Stacked shares of the observed time per interval: (word, seconds (k,), colour)."""
     time = time_scale(float(stop_s[-1]))
     top, bottom = 8.0, 96.0
@@ -76,8 +96,10 @@ def activity(start_s: Array, stop_s: Array, parts_s: Sequence[tuple[str, Array, 
         for a, b, low, part in zip(start_s, stop_s, below, share, strict=True):
             if part > 0:
                 x0, x1, y = float(time(a)), float(time(b)), float(up(min(low + part, 1.0)))
-                drawn.append(f'<rect fill="{colour}" x="{x0:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 0.6, 0.4):.1f}" '
-                             f'height="{max(float(up(low)) - y, 0.0):.1f}"><title>{escape(word)} {part:.0%}</title>'
-                             "</rect>")  # fmt: skip
+                drawn.append(
+                    f'<rect fill="{colour}" x="{x0:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 0.6, 0.4):.1f}" '
+                    f'height="{max(float(up(low)) - y, 0.0):.1f}"><title>{escape(word)} {part:.0%}</title>'
+                    "</rect>"
+                )
         below += share
     return svg(time.stop + 22.0, bottom + 34, drawn)

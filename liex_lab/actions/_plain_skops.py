@@ -30,12 +30,18 @@ def write_plain(document: Any, path: str | Path) -> None:
     with zipfile.ZipFile(BytesIO(io.dumps(document))) as packed:
         schema = packed.read("schema.json").decode()
         arrays = {name: packed.read(name) for name in packed.namelist() if name.endswith(".npy")}
-    number = {found: k + 1 for k, found in enumerate(dict.fromkeys(at for _, at in _ADDRESS.findall(schema)))}
+    number = {
+        found: k + 1
+        for k, found in enumerate(dict.fromkeys(at for _, at in _ADDRESS.findall(schema)))
+    }
     schema = _ADDRESS.sub(lambda found: f"{found[1]}{number[found[2]]}", schema)
     contents = {f"{number[name.removesuffix('.npy')]}.npy": arrays[name] for name in arrays}
     names = sorted(contents, key=lambda name: int(name.removesuffix(".npy")))
     with zipfile.ZipFile(path, "w") as packed:
-        for name, content in [*((name, contents[name]) for name in names), ("schema.json", schema.encode())]:
+        for name, content in [
+            *((name, contents[name]) for name in names),
+            ("schema.json", schema.encode()),
+        ]:
             packed.writestr(zipfile.ZipInfo(name, _THE_DAY), content, zipfile.ZIP_DEFLATED)
 
 
@@ -61,4 +67,6 @@ def _value(node: Any, packed: zipfile.ZipFile, depth: int) -> Any:
     if kind == "NdArrayNode" and node.get("type") == "numpy":
         with packed.open(node["file"]) as file:
             return np.lib.format.read_array(file, allow_pickle=False)
-    raise ValueError(f"it holds a {kind}, and an action model is made of tables, lists, words and arrays alone")
+    raise ValueError(
+        f"it holds a {kind}, and an action model is made of tables, lists, words and arrays alone"
+    )

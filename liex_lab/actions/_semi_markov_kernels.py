@@ -25,7 +25,9 @@ def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, sta
     fresh = np.empty(total)
     if start == 0:
         for k in range(n):
-            value[first[k] : first[k + 1]] = scores[0, k] - np.log(total)  # it may begin in the middle of one
+            value[first[k] : first[k + 1]] = scores[0, k] - np.log(
+                total
+            )  # it may begin in the middle of one
             came_from[0, k], stayed[0, k] = 0, False
     for t in range(max(start, 1), stop):
         for k in range(n):

@@ -38,15 +38,33 @@ class Stretch:
 def channel_names(skeleton: Skeleton) -> list[str]:
     """What the columns of a stretch are, see `stretches_of`; those that end in ~ change sign in a mirror."""
     pitches = [f"pitch_{k}" for k in range(_GROUPS)] if skeleton.axes[1:, 1].any() else []
-    floor = ["tip_height", "middle_height", "base_height", "tip_over_base"] if _stands(skeleton) else []
-    return ["forward", "sideways~", "upward", "speed", "yaw_rate~", "climb", "climb_rate", "straightness", "length",
-            *(f"bend_{k}~" for k in range(_GROUPS)), *(f"bend_rate_{k}~" for k in range(_GROUPS)), *pitches,
-            *(f"{p}_rate" for p in pitches), "twist", *floor, "wall", "doubt"]  # fmt: skip
+    floor = (
+        ["tip_height", "middle_height", "base_height", "tip_over_base"] if _stands(skeleton) else []
+    )
+    return [
+        "forward",
+        "sideways~",
+        "upward",
+        "speed",
+        "yaw_rate~",
+        "climb",
+        "climb_rate",
+        "straightness",
+        "length",
+        *(f"bend_{k}~" for k in range(_GROUPS)),
+        *(f"bend_rate_{k}~" for k in range(_GROUPS)),
+        *pitches,
+        *(f"{p}_rate" for p in pitches),
+        "twist",
+        *floor,
+        "wall",
+        "doubt",
+    ]
 
 
 def stretches_of(
     track: Track, rate_hz: float, wall_mm: Array | None = None, room: Room = np.empty
-) -> list[Stretch]:  # fmt: skip
+) -> list[Stretch]:
     """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal from a wall; room:
     where the channels are to lie.
     """
@@ -61,8 +79,12 @@ def stretches_of(
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
-    return [_stretch(track, rows, time_s, wall, (length_mm, usual_mm), _clock(time_s[rows], rate_hz), room)
-            for rows in np.split(good, cuts)]  # fmt: skip
+    return [
+        _stretch(
+            track, rows, time_s, wall, (length_mm, usual_mm), _clock(time_s[rows], rate_hz), room
+        )
+        for rows in np.split(good, cuts)
+    ]
 
 
 def _usual_step(time_s: Array) -> float:
@@ -71,7 +93,9 @@ def _usual_step(time_s: Array) -> float:
 
 def _clock(time_s: Array, rate_hz: float) -> Array:
     """(m,) s from the first to the last of these times."""
-    return time_s[0] + np.arange(max(2, int((time_s[-1] - time_s[0]) * rate_hz + 1e-6) + 1)) / rate_hz
+    return (
+        time_s[0] + np.arange(max(2, int((time_s[-1] - time_s[0]) * rate_hz + 1e-6) + 1)) / rate_hz
+    )
 
 
 def _stands(skeleton: Skeleton) -> bool:
@@ -109,7 +133,9 @@ class _OnClock:
     A faster camera is averaged over what falls to each tick, a slower one interpolated, linearly; ends are held.
     """
 
-    def __init__(self, track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array) -> None:
+    def __init__(
+        self, track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array
+    ) -> None:
         self._track, self._rows, self._wall = track, rows, wall
         times, step, n = time_s[rows], clock[1] - clock[0], len(rows)
         self._starts: NDArray[np.int64] | None = None  # of the rows that fall to one tick
@@ -134,28 +160,48 @@ class _OnClock:
             seen = self._measured(first, int(low[-1]) + 2)
             out = seen[low - first] * (1.0 - share) + seen[low - first + 1] * share
         j = self._track.skeleton.n_joints
-        return out[:, : 3 * j].reshape(-1, j, 3), out[:, 3 * j : 6 * j].reshape(-1, j, 3), out[:, -2], out[:, -1]
+        return (
+            out[:, : 3 * j].reshape(-1, j, 3),
+            out[:, 3 * j : 6 * j].reshape(-1, j, 3),
+            out[:, -2],
+            out[:, -1],
+        )
 
     def _measured(self, first: int, stop: int) -> Array:
         """Columns (k, 6 J + 2) of measurements first to stop, each of a frame or of those of a tick."""
         starts = None if self._starts is None else self._starts[first : stop + 1]
-        track, rows = self._track, self._rows[first:stop] if starts is None else self._rows[starts[0] : starts[-1]]
+        track, rows = (
+            self._track,
+            self._rows[first:stop] if starts is None else self._rows[starts[0] : starts[-1]],
+        )
         n = len(rows)
         distance = np.nan_to_num(self._wall[rows], nan=1e6)
         error = np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)
         columns = np.concatenate(
-            [track.joints_mm[rows].reshape(n, -1), track.angles_rad[rows].reshape(n, -1), distance[:, None],
-             error[:, None]], axis=1,
-        )  # fmt: skip
+            [
+                track.joints_mm[rows].reshape(n, -1),
+                track.angles_rad[rows].reshape(n, -1),
+                distance[:, None],
+                error[:, None],
+            ],
+            axis=1,
+        )
         if starts is None:
             return columns
-        return np.asarray(np.add.reduceat(columns, starts[:-1] - starts[0]) / np.diff(starts)[:, None])
+        return np.asarray(
+            np.add.reduceat(columns, starts[:-1] - starts[0]) / np.diff(starts)[:, None]
+        )
 
 
 def _stretch(
-    track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, units_mm: tuple[float, float], clock: Array,
+    track: Track,
+    rows: NDArray[np.int64],
+    time_s: Array,
+    wall: Array,
+    units_mm: tuple[float, float],
+    clock: Array,
     room: Room,
-) -> Stretch:  # fmt: skip
+) -> Stretch:
     """The channels of an unbroken stretch, a piece after the other. units_mm: the length and the usual error."""
     found, m = _OnClock(track, rows, time_s, wall, clock), len(clock)
     heading, steep = np.empty(m), np.empty(m, np.bool_)
@@ -185,9 +231,15 @@ def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.boo
 
 
 def _channels(
-    skeleton: Skeleton, units_mm: tuple[float, float], step: float, heading: Array, joints: Array, angles: Array,
-    wall: Array, error: Array,
-) -> Array:  # fmt: skip
+    skeleton: Skeleton,
+    units_mm: tuple[float, float],
+    step: float,
+    heading: Array,
+    joints: Array,
+    angles: Array,
+    wall: Array,
+    error: Array,
+) -> Array:
     """Channels (m, C) of headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and predicted
     errors (m,) mm on a clock whose ticks are `step` s apart.
     """
@@ -203,9 +255,19 @@ def _channels(
     straight = np.linalg.norm(joints[:, -1] - joints[:, 0], axis=1) / np.maximum(bones, 1e-9)
     groups = np.array_split(np.arange(1, skeleton.n_joints - 1), _GROUPS)
     bend = np.stack([angles[:, group, 2].sum(axis=1) for group in groups], axis=1)
-    columns = [forward, sideways, velocity[:, 2], np.linalg.norm(velocity, axis=1), _rate(_softened(heading), step),
-               climb, _rate(_softened(climb), step), straight, bones / length_mm - 1.0, bend,
-               _rate(_softened(bend), step)]  # fmt: skip
+    columns = [
+        forward,
+        sideways,
+        velocity[:, 2],
+        np.linalg.norm(velocity, axis=1),
+        _rate(_softened(heading), step),
+        climb,
+        _rate(_softened(climb), step),
+        straight,
+        bones / length_mm - 1.0,
+        bend,
+        _rate(_softened(bend), step),
+    ]
     if skeleton.axes[1:, 1].any():
         pitch = np.stack([angles[:, group, 1].sum(axis=1) for group in groups], axis=1)
         columns += [pitch, _rate(_softened(pitch), step)]
@@ -213,14 +275,19 @@ def _channels(
     if _stands(skeleton):
         z = joints[..., 2] / length_mm
         columns += [z[:, -1], z.mean(axis=1), z[:, 0], z[:, -1] - z[:, 0]]
-    columns += [np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)), np.log1p(_DOUBT * error / usual_mm)]
+    columns += [
+        np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)),
+        np.log1p(_DOUBT * error / usual_mm),
+    ]
     return np.concatenate([c[:, None] if c.ndim == 1 else c for c in columns], axis=1)
 
 
 def _twist(joints: Array, length_mm: float, step: float) -> Array:
     """(m,) lengths a second: how fast the joints move against the body's middle, of whatever part."""
     own = (joints - joints.mean(axis=1, keepdims=True)) / length_mm
-    return np.asarray(np.sqrt((_rate(_softened(own.reshape(len(own), -1)), step) ** 2).mean(axis=1) * 3.0))
+    return np.asarray(
+        np.sqrt((_rate(_softened(own.reshape(len(own), -1)), step) ** 2).mean(axis=1) * 3.0)
+    )
 
 
 def _softened(rows: Array) -> Array:

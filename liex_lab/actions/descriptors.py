@@ -25,13 +25,20 @@ _PYRAMID = (4, 2, 1)  # equal parts, each described by its mean and standard dev
 def tangent_descriptor(track: Track) -> Array:
     """(252,) of a sequence: the temporal pyramid over its tangent vectors. Frames without a pose are left out."""
     root, angles = _resampled(track)
-    now, following = (SE3(root.rotation[part], root.translation[part]) for part in (slice(None, -1), slice(1, None)))
+    now, following = (
+        SE3(root.rotation[part], root.translation[part])
+        for part in (slice(None, -1), slice(1, None))
+    )
     step = (now.inverse() @ following).log()
     base = np.concatenate([step, step[-1:]])
     change = np.diff(angles, axis=0)
     change = np.concatenate([change, change[-1:]])
     middle = 1 + (track.skeleton.n_joints - 1) // 2  # joints 1-10 of the fish, the rest after them
-    halves = [rows[:, part].mean(axis=1) for part in (slice(1, middle), slice(middle, -1)) for rows in (angles, change)]
+    halves = [
+        rows[:, part].mean(axis=1)
+        for part in (slice(1, middle), slice(middle, -1))
+        for rows in (angles, change)
+    ]
     return pyramid(np.concatenate([base, *halves], axis=1))
 
 

@@ -42,7 +42,9 @@ class Ethogram:
         last = None
         for bout in self.bouts:
             if bout.stop_ns <= bout.start_ns:
-                raise LiexError(f"a bout of {bout.action} stops at {bout.stop_ns} ns, which is not after its start")
+                raise LiexError(
+                    f"a bout of {bout.action} stops at {bout.stop_ns} ns, which is not after its start"
+                )
             if last is not None and bout.start_ns < last.stop_ns:
                 raise LiexError(
                     f"bouts overlap: {last.action} stops at {last.stop_ns} ns, but {bout.action} starts at "
@@ -69,11 +71,14 @@ class Ethogram:
 
     @staticmethod
     def of_words(
-        words: Sequence[str] | NDArray[np.str_] | NDArray[np.int64], times_ns: NDArray[np.int64],
+        words: Sequence[str] | NDArray[np.str_] | NDArray[np.int64],
+        times_ns: NDArray[np.int64],
         vocabulary: Mapping[str, str] | None = None,
-        score: NDArray[np.float64] | None = None, part: NDArray[np.int64] | None = None, source: str = "model",
+        score: NDArray[np.float64] | None = None,
+        part: NDArray[np.int64] | None = None,
+        source: str = "model",
         names: Sequence[str] | None = None,
-    ) -> Ethogram:  # fmt: skip
+    ) -> Ethogram:
         """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never leaves its `part`
         (n,), the unbroken stretch of the recording that it lies in; names: `words` are places in it.
         """

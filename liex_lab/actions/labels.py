@@ -30,7 +30,9 @@ def read_labels(path: str | Path) -> pd.DataFrame:
     try:
         table = pd.read_parquet(source) if source.suffix == ".parquet" else pd.read_csv(source)
     except (OSError, ValueError) as error:
-        raise LiexError(f"{source} should be a table of bouts, as CSV or parquet, but: {one_line(error)}") from None
+        raise LiexError(
+            f"{source} should be a table of bouts, as CSV or parquet, but: {one_line(error)}"
+        ) from None
     lacking = [name for name in _NEEDED if name not in table]
     if lacking:
         raise LiexError(
@@ -51,23 +53,31 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
             f"{origin}: each bout starts before it stops, in seconds; the one of {row['action']} in row {wrong[0] + 1} "
             f"has start_s={row['start_s']} and stop_s={row['stop_s']}"
         )
-    out = table.reset_index(drop=True).assign(action=table["action"].to_numpy().astype(str), **times)
+    out = table.reset_index(drop=True).assign(
+        action=table["action"].to_numpy().astype(str), **times
+    )
     return out.sort_values("start_s", kind="stable").reset_index(drop=True)
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
     """A column (n,) as numbers, NaN where there is none."""
     plain = column.dtype.kind in "iuf"
-    return np.asarray(pd.to_numeric(column if plain else column.astype(str), errors="coerce").to_numpy(np.float64))
+    return np.asarray(
+        pd.to_numeric(column if plain else column.astype(str), errors="coerce").to_numpy(np.float64)
+    )
 
 
-def words_of(table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str = "") -> NDArray[np.str_]:
+def words_of(
+    table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str = ""
+) -> NDArray[np.str_]:
     """(n,) the word of each frame at time_s (n,), UNLABELLED outside all bouts of that session."""
     if "session_id" in table and session_id:
         table = table[table["session_id"].astype(str) == session_id]
     longest = max([len(word) for word in table["action"]], default=1)
     out = np.full(len(time_s), UNLABELLED, dtype=f"<U{max(1, longest)}")
-    for action, start_s, stop_s in zip(table["action"], table["start_s"], table["stop_s"], strict=True):
+    for action, start_s, stop_s in zip(
+        table["action"], table["start_s"], table["stop_s"], strict=True
+    ):
         start, stop = np.searchsorted(time_s, [start_s - 1e-6, stop_s - 1e-6])
         out[start:stop] = action
     return out
@@ -102,7 +112,9 @@ class LabelledTrack:
         """Some of its frames."""
         assert self.wall_mm is not None
         truth = None if self.truth is None else self.truth[rows]
-        return LabelledTrack(some_rows(self.track, rows), self.words[rows], self.animal, self.wall_mm[rows], truth)
+        return LabelledTrack(
+            some_rows(self.track, rows), self.words[rows], self.animal, self.wall_mm[rows], truth
+        )
 
 
 def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:

@@ -26,15 +26,22 @@ _WEIGHT_DECAY = 2e-3
 _RATE, _LEAST_RATE = 1.5e-3, 1e-5
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
-_USUAL, _LEAST_PEAK = (0.005, 0.99), 0.01  # quantiles of the speeds of a word, and of its bouts' highest ones
+_USUAL, _LEAST_PEAK = (
+    (0.005, 0.99),
+    0.01,
+)  # quantiles of the speeds of a word, and of its bouts' highest ones
 _FAST = 1.0  # lengths a second, in the mean of a bout: an action that goes fast
 _NEVER = -30.0  # what a network says of a word that it has not seen
 
 
 def learn(
-    tracks: Sequence[LabelledTrack], *, seed: int = 0, definitions: dict[str, str] | None = None,
-    sequences: Sequence[LabelledTrack] = (), progress: Progress = silent,
-) -> TimelineModel:  # fmt: skip
+    tracks: Sequence[LabelledTrack],
+    *,
+    seed: int = 0,
+    definitions: dict[str, str] | None = None,
+    sequences: Sequence[LabelledTrack] = (),
+    progress: Progress = silent,
+) -> TimelineModel:
     """A recogniser from labelled tracks; sequences: single actions cut out of somewhere, without their surroundings."""
     words = vocabulary_of([*tracks, *sequences])
     clock_hz = clock_of(tracks[0].track.skeleton)
@@ -46,7 +53,15 @@ def learn(
     speeds, peaks = speeds_of(examples, len(words)), peaks_of(examples, len(words))
     chain = ActionChain.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
-        tracks[0].track.skeleton.name, clock_hz, words, share, networks, chain, _SHARPNESS, speeds, peaks,
+        tracks[0].track.skeleton.name,
+        clock_hz,
+        words,
+        share,
+        networks,
+        chain,
+        _SHARPNESS,
+        speeds,
+        peaks,
         definitions or {},
     )
 
@@ -77,7 +92,10 @@ def peaks_of(examples: Examples, n_words: int) -> Array:
     """
     least = np.zeros(n_words)
     starts, stops, codes = runs_of(examples.code + n_words * examples.recording)
-    peak, mean = np.maximum.reduceat(examples.speed, starts), np.add.reduceat(examples.speed, starts) / (stops - starts)
+    peak, mean = (
+        np.maximum.reduceat(examples.speed, starts),
+        np.add.reduceat(examples.speed, starts) / (stops - starts),
+    )
     for k in range(1, n_words):  # 0 is UNLABELLED
         own = codes % n_words == k
         if own.any() and np.median(mean[own]) > _FAST:
@@ -96,18 +114,26 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
     present = np.unique(code)  # of the vocabulary; stretches without a name may be missing
     (first, (weights, bias)) = descend(
-        inputs, code, (_HIDDEN,), epochs=epochs, batch=batch, rate=_RATE, least_rate=_LEAST_RATE,
-        weight_decay=_WEIGHT_DECAY, seed=seed,
-    )  # fmt: skip
+        inputs,
+        code,
+        (_HIDDEN,),
+        epochs=epochs,
+        batch=batch,
+        rate=_RATE,
+        least_rate=_LEAST_RATE,
+        weight_decay=_WEIGHT_DECAY,
+        seed=seed,
+    )
     if len(present) == 2:  # one number decides between two words
         weights, bias = np.hstack([0 * weights, weights]), np.hstack([0 * bias, bias])
     last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
     last[0][:, present], last[1][present] = weights, bias
     layers = first, last
     return Network(
-        centre.astype(np.float32), scale.astype(np.float32),
+        centre.astype(np.float32),
+        scale.astype(np.float32),
         tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers),
-    )  # fmt: skip
+    )
 
 
 def leave_one_animal_out(
@@ -116,18 +142,28 @@ def leave_one_animal_out(
     """Scores on each animal of a recogniser that learned from the others."""
     animals = sorted({one.animal for one in tracks})
     if len(animals) < 2:
-        return {"animals": len(animals), "note": "one animal only: nobody knows how well this works on another"}
+        return {
+            "animals": len(animals),
+            "note": "one animal only: nobody knows how well this works on another",
+        }
     words = vocabulary_of(tracks)
     held_out: dict[str, Any] = {}
     pairs: list[tuple[LabelledTrack, NDArray[np.str_]]] = []
     for k, animal in enumerate(animals):
         progress(k, len(animals), f"learning without {animal}")
         model = learn([one for one in tracks if one.animal != animal], seed=seed)
-        own = [(one, model.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns))
-               for one in tracks if one.animal == animal]  # fmt: skip
+        own = [
+            (one, model.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns))
+            for one in tracks
+            if one.animal == animal
+        ]
         held_out[animal] = timeline_scores(own, words)["macro_f1"]
         pairs += own
-    return {"animals": len(animals), "macro_f1_by_animal": held_out, **timeline_scores(pairs, words)}
+    return {
+        "animals": len(animals),
+        "macro_f1_by_animal": held_out,
+        **timeline_scores(pairs, words),
+    }
 
 
 def with_card(model: TimelineModel, **facts: Any) -> TimelineModel:

@@ -14,7 +14,10 @@ from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
-DESCRIPTORS: dict[str, Callable[[Track], Array]] = {"tangent": tangent_descriptor, "joints": position_descriptor}
+DESCRIPTORS: dict[str, Callable[[Track], Array]] = {
+    "tangent": tangent_descriptor,
+    "joints": position_descriptor,
+}
 _TREES, _DEPTH = 50, 20
 
 

@@ -15,7 +15,9 @@ Array = NDArray[np.float64]
 Words = NDArray[np.str_]
 
 
-def timeline_scores(pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequence[str]) -> dict[str, Any]:
+def timeline_scores(
+    pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequence[str]
+) -> dict[str, Any]:
     """Scores of recognised words (n,) beside the labels of their tracks.
 
     macro_f1: mean over the actions of their frame-wise F1; segment_f1_50: F1 of bouts, of which one is right where it
@@ -35,27 +37,38 @@ def timeline_scores(pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequenc
                 total[word] += n
     per_action = {
         word or "unlabelled": {
-            "f1": _f1(*frames[word]), "precision": _share(frames[word][0], frames[word][1]),
+            "f1": _f1(*frames[word]),
+            "precision": _share(frames[word][0], frames[word][1]),
             "recall": _share(frames[word][0], frames[word][2]),
-            **({"segment_f1_50": _f1(hits[word], found[word], true[word]), "bouts": true[word]} if word else {}),
+            **(
+                {"segment_f1_50": _f1(hits[word], found[word], true[word]), "bouts": true[word]}
+                if word
+                else {}
+            ),
         }
         for word in words
-    }  # fmt: skip
+    }
     seen = [word for word in named if frames[word][2] > 0]
     return {
-        "macro_f1": float(np.mean([per_action[word]["f1"] for word in seen])) if seen else float("nan"),
+        "macro_f1": float(np.mean([per_action[word]["f1"] for word in seen]))
+        if seen
+        else float("nan"),
         "segment_f1_50": _f1(sum(hits.values()), sum(found.values()), sum(true.values())),
         "per_action": per_action,
     }
 
 
-def match_bouts(true: NDArray[np.bool_], found: NDArray[np.bool_], overlap: float = 0.5) -> tuple[int, int, int]:
+def match_bouts(
+    true: NDArray[np.bool_], found: NDArray[np.bool_], overlap: float = 0.5
+) -> tuple[int, int, int]:
     """How many runs of `found` (n,) match a run of `true` (n,), how many were found, and how many there are."""
     spans, guesses = _spans(true), _spans(found)
     taken, hits = set(), 0
     for start, stop in guesses:
         shares = [
-            (min(stop, b) - max(start, a)) / (max(stop, b) - min(start, a)) if min(stop, b) > max(start, a) else 0.0
+            (min(stop, b) - max(start, a)) / (max(stop, b) - min(start, a))
+            if min(stop, b) > max(start, a)
+            else 0.0
             for a, b in spans
         ]
         best = int(np.argmax(shares)) if shares else -1

@@ -42,12 +42,16 @@ class ActionChain:
         np.fill_diagonal(counts, 0.0)
         shortest = np.array([np.quantile(some, _SHORT) if some else 0.1 for some in lengths])
         mean = np.array([np.mean(some) if some else 0.5 for some in lengths])
-        return ActionChain(shortest, np.maximum(mean, shortest), counts / counts.sum(axis=1, keepdims=True))
+        return ActionChain(
+            shortest, np.maximum(mean, shortest), counts / counts.sum(axis=1, keepdims=True)
+        )
 
     def _terms(self, step_s: float) -> tuple[NDArray[np.int64], Array, Array, Array]:
         """What the kernels want to know, on a clock with this step."""
         least = np.maximum(np.round(self.shortest_s / step_s).astype(np.int64), 1)
-        more = np.maximum(self.mean_s / step_s - least, 0.5)  # ticks spent in the last state beyond the first
+        more = np.maximum(
+            self.mean_s / step_s - least, 0.5
+        )  # ticks spent in the last state beyond the first
         go = more / (1.0 + more)
         with np.errstate(divide="ignore"):
             switch = np.maximum(np.log(self.follow), -1e30)

@@ -24,16 +24,26 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
     target = Path(path).with_suffix(SUFFIX)
     target.parent.mkdir(parents=True, exist_ok=True)
     document: dict[str, Any] = {
-        "format": _FORMAT, "skeleton": model.skeleton, "clock_hz": model.clock_hz, "words": list(model.words),
-        "share": model.share, "sharpness": model.sharpness, "speeds": model.speeds,
-        "peaks": model.peaks, "definitions": dict(model.definitions),
+        "format": _FORMAT,
+        "skeleton": model.skeleton,
+        "clock_hz": model.clock_hz,
+        "words": list(model.words),
+        "share": model.share,
+        "sharpness": model.sharpness,
+        "speeds": model.speeds,
+        "peaks": model.peaks,
+        "definitions": dict(model.definitions),
         "card": dict(model.card),
         "chain": {name: getattr(model.chain, name) for name in ActionChain.__dataclass_fields__},
         "networks": [
-            {"centre": n.centre, "scale": n.scale, "layers": [[w.astype(np.float32), b] for w, b in n.layers]}
+            {
+                "centre": n.centre,
+                "scale": n.scale,
+                "layers": [[w.astype(np.float32), b] for w, b in n.layers],
+            }
             for n in model.networks
         ],
-    }  # fmt: skip
+    }
     unfinished = target.with_name(f"{target.name}.part")
     write_plain(document, unfinished)
     unfinished.replace(target)
@@ -50,16 +60,31 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
                 f"the action model {path} has format {document['format']}, this liex_lab reads {_WITHOUT_PEAKS} and "
                 f"{_FORMAT}"
             )
-        peaks = np.zeros(len(document["words"])) if document["format"] == _WITHOUT_PEAKS else document["peaks"]
-        chain = ActionChain(*(np.asarray(document["chain"][name]) for name in ActionChain.__dataclass_fields__))
+        peaks = (
+            np.zeros(len(document["words"]))
+            if document["format"] == _WITHOUT_PEAKS
+            else document["peaks"]
+        )
+        chain = ActionChain(
+            *(np.asarray(document["chain"][name]) for name in ActionChain.__dataclass_fields__)
+        )
         networks = tuple(
-            Network(n["centre"], n["scale"], tuple((w, b) for w, b in n["layers"])) for n in document["networks"]
+            Network(n["centre"], n["scale"], tuple((w, b) for w, b in n["layers"]))
+            for n in document["networks"]
         )
         return TimelineModel(
-            document["skeleton"], float(document["clock_hz"]), tuple(document["words"]), document["share"], networks,
-            chain, float(document["sharpness"]), document["speeds"], peaks, document["definitions"],
+            document["skeleton"],
+            float(document["clock_hz"]),
+            tuple(document["words"]),
+            document["share"],
+            networks,
+            chain,
+            float(document["sharpness"]),
+            document["speeds"],
+            peaks,
+            document["definitions"],
             {**document["card"], "sha256": sha256(path)},
-        )  # fmt: skip
+        )
     except ModelError:
         raise
     except Exception as error:  # a file that is not ours can fail anywhere in the reader

@@ -14,7 +14,9 @@ Array = NDArray[np.float64]
 _STEP = 0.5  # of a window: how far apart windows begin
 
 
-def doubtful_stretches(found: Recognised, times_ns: NDArray[np.int64], n: int, least_s: float) -> list[dict[str, Any]]:
+def doubtful_stretches(
+    found: Recognised, times_ns: NDArray[np.int64], n: int, least_s: float
+) -> list[dict[str, Any]]:
     """Up to n stretches of at least least_s, the least certain of every pair of confused words first.
 
     uncertainty: entropy of the words' probabilities, of its largest value, on average over the stretch.
@@ -38,8 +40,13 @@ def doubtful_stretches(found: Recognised, times_ns: NDArray[np.int64], n: int, l
         taken[a:b] = True
         pair = tuple(sorted((int(first), int(second))))
         pairs[pair] = pairs.get(pair, 0) + 1
-        row = {"start_s": float(time_s[a]), "stop_s": float(starts[k] + least_s), "uncertainty": float(mean[k]),
-               "guess": found.words[first] or "unlabelled", "or_else": found.words[second] or "unlabelled"}  # fmt: skip
+        row = {
+            "start_s": float(time_s[a]),
+            "stop_s": float(starts[k] + least_s),
+            "uncertainty": float(mean[k]),
+            "guess": found.words[first] or "unlabelled",
+            "or_else": found.words[second] or "unlabelled",
+        }
         rows.append((pairs[pair], -float(mean[k]), len(rows), row))
         if len(rows) >= 6 * n:
             break

@@ -29,8 +29,16 @@ Array = NDArray[np.float64]
 CLOCKS_HZ = {"fish": 50.0}
 _CLOCK_HZ = 30.0
 _PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
-_SPEED_S, _SLACK, _STILL, _UNSEEN = 0.2, 1.25, 0.1, 6.0  # half window; how far beyond is meant, and what it costs
-_MOST_DECODED, _REFUSED = 6, 10.0  # how often bouts that are too slow are refused, and what that costs a tick
+_SPEED_S, _SLACK, _STILL, _UNSEEN = (
+    0.2,
+    1.25,
+    0.1,
+    6.0,
+)  # half window; how far beyond is meant, and what it costs
+_MOST_DECODED, _REFUSED = (
+    6,
+    10.0,
+)  # how often bouts that are too slow are refused, and what that costs a tick
 _FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
 _RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
 
@@ -57,20 +65,26 @@ class TimelineModel:
 
     def log_probabilities(
         self, stretch: Stretch, names: Sequence[str], speed: Array
-    ) -> Iterator[tuple[slice, Array]]:  # fmt: skip
+    ) -> Iterator[tuple[slice, Array]]:
         """(some, K) of each word at each of some consecutive ticks by itself; speed (m,): the `steady_speed`."""
         margin, m = round(_MARGIN_S * self.clock_hz), len(stretch.times_s)
         for ticks in blocks(m, _PIECE):
             low, high = max(0, ticks.start - margin), min(m, ticks.stop + margin)
-            features = window_features(Stretch(stretch.times_s[low:high], stretch.values[low:high]), names)
+            features = window_features(
+                Stretch(stretch.times_s[low:high], stretch.values[low:high]), names
+            )
             features = features[ticks.start - low : ticks.stop - low]
             let_go(stretch.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
             now = speed[ticks, None]
-            beyond = (now < self.speeds[:, 0] / _SLACK) | (now > self.speeds[:, 1] * _SLACK + _STILL)
+            beyond = (now < self.speeds[:, 0] / _SLACK) | (
+                now > self.speeds[:, 1] * _SLACK + _STILL
+            )
             yield ticks, np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
 
-    def scores(self, stretch: Stretch, names: Sequence[str], speed: Array, room: Room = np.empty) -> Array:
+    def scores(
+        self, stretch: Stretch, names: Sequence[str], speed: Array, room: Room = np.empty
+    ) -> Array:
         """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is; room: where they are to
         lie.
         """
@@ -80,7 +94,9 @@ class TimelineModel:
             let_go(scores)
         return scores
 
-    def recognise(self, track: Track, wall_mm: Array | None = None, room: Room = np.empty) -> Recognised:
+    def recognise(
+        self, track: Track, wall_mm: Array | None = None, room: Room = np.empty
+    ) -> Recognised:
         """The ethogram of a track, and the probability of each word in each of its frames. room: for what takes much
         of it on the way.
         """
@@ -101,12 +117,16 @@ class TimelineModel:
             first, last = np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step])
             for piece in blocks(last - first, _PIECE):
                 rows = slice(first + piece.start, first + piece.stop)
-                tick = np.clip(np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1)
+                tick = np.clip(
+                    np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1
+                )
                 told = certain[tick]
                 code[rows], probability[rows], part[rows] = decoded[tick], told, number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
                 let_go(certain, probability)
-        ethogram = Ethogram.of_words(code, track.times_ns, self.definitions, score, part, names=self.words)
+        ethogram = Ethogram.of_words(
+            code, track.times_ns, self.definitions, score, part, names=self.words
+        )
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
 
     def _decode(self, scores: Array, speed: Array, room: Room) -> NDArray[np.int64]:
@@ -135,13 +155,17 @@ class TimelineModel:
         for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):
             told = []
             if word != UNLABELLED and shortest * rate < _FRAMES_NEEDED:
-                told.append(f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at {rate:.0f} per "
-                            "second, and may be missed")  # fmt: skip
+                told.append(
+                    f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at {rate:.0f} per "
+                    "second, and may be missed"
+                )
             part = fastest.get(word)
             if part is not None and rate < part.least_hz - _RATE_SLACK_HZ:
-                told.append(f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} frames at "
-                            f"{rate:.0f} per second: that it happened may be told, but not how fast, how often or when "
-                            f"exactly, which wants {part.least_hz:.0f} per second")  # fmt: skip
+                told.append(
+                    f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} frames at "
+                    f"{rate:.0f} per second: that it happened may be told, but not how fast, how often or when "
+                    f"exactly, which wants {part.least_hz:.0f} per second"
+                )
             if told:
                 found[word] = "; ".join(told)
         return found
@@ -191,7 +215,9 @@ def steady_speed(stretch: Stretch, names: Sequence[str]) -> Array:
 
     step = stretch.times_s[1] - stretch.times_s[0]
     width = 2 * max(1, round(_SPEED_S / step)) + 1
-    return np.asarray(uniform_filter1d(stretch.values[:, names.index("speed")], width, mode="nearest"))
+    return np.asarray(
+        uniform_filter1d(stretch.values[:, names.index("speed")], width, mode="nearest")
+    )
 
 
 def clock_of(skeleton: Skeleton) -> float:
@@ -209,7 +235,9 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
         time_s = (one.track.times_ns - one.track.times_ns[:1]) * 1e-9
         code = np.array([place[str(word)] for word in one.words], np.int64)
         for stretch in stretches_of(one.track, clock_hz, one.wall_mm):
-            row = np.clip(np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz), 0, len(time_s) - 1)
+            row = np.clip(
+                np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz), 0, len(time_s) - 1
+            )
             features.append(window_features(stretch, names))
             codes.append(code[row])
             speeds.append(steady_speed(stretch, names))
@@ -217,18 +245,26 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
             recordings.append(np.full(len(row), k))
         runs.append(_runs(one.words, one.track.times_ns, place))
     return Examples(
-        np.concatenate(features), np.concatenate(codes), np.concatenate(speeds), np.concatenate(animals),
-        np.concatenate(recordings), runs,
-    )  # fmt: skip
+        np.concatenate(features),
+        np.concatenate(codes),
+        np.concatenate(speeds),
+        np.concatenate(animals),
+        np.concatenate(recordings),
+        runs,
+    )
 
 
-def _runs(words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str, int]) -> list[tuple[int, float]]:
+def _runs(
+    words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str, int]
+) -> list[tuple[int, float]]:
     """The bouts (word, s) of a recording, those without a name among them."""
     if not len(words):
         return []
     ends = frame_stops(times_ns)
-    return [(place[str(word)], float(ends[b - 1] - times_ns[a]) * 1e-9)
-            for a, b, word in zip(*runs_of(words), strict=True)]  # fmt: skip
+    return [
+        (place[str(word)], float(ends[b - 1] - times_ns[a]) * 1e-9)
+        for a, b, word in zip(*runs_of(words), strict=True)
+    ]
 
 
 def _softmax(logits: Array) -> Array:

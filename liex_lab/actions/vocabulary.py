@@ -43,11 +43,16 @@ class Fastest(NamedTuple):
     least_hz: float
 
 
-_BEAT = Fastest("a beat of the tail", 0.1, 40.0)  # up to 10 Hz in adults; a frequency is told up to rate / 4
+_BEAT = Fastest(
+    "a beat of the tail", 0.1, 40.0
+)  # up to 10 Hz in adults; a frequency is told up to rate / 4
 FASTEST: dict[str, dict[str, Fastest]] = {
     "fish": {
         "c_turn": Fastest("its first bend", 0.02, 250.0),
-        "scoot": _BEAT, "surface": _BEAT, "dive": _BEAT, "thrash": _BEAT,
+        "scoot": _BEAT,
+        "surface": _BEAT,
+        "dive": _BEAT,
+        "thrash": _BEAT,
         "zigzag": Fastest("one of its turns", 0.16, 20.0),
     },
     "mouse": {
@@ -55,4 +60,4 @@ FASTEST: dict[str, dict[str, Fastest]] = {
         "sniff": Fastest("one movement of the head", 0.1, 40.0),
         "dart": Fastest("its start", 0.12, 25.0),
     },
-}  # fmt: skip
+}

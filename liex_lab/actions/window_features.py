@@ -26,7 +26,9 @@ def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float3
     step = stretch.times_s[1] - stretch.times_s[0]
     signed = np.array([name.endswith("~") for name in names])
     n, n_signed = x.shape[1], int(signed.sum())
-    n_features = n + n_signed + len(HALF_WINDOWS_S) * (2 * n + n_signed) + len(SIDE_WINDOWS_S) * 2 * n + n
+    n_features = (
+        n + n_signed + len(HALF_WINDOWS_S) * (2 * n + n_signed) + len(SIDE_WINDOWS_S) * 2 * n + n
+    )
     found, filled = np.empty((len(x), n_features), np.float32), 0
 
     def put(*parts: Array) -> None:  # one by one, for all of them in double precision are large
@@ -61,4 +63,6 @@ def _extreme(x: Array, half_s: float, step: float) -> Array:
     """The largest (m, C) within half_s of each tick."""
     from scipy.ndimage import maximum_filter1d
 
-    return np.asarray(maximum_filter1d(x, 2 * max(1, round(half_s / step)) + 1, axis=0, mode="nearest"))
+    return np.asarray(
+        maximum_filter1d(x, 2 * max(1, round(half_s / step)) + 1, axis=0, mode="nearest")
+    )

@@ -19,7 +19,9 @@ _N_FITTED = 60_000  # pixels that the plane is fitted to
 _INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
 _MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
 _MAX_TILT_DEG = 60.0
-_FLAT_MM = 15.0  # background this near to the plane is floor: flatness, noise and lens errors together
+_FLAT_MM = (
+    15.0  # background this near to the plane is floor: flatness, noise and lens errors together
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,11 @@ class Floor:
         """The plane normal . p = distance_mm in the camera frame."""
         n = np.asarray(normal, float) / np.linalg.norm(normal)
         a, b = n[0] / camera.fx / distance_mm, n[1] / camera.fy / distance_mm
-        return Floor(n, float(distance_mm), np.array([a, b, n[2] / distance_mm - a * camera.cx - b * camera.cy]))
+        return Floor(
+            n,
+            float(distance_mm),
+            np.array([a, b, n[2] / distance_mm - a * camera.cx - b * camera.cy]),
+        )
 
     @cached_property
     def T_arena_camera(self) -> SE3:
@@ -84,7 +90,10 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     depth = background[rows, columns].astype(float)
     middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
     # pixels counted from the picture's middle, in units of its size: so the sums below lose no digits
-    points = np.stack([(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))], axis=1)
+    points = np.stack(
+        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
+        axis=1,
+    )
     plane = _largest_plane(points[:_N_VOTERS], depth[:_N_VOTERS], camera.fx / middle[0], rng)
     share = 0.0
     for _ in range(3):  # least squares on many pixels, not only on the voters
@@ -114,7 +123,9 @@ def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Gen
     a = (rise[:, 0] * ends[:, 1, 1] - rise[:, 1] * ends[:, 0, 1]) / area
     b = (ends[:, 0, 0] * rise[:, 1] - ends[:, 1, 0] * rise[:, 0]) / area
     planes = np.stack([a, b, w[:, 0] - a * p[:, 0, 0] - b * p[:, 0, 1]], axis=1)
-    steepness = np.hypot(a, b) * focal / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)  # tangent of the tilt
+    steepness = (
+        np.hypot(a, b) * focal / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)
+    )  # tangent of the tilt
     planes = planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))]
     for n_kept, n_voters in ((20, _N_VOTERS // 6), (1, _N_VOTERS)):
         votes = _is_near(points[:n_voters] @ planes.T, depth[:n_voters, None]).sum(axis=0)

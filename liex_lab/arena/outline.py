@@ -17,7 +17,10 @@ ROUND, RECTANGULAR, IRREGULAR, OPEN = "round", "rectangular", "irregular", "open
 _BORDER_PX = 8  # an outline this near to the picture's edge is the picture's and not the floor's
 _NOTCH_PX = 3.0  # and one this far inside the convex hull is a thing on the floor
 _SEEN_SHARE = 0.6  # of the way round must be in view
-_FIT_SHARE, _FIT_MM = 0.025, 4.0  # an outline this near to a shape, of its size or in mm, has that shape
+_FIT_SHARE, _FIT_MM = (
+    0.025,
+    4.0,
+)  # an outline this near to a shape, of its size or in mm, has that shape
 _BAND_MM = 60.0  # beyond the outline, in which a wall is looked for
 _WALL_MM = 20.0  # and how high it has to be there, or how deep a drop
 _SIDE_SHARE = 0.3  # of each side of a rectangle must be in view
@@ -62,30 +65,40 @@ class Arena:
             return np.empty((0, 2))
         if self.radius_mm is not None:
             return np.array(self.centre_mm) + self.radius_mm * circle_points(96)
-        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * np.array(self.half_mm)
+        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * np.array(
+            self.half_mm
+        )
         return np.asarray(np.array(self.centre_mm) + corners @ _turn(self.yaw_rad or 0.0).T)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json, rounded to what can be known; what is unknown is left out."""
         numbers = {
-            name: value if isinstance(value, str) else np.round(value, 4 if name == "yaw_rad" else 2).tolist()
-            for name, value in vars(self).items() if value is not None
-        }  # fmt: skip
+            name: value
+            if isinstance(value, str)
+            else np.round(value, 4 if name == "yaw_rad" else 2).tolist()
+            for name, value in vars(self).items()
+            if value is not None
+        }
         return dict(numbers)
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Arena:
         """The arena that `to_dict` wrote."""
         known: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in numbers.items()
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in numbers.items()
         }
         return Arena(**known)
 
     def __str__(self) -> str:
         known = {
             ROUND: lambda: f"round, radius {self.radius_mm:.0f} mm",
-            RECTANGULAR: lambda: "rectangular, " + " x ".join(f"{2 * half:.0f}" for half in self.half_mm or ()) + " mm",
-        }  # fmt: skip
+            RECTANGULAR: lambda: (
+                "rectangular, "
+                + " x ".join(f"{2 * half:.0f}" for half in self.half_mm or ())
+                + " mm"
+            ),
+        }
         return known.get(self.kind, lambda: self.kind)()
 
 
@@ -110,7 +123,9 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
     return Arena(RECTANGULAR, _pair(middle), None, _pair(half), yaw, off_rectangle, share, edge)
 
 
-def _outline(background: NDArray[np.float32], floor: Floor, camera: Camera) -> tuple[Array, Array, float]:
+def _outline(
+    background: NDArray[np.float32], floor: Floor, camera: Camera
+) -> tuple[Array, Array, float]:
     """Where the floor ends: points (n, 2) mm in the arena frame, their pixels (n, 2), and the share of it in view.
 
     A point's place is that of the reading there, for the foot of a wall stands on the wall's own line at any height.
@@ -134,7 +149,9 @@ def _outline(background: NDArray[np.float32], floor: Floor, camera: Camera) -> t
     depth = background[uv[:, 1], uv[:, 0]].astype(float)
     middle = hull[:, 0].mean(axis=0)
     out = (uv - middle) / np.maximum(np.linalg.norm(uv - middle, axis=1, keepdims=True), 1e-9)
-    place = floor.T_arena_camera @ camera.unproject(uv + 0.5 * out, depth)  # the last floor pixel ends half a pixel on
+    place = floor.T_arena_camera @ camera.unproject(
+        uv + 0.5 * out, depth
+    )  # the last floor pixel ends half a pixel on
     return place[:, :2], uv, share
 
 
@@ -144,7 +161,8 @@ def _share_in_view(hull: Array, width: int, height: int) -> float:
     length = np.linalg.norm(ends - hull, axis=1)
     limit = np.array([width, height]) - _BORDER_PX
     at_edge = np.logical_or(
-        ((hull < _BORDER_PX) & (ends < _BORDER_PX)).any(axis=1), ((hull >= limit) & (ends >= limit)).any(axis=1)
+        ((hull < _BORDER_PX) & (ends < _BORDER_PX)).any(axis=1),
+        ((hull >= limit) & (ends >= limit)).any(axis=1),
     )
     return float(length[~at_edge].sum() / max(length.sum(), 1e-9))
 
@@ -154,13 +172,18 @@ def fit_circle(points: Array) -> tuple[Array, float, float]:
 
     First, out of circles through three points each, the one with the least median distance; then least squares.
     """
-    a, b, c = np.moveaxis(points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0)
+    a, b, c = np.moveaxis(
+        points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0
+    )
     p, q = b - a, c - a
     twice = 2.0 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
     usable = np.abs(twice) > 1e-9
     p, q, a, twice = p[usable], q[usable], a[usable], twice[usable]
     pp, qq = (p * p).sum(axis=1), (q * q).sum(axis=1)
-    off = np.stack([q[:, 1] * pp - p[:, 1] * qq, p[:, 0] * qq - q[:, 0] * pp], axis=1) / twice[:, None]
+    off = (
+        np.stack([q[:, 1] * pp - p[:, 1] * qq, p[:, 0] * qq - q[:, 0] * pp], axis=1)
+        / twice[:, None]
+    )
     distance = np.linalg.norm(points[:, None] - (a + off), axis=2) - np.linalg.norm(off, axis=1)
     best = np.abs(distance).T[np.median(np.abs(distance), axis=0).argmin()]
     some = points[best <= 3.0 * np.median(best) + 1e-6]
@@ -197,7 +220,9 @@ def _sides(points: Array) -> tuple[float, Array, Array]:
     """Median distance of points (n, 2) from the sides of an upright rectangle, and its corners (2,) low and high."""
     low, high = np.percentile(points, 2, axis=0), np.percentile(points, 98, axis=0)
     for _ in range(4):
-        gaps = np.stack([points - low, high - points], axis=1).reshape(len(points), 4)  # low x, low y, high x, high y
+        gaps = np.stack([points - low, high - points], axis=1).reshape(
+            len(points), 4
+        )  # low x, low y, high x, high y
         side = np.abs(gaps).argmin(axis=1)
         for k in range(4):
             of_side = points[side == k, k % 2]
@@ -213,7 +238,10 @@ def _all_sides_seen(points: Array, centre: Array, half: Array, yaw: float) -> bo
     for axis in (0, 1):
         for end in (-1.0, 1.0):
             along = local[np.abs(local[:, axis] - end * half[axis]) < _FIT_MM, 1 - axis]
-            if len(along) < 8 or np.diff(np.percentile(along, [10, 90]))[0] < _SIDE_SHARE * 2.0 * half[1 - axis]:
+            if (
+                len(along) < 8
+                or np.diff(np.percentile(along, [10, 90]))[0] < _SIDE_SHARE * 2.0 * half[1 - axis]
+            ):
                 return False
     return True
 
@@ -221,19 +249,31 @@ def _all_sides_seen(points: Array, centre: Array, half: Array, yaw: float) -> bo
 def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels: Array) -> str:
     """What is just outside the outline, pixels (n, 2): wall, drop or unknown."""
     middle = pixels.mean(axis=0)
-    out = (pixels - middle) / np.maximum(np.linalg.norm(pixels - middle, axis=1, keepdims=True), 1e-9)
+    out = (pixels - middle) / np.maximum(
+        np.linalg.norm(pixels - middle, axis=1, keepdims=True), 1e-9
+    )
     reach = max(4.0, _BAND_MM * np.sqrt(camera.fx * camera.fy) / floor.distance_mm)
     beyond = pixels + out * np.arange(2.0, reach)[:, None, None]  # (k, n, 2)
     column, row = np.moveaxis(np.rint(beyond).astype(int), -1, 0)
-    inside = (row >= 0) & (row < background.shape[0]) & (column >= 0) & (column < background.shape[1])
+    inside = (
+        (row >= 0) & (row < background.shape[0]) & (column >= 0) & (column < background.shape[1])
+    )
     depth = np.where(inside, background[np.where(inside, row, 0), np.where(inside, column, 0)], 0.0)
     a, b, c = floor.inverse_depth
-    height = np.where(depth > 0, floor.distance_mm * (1.0 - depth * (a * column + b * row + c)), np.nan)
+    height = np.where(
+        depth > 0, floor.distance_mm * (1.0 - depth * (a * column + b * row + c)), np.nan
+    )
     known = np.isfinite(height).any(axis=0)
     if known.mean() < 0.3:
         return "unknown"
     highest, lowest = np.nanmax(height[:, known], axis=0), np.nanmin(height[:, known], axis=0)
-    return "wall" if np.median(highest) > _WALL_MM else "drop" if np.median(lowest) < -_WALL_MM else "unknown"
+    return (
+        "wall"
+        if np.median(highest) > _WALL_MM
+        else "drop"
+        if np.median(lowest) < -_WALL_MM
+        else "unknown"
+    )
 
 
 def circle_points(n: int) -> Array:

@@ -112,7 +112,9 @@ class DrawnZone:
         a, b, c = floor.inverse_depth
         inverse = a * uv[:, 0] + b * uv[:, 1] + c
         if not (inverse > 0).all():
-            raise PlanError(f"{self.where} reaches above the horizon of the floor; draw it on the floor")
+            raise PlanError(
+                f"{self.where} reaches above the horizon of the floor; draw it on the floor"
+            )
         return np.asarray((floor.T_arena_camera @ camera.unproject(uv, 1.0 / inverse))[:, :2])
 
 
@@ -128,12 +130,23 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise PlanError(f"there is no file {file} with zones; check the spelling of arena.zones") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError, RecursionError) as error:
-        raise PlanError(f"{file} should be a TOML file with zones, but it is not ({error}); correct it") from None
+        raise PlanError(
+            f"there is no file {file} with zones; check the spelling of arena.zones"
+        ) from None
+    except (
+        tomllib.TOMLDecodeError,
+        UnicodeDecodeError,
+        IsADirectoryError,
+        RecursionError,
+    ) as error:
+        raise PlanError(
+            f"{file} should be a TOML file with zones, but it is not ({error}); correct it"
+        ) from None
     entries = table.get("zones")
     if not isinstance(entries, list) or not entries or set(table) != {"zones"}:
-        raise PlanError(f"{file} should hold nothing but zones, each beginning with [[zones]]; as in {_EXAMPLE}")
+        raise PlanError(
+            f"{file} should hold nothing but zones, each beginning with [[zones]]; as in {_EXAMPLE}"
+        )
     zones = [_zone(file, number, entry) for number, entry in enumerate(entries, start=1)]
     names = [zone.name for zone in zones]
     if double := next((name for name in names if names.count(name) > 1), None):
@@ -144,34 +157,52 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
 def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
     where = f"zone {number} of {file}"
     if not isinstance(entry, dict):
-        raise PlanError(f"{where} should be a table with a name and a circle or a polygon; as in {_EXAMPLE}")
+        raise PlanError(
+            f"{where} should be a table with a name and a circle or a polygon; as in {_EXAMPLE}"
+        )
     for key in entry:
         if key not in _KEYS:
             near = difflib.get_close_matches(key, _KEYS, 1, cutoff=0.0)[0]
-            raise PlanError(f"{where} has a key '{key}' that no zone has; the nearest one is {near}")
+            raise PlanError(
+                f"{where} has a key '{key}' that no zone has; the nearest one is {near}"
+            )
     name = entry.get("name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)):
-        raise PlanError(f"{where} needs a name of letters, digits and _, for columns are named after it, got {name!r}")
+        raise PlanError(
+            f"{where} needs a name of letters, digits and _, for columns are named after it, got {name!r}"
+        )
     where = f"zone '{name}' of {file}"
     unit, relative = entry.get("unit", "mm"), entry.get("relative_to")
     if unit not in ("mm", "px") or relative not in (None, "centre") or (unit == "px" and relative):
-        raise PlanError(f'{where} has unit = "mm" or "px", and with mm perhaps relative_to = "centre"; correct it')
+        raise PlanError(
+            f'{where} has unit = "mm" or "px", and with mm perhaps relative_to = "centre"; correct it'
+        )
     if ("circle" in entry) == ("polygon" in entry):
         raise PlanError(f"{where} should have either a circle or a polygon; as in {_EXAMPLE}")
     if "polygon" in entry:
-        return DrawnZone(name, _pairs(_polygon(where, entry["polygon"])), None, unit, relative, where)
+        return DrawnZone(
+            name, _pairs(_polygon(where, entry["polygon"])), None, unit, relative, where
+        )
     circle = entry["circle"]
     if not isinstance(circle, dict) or set(circle) != {"centre", "radius"}:
-        raise PlanError(f"{where}: a circle is written as {{ centre = [0, 0], radius = 80 }}, got {circle!r}")
+        raise PlanError(
+            f"{where}: a circle is written as {{ centre = [0, 0], radius = 80 }}, got {circle!r}"
+        )
     if not (_is_number(circle["radius"]) and circle["radius"] > 0):
-        raise PlanError(f"{where}: the radius of a circle is a positive number, got {circle['radius']!r}")
-    return DrawnZone(name, (_point(where, circle["centre"]),), float(circle["radius"]), unit, relative, where)
+        raise PlanError(
+            f"{where}: the radius of a circle is a positive number, got {circle['radius']!r}"
+        )
+    return DrawnZone(
+        name, (_point(where, circle["centre"]),), float(circle["radius"]), unit, relative, where
+    )
 
 
 def _polygon(where: str, polygon: Any) -> Array:
     """The corners (n, 2) of a polygon that is one."""
     if not isinstance(polygon, list) or len(polygon) < 3:
-        raise PlanError(f"{where}: a polygon is a list of at least three corners [x, y], got {polygon!r}")
+        raise PlanError(
+            f"{where}: a polygon is a list of at least three corners [x, y], got {polygon!r}"
+        )
     corners = np.array([_point(where, corner) for corner in polygon])
     ends = np.roll(corners, -1, axis=0)
     if abs((corners[:, 0] * ends[:, 1] - corners[:, 1] * ends[:, 0]).sum()) < 1e-6:
@@ -180,7 +211,9 @@ def _polygon(where: str, polygon: Any) -> Array:
     for i in range(n):
         for j in range(i + 2, n - (i == 0)):
             if _cross(corners[i], ends[i], corners[j], ends[j]):
-                raise PlanError(f"{where}: sides {i + 1} and {j + 1} of the polygon cross; list its corners in order")
+                raise PlanError(
+                    f"{where}: sides {i + 1} and {j + 1} of the polygon cross; list its corners in order"
+                )
     return corners
 
 
@@ -194,7 +227,9 @@ def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
 
 
 def _point(where: str, value: Any) -> tuple[float, float]:
-    if not (isinstance(value, list) and len(value) == 2 and all(_is_number(number) for number in value)):
+    if not (
+        isinstance(value, list) and len(value) == 2 and all(_is_number(number) for number in value)
+    ):
         raise PlanError(f"{where}: a point is a pair of numbers [x, y], got {value!r}")
     return float(value[0]), float(value[1])
 

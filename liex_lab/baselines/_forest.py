@@ -62,7 +62,13 @@ def turn_to(heading, rotation):
     """Rotation (3, 3) about the view's z axis by an angle, rad."""
     c, s = np.cos(heading), np.sin(heading)
     rotation[:] = 0.0
-    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1], rotation[2, 2] = c, -s, s, c, 1.0
+    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1], rotation[2, 2] = (
+        c,
+        -s,
+        s,
+        c,
+        1.0,
+    )
 
 
 @njit(cache=True)
@@ -120,11 +126,36 @@ def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leave
 
 
 @njit(cache=True, parallel=True)
-def locate_all(heights, looks, image, phases, n_points, reach, bandwidth, nodes, roots, leaves, used, places, headings):
+def locate_all(
+    heights,
+    looks,
+    image,
+    phases,
+    n_points,
+    reach,
+    bandwidth,
+    nodes,
+    roots,
+    leaves,
+    used,
+    places,
+    headings,
+):
     """`locate` for a batch: image (n,), phases (n,), used (n, T) into places (n, 3) and headings (n,)."""
     for s in prange(image.size):
-        headings[s] = locate(heights[image[s]], looks[image[s]], phases[s], n_points, reach, bandwidth, nodes, roots,
-                             leaves, used[s], places[s])  # fmt: skip
+        headings[s] = locate(
+            heights[image[s]],
+            looks[image[s]],
+            phases[s],
+            n_points,
+            reach,
+            bandwidth,
+            nodes,
+            roots,
+            leaves,
+            used[s],
+            places[s],
+        )
 
 
 @njit(cache=True)
@@ -151,17 +182,48 @@ def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotatio
 
 @njit(cache=True, parallel=True)
 def guess_all(
-    heights, looks, found, n_points, reach, bandwidths, nodes, roots, leaves, pose_nodes, pose_roots, pose_leaves,
-    levers, parents, offsets, rest, axes, positions,
-):  # fmt: skip
+    heights,
+    looks,
+    found,
+    n_points,
+    reach,
+    bandwidths,
+    nodes,
+    roots,
+    leaves,
+    pose_nodes,
+    pose_roots,
+    pose_leaves,
+    levers,
+    parents,
+    offsets,
+    rest,
+    axes,
+    positions,
+):
     """Joints (n, J, 3) mm in their view frames, of the frames in which an animal was found."""
     for i in prange(heights.shape[0]):
         if not found[i]:
             continue
         place, n_trees, width = np.empty(3), pose_roots.size, pose_leaves.shape[1]
-        heading = locate(heights[i], looks[i], 0.5, n_points, reach, bandwidths[0], nodes, roots, leaves,
-                         np.ones(roots.size, np.bool_), place)  # fmt: skip
-        turned, view, none = np.empty((3, 3)), np.empty((1, VIEW), np.float32), np.zeros(1, np.float32)
+        heading = locate(
+            heights[i],
+            looks[i],
+            0.5,
+            n_points,
+            reach,
+            bandwidths[0],
+            nodes,
+            roots,
+            leaves,
+            np.ones(roots.size, np.bool_),
+            place,
+        )
+        turned, view, none = (
+            np.empty((3, 3)),
+            np.empty((1, VIEW), np.float32),
+            np.zeros(1, np.float32),
+        )
         turn_to(heading, turned)
         fill_view(turned, place, looks[i], 1.0, reach, view[0])
         votes, values = np.empty((n_trees, width)), np.zeros(width)
@@ -172,4 +234,6 @@ def guess_all(
                 values[d] += votes[t, d] / n_trees
         mode_of_votes(votes, bandwidths[1], values)
         rotations = np.empty((parents.size, 3, 3))
-        unfold(values, levers, place, heading, parents, offsets, rest, axes, rotations, positions[i])
+        unfold(
+            values, levers, place, heading, parents, offsets, rest, axes, rotations, positions[i]
+        )

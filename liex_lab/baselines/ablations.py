@@ -31,7 +31,9 @@ class PlainMean:
         """As the paper's variant: the home size."""
         return self.estimator.find_size(sample, scene)
 
-    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
+    def estimate(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+    ) -> Guesses:
         """The mean over all candidates of each joint's position."""
         crops, looks = see(depths, scene, parallel)
         _, positions, _, _ = self.estimator.candidates(crops, looks, size, parallel)

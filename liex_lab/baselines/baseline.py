@@ -14,7 +14,14 @@ from liex_lab.foreground.height_maps import Crops, Foreground
 
 Array = NDArray[np.float64]
 
-DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile)  # what a broken .npz raises
+DAMAGE = (
+    OSError,
+    ValueError,
+    LookupError,
+    EOFError,
+    RuntimeError,
+    zipfile.BadZipFile,
+)  # what a broken .npz raises
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,9 @@ class Baseline(Protocol):
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
         """The animal's size over home size; 1 where the baseline knows of no such thing, as the paper's do not."""
 
-    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
+    def estimate(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+    ) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame; on one core unless `parallel`."""
 
 
@@ -49,7 +58,10 @@ def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple
     crops, second = scene.extract_both(depths, 1.0, parallel, camera_view=True)
     unsure = np.flatnonzero(crops.n_blobs > 1)
     if len(unsure):
-        misfits = [scene.misfit(above_floor) for above_floor in scene.extract_both(depths[unsure], 1.0, parallel)]
+        misfits = [
+            scene.misfit(above_floor)
+            for above_floor in scene.extract_both(depths[unsure], 1.0, parallel)
+        ]
         better = unsure[misfits[1] < misfits[0]]
         crops.put(better, second[better])
     return crops, scene.looks(crops, camera_view=True)

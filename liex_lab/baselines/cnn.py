@@ -58,27 +58,38 @@ def require_torch() -> None:
     from importlib.util import find_spec
 
     if find_spec("torch") is None:
-        raise MissingPackageError("the CNN baseline needs torch, which is not installed; pip install 'liex_lab[cnn]'")
+        raise MissingPackageError(
+            "the CNN baseline needs torch, which is not installed; pip install 'liex_lab[cnn]'"
+        )
 
 
 def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
     """The network for three channels of 224 x 224."""
     from torch import nn
 
-    def convolution(before: int, after: int, size: int, stride: int, padding: int) -> list[nn.Module]:
+    def convolution(
+        before: int, after: int, size: int, stride: int, padding: int
+    ) -> list[nn.Module]:
         layer = nn.Conv2d(before, after, size, stride, padding, bias=False)
         return [layer, nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
 
     a, b, c, d, e = (round(plan.width * channels) for channels in (64, 192, 384, 256, 256))
     net = nn.Sequential(
-        *convolution(3, a, 11, 4, 2), nn.MaxPool2d(3, 2),
-        *convolution(a, b, 5, 1, 2), nn.MaxPool2d(3, 2),
-        *convolution(b, c, 3, 1, 1), *convolution(c, d, 3, 1, 1), *convolution(d, e, 3, 1, 1), nn.MaxPool2d(3, 2),
+        *convolution(3, a, 11, 4, 2),
+        nn.MaxPool2d(3, 2),
+        *convolution(a, b, 5, 1, 2),
+        nn.MaxPool2d(3, 2),
+        *convolution(b, c, 3, 1, 1),
+        *convolution(c, d, 3, 1, 1),
+        *convolution(d, e, 3, 1, 1),
+        nn.MaxPool2d(3, 2),
         nn.Flatten(),
-        nn.Linear(36 * e, plan.connected), nn.ReLU(inplace=True),
-        nn.Linear(plan.connected, plan.connected), nn.ReLU(inplace=True),
+        nn.Linear(36 * e, plan.connected),
+        nn.ReLU(inplace=True),
+        nn.Linear(plan.connected, plan.connected),
+        nn.ReLU(inplace=True),
         nn.Linear(plan.connected, n_outputs),
-    )  # fmt: skip
+    )
     net.to(memory_format=torch_layout())
     return net
 
@@ -122,7 +133,9 @@ class Cnn:
         """1: the network knows nothing of size."""
         return 1.0
 
-    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
+    def estimate(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+    ) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame."""
         crops, looks = see(depths, scene, parallel)
         joints = np.full((len(looks), self.skeleton.n_joints, 3), np.nan)
@@ -155,10 +168,14 @@ class Cnn:
         net = alexnet(3 * skeleton.n_joints, plan)
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                net.load_state_dict({name: torch.from_numpy(archive[name]) for name in archive.files})
+                net.load_state_dict(
+                    {name: torch.from_numpy(archive[name]) for name in archive.files}
+                )
         except DAMAGE as error:
             said = str(error).splitlines()[0]
-            raise ModelError(f"{path} does not hold the CNN's weights ({said}); remove it and train again") from None
+            raise ModelError(
+                f"{path} does not hold the CNN's weights ({said}); remove it and train again"
+            ) from None
         return Cnn(skeleton, net)
 
 
@@ -170,7 +187,9 @@ def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
     return grey[:, None].expand(-1, 3, -1, -1).contiguous(memory_format=torch_layout())
 
 
-def train_cnn(data: TrainingSet, skeleton: Skeleton, plan: CnnPlan, rng: np.random.Generator, tell: Tell) -> Cnn:
+def train_cnn(
+    data: TrainingSet, skeleton: Skeleton, plan: CnnPlan, rng: np.random.Generator, tell: Tell
+) -> Cnn:
     """Train from scratch with AdamW and one cycle of the step size."""
     import torch
 
@@ -180,7 +199,9 @@ def train_cnn(data: TrainingSet, skeleton: Skeleton, plan: CnnPlan, rng: np.rand
     net = alexnet(3 * skeleton.n_joints, plan)
     steps = plan.epochs * (len(animals) // _BATCH)
     optimiser = torch.optim.AdamW(net.parameters(), lr=plan.rate, weight_decay=plan.decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, plan.rate, total_steps=max(steps, 1), pct_start=0.15)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, plan.rate, total_steps=max(steps, 1), pct_start=0.15
+    )
     net.train()
     done = 0
     for _ in range(plan.epochs):
@@ -202,7 +223,9 @@ def _loss(net: torch.nn.Sequential, data: TrainingSet, rows: NDArray[np.int64]) 
 
     heights, looks = data.images.heights[rows], data.images.looks[rows]
     frames = frames_of(heights, looks)
-    wanted = torch.from_numpy(targets_of(in_camera_frame(data.truth.positions[rows], looks), looks, frames))
+    wanted = torch.from_numpy(
+        targets_of(in_camera_frame(data.truth.positions[rows], looks), looks, frames)
+    )
     with low_precision():
         told = net(_channels(patches_of(heights, looks, frames)))
     off = (told.float() - wanted).reshape(len(rows), -1, 3)

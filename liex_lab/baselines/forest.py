@@ -43,7 +43,9 @@ Array = NDArray[np.float64]
 
 _F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
 _F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
-_LEAST_LEVER = 0.05  # of the animal's length: a turn about its own axis moves no joint of a straight animal
+_LEAST_LEVER = (
+    0.05  # of the animal's length: a turn about its own axis moves no joint of a straight animal
+)
 
 
 @dataclass(frozen=True)
@@ -75,25 +77,43 @@ class RegressionForest:
         """1: the paper's forests know nothing of size."""
         return 1.0
 
-    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Guesses:
+    def estimate(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+    ) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame."""
         crops, looks = see(depths, scene, parallel)
         s, n = self.skeleton, len(looks)
         joints = np.full((n, s.n_joints, 3), np.nan)
         with threads(parallel):
             kernels.guess_all(
-                crops.heights, looks, crops.found, self.plan.n_points, s.length,
-                s.length * np.array(self.plan.bandwidths), self.where.nodes, self.where.roots, self.where.leaves,
-                self.pose.nodes, self.pose.roots, self.pose.leaves, levers(s), s.parents, s.offsets, s.rest, s.axes,
+                crops.heights,
+                looks,
+                crops.found,
+                self.plan.n_points,
+                s.length,
+                s.length * np.array(self.plan.bandwidths),
+                self.where.nodes,
+                self.where.roots,
+                self.where.leaves,
+                self.pose.nodes,
+                self.pose.roots,
+                self.pose.leaves,
+                levers(s),
+                s.parents,
+                s.offsets,
+                s.rest,
+                s.axes,
                 joints,
-            )  # fmt: skip
+            )
         return Guesses(in_camera_frame(joints, looks), crops.found, crops)
 
     def to_bytes(self) -> bytes:
         """The model as the bytes of an .npz without pickle; skeleton and plan are known to who asks for it."""
         arrays: dict[str, Any] = {}
         for name, forest in (("where", self.where), ("pose", self.pose)):
-            arrays |= {f"{name}_{part}": getattr(forest, part) for part in ("nodes", "roots", "leaves")}
+            arrays |= {
+                f"{name}_{part}": getattr(forest, part) for part in ("nodes", "roots", "leaves")
+            }
         packed = io.BytesIO()
         np.savez_compressed(packed, **arrays)
         return packed.getvalue()
@@ -108,7 +128,9 @@ class RegressionForest:
                     for name in ("where", "pose")
                 )
         except DAMAGE as error:
-            raise ModelError(f"{path} is not a whole regression forest ({error}); remove it and train again") from None
+            raise ModelError(
+                f"{path} is not a whole regression forest ({error}); remove it and train again"
+            ) from None
         return RegressionForest(skeleton, plan, where, pose)
 
 
@@ -118,7 +140,9 @@ def levers(skeleton: Skeleton) -> Array:
     Coordinates: the base's rotation about x, y, z (rad), its translation (mm, lever 1), log scale, then the angles
     about the other joints' free axes in the skeleton's order. One unit of label is then about one millimetre of error.
     """
-    rotations, positions = forward_kinematics(skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(()))
+    rotations, positions = forward_kinematics(
+        skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(())
+    )
     below = np.eye(skeleton.n_joints, dtype=bool)
     for j in range(skeleton.n_joints - 1, 0, -1):
         below[skeleton.parents[j]] |= below[j]
@@ -165,9 +189,20 @@ def train_forests(
     unseen = ~in_bag.T[image]
     unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees have seen it: then all are asked
     kernels.locate_all(
-        data.images.heights, data.images.looks, image, rng.random(len(image)), plan.n_points, skeleton.length,
-        plan.bandwidths[0] * skeleton.length, where.nodes, where.roots, where.leaves, unseen, places, headings,
-    )  # fmt: skip
+        data.images.heights,
+        data.images.looks,
+        image,
+        rng.random(len(image)),
+        plan.n_points,
+        skeleton.length,
+        plan.bandwidths[0] * skeleton.length,
+        where.nodes,
+        where.roots,
+        where.leaves,
+        unseen,
+        places,
+        headings,
+    )
     labels = coordinates(data, skeleton, image, places, headings)
     turned = np.linalg.norm(labels[:, :3] / levers(skeleton)[:3], axis=1)
     samples = _samples(data, skeleton, image, places, headings)
@@ -181,11 +216,15 @@ def _grow_where(
     """F1, and which images each of its trees has seen (T, n_images)."""
     animals = np.flatnonzero(data.animal).astype(np.int32)
     points = np.empty((len(animals), plan.training_points, 3))
-    kernels.points_all(data.images.heights, data.images.looks, animals, rng.random(len(animals)), points)
+    kernels.points_all(
+        data.images.heights, data.images.looks, animals, rng.random(len(animals)), points
+    )
     image = np.repeat(animals, plan.training_points)
     places = points.reshape(-1, 3)
     heading = 0.5 * skeleton.length * data.truth.rotations[image, 0, :2, 0]
-    labels = np.concatenate([data.truth.positions[image, 0] - places, heading], axis=1).astype(np.float32)
+    labels = np.concatenate([data.truth.positions[image, 0] - places, heading], axis=1).astype(
+        np.float32
+    )
     samples = _samples(data, skeleton, image, places, np.zeros(len(image)))
     return grow_forest(samples, labels, np.ones(len(image), np.bool_), plan.where, rng)
 
@@ -197,4 +236,6 @@ def _samples(
     n = len(image)
     views = np.empty((n, 1, VIEW), np.float32)
     kernels.views_all(data.images.looks, image, places, headings, skeleton.length, views)
-    return Samples(data.images.heights, image, np.ones(n, np.float32), views, np.zeros((n, 1), np.float32))
+    return Samples(
+        data.images.heights, image, np.ones(n, np.float32), views, np.zeros((n, 1), np.float32)
+    )

@@ -52,7 +52,9 @@ def joints_of(told: NDArray[np.float32], looks: Array, frames: Array) -> Array:
     u0, v0, half_px, depth, half_mm = frames.T[:, :, None]
     fx, fy, cx, cy = looks.T[:4, :, None]
     z = depth - nearer * half_mm
-    return np.stack([(u0 + right * half_px - cx) / fx * z, (v0 + down * half_px - cy) / fy * z, z], axis=-1)
+    return np.stack(
+        [(u0 + right * half_px - cx) / fx * z, (v0 + down * half_px - cy) / fy * z, z], axis=-1
+    )
 
 
 @njit(cache=True, parallel=True)
@@ -78,7 +80,10 @@ def _frames_all(heights, looks, frames):
 @njit(cache=True)
 def _shade(heights, row, column, level, per_mm):
     """The brightness of one height map pixel; `level` is the animal's mean height, sixteenths of a mm."""
-    if not (0 <= row < heights.shape[0] and 0 <= column < heights.shape[1]) or heights[row, column] <= 0:
+    if (
+        not (0 <= row < heights.shape[0] and 0 <= column < heights.shape[1])
+        or heights[row, column] <= 0
+    ):
         return 0.0
     return min(max(127.5 * (1.0 + (heights[row, column] - level) / _MM * per_mm), 1.0), 255.0)
 

@@ -35,12 +35,21 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
     spent = {}
     for word in words:
         own = bouts[bouts["action"] == word]
-        spent[f"{word}_s"] = time_within(own["start_s"].to_numpy(float), own["stop_s"].to_numpy(float), edges)
-    return to_pandas(activity_columns(words), {
-        **{name: [str(kinematics[name].iloc[0])] * n for name in ("session_id", "individual")},
-        "start_s": edges[:-1], "stop_s": edges[1:], "observed_s": total(hold, observed), "distance_mm": distance,
-        "mean_speed_mm_s": np.divide(distance, timed, out=np.full(n, np.nan), where=timed > 0), **spent,
-    })  # fmt: skip
+        spent[f"{word}_s"] = time_within(
+            own["start_s"].to_numpy(float), own["stop_s"].to_numpy(float), edges
+        )
+    return to_pandas(
+        activity_columns(words),
+        {
+            **{name: [str(kinematics[name].iloc[0])] * n for name in ("session_id", "individual")},
+            "start_s": edges[:-1],
+            "stop_s": edges[1:],
+            "observed_s": total(hold, observed),
+            "distance_mm": distance,
+            "mean_speed_mm_s": np.divide(distance, timed, out=np.full(n, np.nan), where=timed > 0),
+            **spent,
+        },
+    )
 
 
 def intervals(duration_s: float) -> Array:

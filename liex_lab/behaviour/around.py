@@ -28,7 +28,9 @@ class Around:
     n: int
 
 
-def around_onsets(kinematics: pd.DataFrame, bouts: pd.DataFrame, action: str, column: str) -> Around | None:
+def around_onsets(
+    kinematics: pd.DataFrame, bouts: pd.DataFrame, action: str, column: str
+) -> Around | None:
     """`column` of the table `kinematics` around every onset of `action`; None where there are too few bouts.
 
     Values are interpolated between the frames' true times, never across a gap; where a bout has no value it does not

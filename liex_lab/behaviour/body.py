@@ -49,8 +49,13 @@ class Body:
             return Body(names, True, tuple(range(n)), (min(max(n // 4, 1), n - 1), 0), half)
         at = {name: k for k, name in enumerate(names)}
         rump, neck, nose = (
-            at.get(name, place) for name, place in (("rump", 0), ("neck", max(n - 2, 0)), ("nose", n - 1))
+            at.get(name, place)
+            for name, place in (("rump", 0), ("neck", max(n - 2, 0)), ("nose", n - 1))
         )
-        spine = (nose, *(k for k in reversed(range(n)) if k not in (nose, rump)), rump) if n > 1 else (0,)
+        spine = (
+            (nose, *(k for k in reversed(range(n)) if k not in (nose, rump)), rump)
+            if n > 1
+            else (0,)
+        )
         trunk = tuple(k for k in range(n) if k != nose) or (nose,)
         return Body(names, False, spine, (rump, neck), trunk)

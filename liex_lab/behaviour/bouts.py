@@ -40,7 +40,9 @@ class MouseRules:
     rear_height_mm: float = 40.0
     rear_height_bl: float = 0.6
     rear_leave: float = 2.0 / 3.0
-    speed_hysteresis: float = 0.1  # a threshold is crossed upwards 10 % above it, downwards 10 % below
+    speed_hysteresis: float = (
+        0.1  # a threshold is crossed upwards 10 % above it, downwards 10 % below
+    )
     merge_pauses_s: float = 0.33
     min_bout_s: float = 0.23
 
@@ -61,14 +63,21 @@ class MouseRules:
         }
 
 
-def find_bouts(frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None) -> pd.DataFrame:
+def find_bouts(
+    frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None
+) -> pd.DataFrame:
     """The table `bouts` of one animal from its tables `frames` and `kinematics`."""
     rules = rules or MouseRules()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
     number = segments(time_s, observed)
     stop_s = stop_times(time_s)
-    raw = raw_labels(kinematics, float(np.nanmedian(frames["spine_mm"])) if observed.any() else np.nan, number, rules)
+    raw = raw_labels(
+        kinematics,
+        float(np.nanmedian(frames["spine_mm"])) if observed.any() else np.nan,
+        number,
+        rules,
+    )
     label = np.full(len(time_s), "", dtype=object)
     for action in ACTIONS:
         free = (label == "") & observed
@@ -82,7 +91,11 @@ def raw_labels(
 ) -> dict[str, Mask]:
     """(n,) per action: the frames that satisfy its rule, with hysteresis inside each unbroken stretch."""
     speed = kinematics["speed_mm_s"].to_numpy(float)
-    slope = kinematics["nose_over_rump_mm"].to_numpy(float) if "nose_over_rump_mm" in kinematics else speed * np.nan
+    slope = (
+        kinematics["nose_over_rump_mm"].to_numpy(float)
+        if "nose_over_rump_mm" in kinematics
+        else speed * np.nan
+    )
     rear_mm = rules.rear_mm(spine_mm)
     low, high = 1.0 - rules.speed_hysteresis, 1.0 + rules.speed_hysteresis
     moving = hysteresis(speed, rules.pause_below_mm_s * high, rules.pause_below_mm_s * low, number)
@@ -103,14 +116,21 @@ def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int
     """
     high, inside = values >= enter, values >= leave
     out = np.zeros(len(values), bool)
-    group = np.where(inside, number, -1 - number)  # a run of equal group lies in one stretch, above `leave` or not
+    group = np.where(
+        inside, number, -1 - number
+    )  # a run of equal group lies in one stretch, above `leave` or not
     for start, stop, which in stretches(group):
         out[start:stop] = which >= 0 and bool(high[start:stop].any())
     return out
 
 
 def tidy(
-    mask: Mask, free: Mask, number: NDArray[np.int64], time_s: Array, stop_s: Array, rules: MouseRules
+    mask: Mask,
+    free: Mask,
+    number: NDArray[np.int64],
+    time_s: Array,
+    stop_s: Array,
+    rules: MouseRules,
 ) -> Iterator[tuple[int, int]]:
     """Bouts (start, stop) of a rule's frames: short pauses bridged over free frames, then short bouts dropped."""
     merged: list[tuple[int, int]] = []
@@ -130,23 +150,42 @@ def tidy(
 
 
 def _table(
-    kinematics: pd.DataFrame, label: NDArray[np.object_], raw: dict[str, Mask], number: NDArray[np.int64], stop_s: Array
+    kinematics: pd.DataFrame,
+    label: NDArray[np.object_],
+    raw: dict[str, Mask],
+    number: NDArray[np.int64],
+    stop_s: Array,
 ) -> pd.DataFrame:
     """One row per run of equal labels inside one stretch."""
-    time_s, count = kinematics["time_s"].to_numpy(float), frame_count(kinematics["frame_index"].to_numpy())
+    time_s, count = (
+        kinematics["time_s"].to_numpy(float),
+        frame_count(kinematics["frame_index"].to_numpy()),
+    )
     code = {action: k for k, action in enumerate(ACTIONS)}
     runs = np.array([code.get(word, -1) for word in label], np.int64)
     pieces = [
-        (start, stop) for start, stop, key in stretches(np.where(runs >= 0, runs + len(code) * number, -1)) if key >= 0
+        (start, stop)
+        for start, stop, key in stretches(np.where(runs >= 0, runs + len(code) * number, -1))
+        if key >= 0
     ]
     rows = [(str(label[a]), time_s[a], stop_s[b - 1], count[a], count[b]) for a, b in pieces]
-    action, start_s, end_s, start_frame, stop_frame = zip(*rows, strict=True) if rows else ([], [], [], [], [])
-    named = to_pandas(BOUTS, {
-        "session_id": [kinematics["session_id"].iloc[0]] * len(rows),
-        "individual": [kinematics["individual"].iloc[0]] * len(rows),
-        "action": list(action), "start_s": list(start_s), "stop_s": list(end_s),
-        "duration_s": list(np.subtract(end_s, start_s)), "start_frame": list(start_frame),
-        "stop_frame": list(stop_frame), "score": [float(raw[str(label[a])][a:b].mean()) for a, b in pieces],
-        "source": ["rule"] * len(rows), "model_hash": [""] * len(rows),
-    })  # fmt: skip
+    action, start_s, end_s, start_frame, stop_frame = (
+        zip(*rows, strict=True) if rows else ([], [], [], [], [])
+    )
+    named = to_pandas(
+        BOUTS,
+        {
+            "session_id": [kinematics["session_id"].iloc[0]] * len(rows),
+            "individual": [kinematics["individual"].iloc[0]] * len(rows),
+            "action": list(action),
+            "start_s": list(start_s),
+            "stop_s": list(end_s),
+            "duration_s": list(np.subtract(end_s, start_s)),
+            "start_frame": list(start_frame),
+            "stop_frame": list(stop_frame),
+            "score": [float(raw[str(label[a])][a:b].mean()) for a, b in pieces],
+            "source": ["rule"] * len(rows),
+            "model_hash": [""] * len(rows),
+        },
+    )
     return measure_bouts(named, kinematics)

@@ -32,8 +32,15 @@ if TYPE_CHECKING:
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
-_USUAL = ("distance_m", "mean_speed_mm_s", "mean_abs_yaw_rate_rad_s", "turn_bias", "outer_half_share",
-          "top_third_share", "tail_beat_hz")  # fmt: skip
+_USUAL = (
+    "distance_m",
+    "mean_speed_mm_s",
+    "mean_abs_yaw_rate_rad_s",
+    "turn_bias",
+    "outer_half_share",
+    "top_third_share",
+    "tail_beat_hz",
+)
 
 STATS: tuple[Column, ...] = columns(
     "stats",
@@ -42,16 +49,26 @@ STATS: tuple[Column, ...] = columns(
     ("estimate", "float64", "", "difference of the groups, in the measure's own unit"),
     ("ci_low", "float64", "", "lower end of the difference's 95 % interval", "t, over the units"),
     ("ci_high", "float64", "", "upper end of it", "t, over the units"),
-    ("effect_size", "float64", "", "Hedges' g: the difference in standard deviations between animals",
-     "J x estimate / pooled sd of the animals' means"),
+    (
+        "effect_size",
+        "float64",
+        "",
+        "Hedges' g: the difference in standard deviations between animals",
+        "J x estimate / pooled sd of the animals' means",
+    ),
     ("effect_low", "float64", "", "lower end of its interval", "as effect_size, of ci_low"),
     ("effect_high", "float64", "", "upper end of its interval", "as effect_size, of ci_high"),
     ("p", "float64", "", "two-sided p of the test; empty where there is none, see refused"),
     ("p_fdr", "float64", "", "p, corrected for the size of the family", "Benjamini-Hochberg"),
     ("test", "string", "", "the test that was made"),
     ("refused", "string", "", "why there is no test; empty where there is one"),
-    ("unit", "string", "", "what was assigned to a group, and so what n counts: cage, animal, or an animal's own "
-     "difference"),
+    (
+        "unit",
+        "string",
+        "",
+        "what was assigned to a group, and so what n counts: cage, animal, or an animal's own "
+        "difference",
+    ),
     ("n_units_first", "int64", "", "units in the first group"),
     ("n_units_second", "int64", "", "units in the second group"),
     ("n_animals", "int64", "", "animals in both groups"),
@@ -59,11 +76,22 @@ STATS: tuple[Column, ...] = columns(
     ("n_sessions", "int64", "", "sessions with a value"),
     ("n_bouts", "int64", "", "bouts in them; 0 when not told"),
     ("observed_min", "float64", "min", "time with a pose in them"),
-    ("n_without_value", "int64", "", "sessions of these groups that have no value and are left out"),
-    ("smallest_p", "float64", "", "the smallest p that a permutation of these units can give", "2 / arrangements"),
+    (
+        "n_without_value",
+        "int64",
+        "",
+        "sessions of these groups that have no value and are left out",
+    ),
+    (
+        "smallest_p",
+        "float64",
+        "",
+        "the smallest p that a permutation of these units can give",
+        "2 / arrangements",
+    ),
     ("family", "string", "", "the tests that p_fdr is corrected for"),
     ("n_family", "int64", "", "how many they are"),
-)  # fmt: skip
+)
 
 
 def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
@@ -71,15 +99,23 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
     rows = []
     for session in sessions:
         who = session.table("sessions")
-        table = who.merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
+        table = who.merge(
+            session.summary, on=["session_id", "individual"], suffixes=("", "_summary")
+        )
         rows.append(table.assign(n_bouts=len(session.table("bouts", ["action"]))))
-    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame(columns=["session_id", *WHO])
+    return (
+        pd.concat(rows, ignore_index=True) if rows else pd.DataFrame(columns=["session_id", *WHO])
+    )
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
     """What is compared when nobody says: the usual ones that have values, and every action's share."""
-    shares = [str(name) for name in table.columns if str(name).removesuffix("_share") + "_count" in table.columns
-              and str(name).endswith("_share")]  # fmt: skip
+    shares = [
+        str(name)
+        for name in table.columns
+        if str(name).removesuffix("_share") + "_count" in table.columns
+        and str(name).endswith("_share")
+    ]
     return [name for name in (*_USUAL, *shares) if name in table and table[name].notna().any()]
 
 
@@ -105,11 +141,17 @@ def compare(
     if reference is None:
         pairs = list(combinations(groups, 2))
     else:
-        pairs = [(reference, other) for other in groups if other != reference and reference in groups]
+        pairs = [
+            (reference, other) for other in groups if other != reference and reference in groups
+        ]
     rows = []
     for k, (measure, pair) in enumerate((measure, pair) for measure in measures for pair in pairs):
         own = table.assign(value=_values(table, measure))
-        rows.append(_compare_one(own, measure, pair, engine, blocks, alpha, np.random.default_rng([seed, k])))
+        rows.append(
+            _compare_one(
+                own, measure, pair, engine, blocks, alpha, np.random.default_rng([seed, k])
+            )
+        )
     corrected = false_discovery([row["p"] for row in rows])
     n_family = int(np.isfinite(corrected).sum())
     for row, p in zip(rows, corrected, strict=True):
@@ -125,26 +167,52 @@ def _prepared(table: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
 
 
 def _values(table: pd.DataFrame, measure: str) -> pd.Series[Any]:
-    return table[measure].astype(float) if measure in table else pd.Series(np.nan, index=table.index)
+    return (
+        table[measure].astype(float) if measure in table else pd.Series(np.nan, index=table.index)
+    )
 
 
 def _compare_one(
-    table: pd.DataFrame, measure: str, groups: tuple[str, str], engine: str, blocks: Sequence[str], alpha: float,
+    table: pd.DataFrame,
+    measure: str,
+    groups: tuple[str, str],
+    engine: str,
+    blocks: Sequence[str],
+    alpha: float,
     rng: np.random.Generator,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """One row of the table."""
     own = table[table["group"].isin(groups)]
     rows = own[np.isfinite(own["value"])]
     cages = set(rows["cage"]) - {""}
     row: dict[str, Any] = {
-        "measure": measure, "contrast": f"{groups[1]} - {groups[0]}", "unit": "", "test": "", "refused": "",
-        **dict.fromkeys(("estimate", "ci_low", "ci_high", "effect_size", "effect_low", "effect_high", "p",
-                         "smallest_p"), np.nan),
-        "n_units_first": 0, "n_units_second": 0, "n_animals": int(rows["subject_id"].nunique()), "n_cages": len(cages),
-        "n_sessions": len(rows), "n_bouts": int(rows["n_bouts"].sum()) if "n_bouts" in rows else 0,
+        "measure": measure,
+        "contrast": f"{groups[1]} - {groups[0]}",
+        "unit": "",
+        "test": "",
+        "refused": "",
+        **dict.fromkeys(
+            (
+                "estimate",
+                "ci_low",
+                "ci_high",
+                "effect_size",
+                "effect_low",
+                "effect_high",
+                "p",
+                "smallest_p",
+            ),
+            np.nan,
+        ),
+        "n_units_first": 0,
+        "n_units_second": 0,
+        "n_animals": int(rows["subject_id"].nunique()),
+        "n_cages": len(cages),
+        "n_sessions": len(rows),
+        "n_bouts": int(rows["n_bouts"].sum()) if "n_bouts" in rows else 0,
         "observed_min": float(rows["observed_s"].sum()) / 60.0 if "observed_s" in rows else np.nan,
         "n_without_value": len(own) - len(rows),
-    }  # fmt: skip
+    }
     try:
         units = find_units(rows, groups, blocks)
         row |= _described(units)
@@ -160,23 +228,42 @@ def _compare_one(
 
 def _described(units: Units) -> dict[str, Any]:
     n = len(units.values)
-    first, second = (n, n) if units.paired else (int((~units.second).sum()), int(units.second.sum()))
-    return {"unit": units.unit, "n_units_first": first, "n_units_second": second, "smallest_p": smallest_p(units)}
+    first, second = (
+        (n, n) if units.paired else (int((~units.second).sum()), int(units.second.sum()))
+    )
+    return {
+        "unit": units.unit,
+        "n_units_first": first,
+        "n_units_second": second,
+        "smallest_p": smallest_p(units),
+    }
 
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
     """The difference, and the same in standard deviations between animals."""
     second = (rows["group"] == groups[1]).to_numpy()
-    animal = pd.factorize(rows["subject_id"])[0] * 2 + second  # one that was in both groups counts in both
+    animal = (
+        pd.factorize(rows["subject_id"])[0] * 2 + second
+    )  # one that was in both groups counts in both
     places, number = np.unique(animal, return_inverse=True)
-    sd, correction = spread_of_animals(animal_means(rows["value"].to_numpy(float), number), places % 2 == 1)
+    sd, correction = spread_of_animals(
+        animal_means(rows["value"].to_numpy(float), number), places % 2 == 1
+    )
     known = {"estimate": found.difference, "ci_low": found.low, "ci_high": found.high}
     effect = {"effect_size": found.difference, "effect_low": found.low, "effect_high": found.high}
-    return {**known, **{name: correction * value / sd if sd > 0 else np.nan for name, value in effect.items()}}
+    return {
+        **known,
+        **{name: correction * value / sd if sd > 0 else np.nan for name, value in effect.items()},
+    }
 
 
 def _tested(
-    rows: pd.DataFrame, units: Units, groups: tuple[str, str], engine: str, alpha: float, rng: np.random.Generator
+    rows: pd.DataFrame,
+    units: Units,
+    groups: tuple[str, str],
+    engine: str,
+    alpha: float,
+    rng: np.random.Generator,
 ) -> dict[str, Any]:
     """The p and the test's name. Raises NotComparable where the permutation cannot reach alpha."""
     enough = min(int((~units.second).sum()), int(units.second.sum())) >= FEWEST_FOR_MODEL
@@ -201,9 +288,11 @@ def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
         return ""
     units = ", ".join(sorted(set(done["unit"])))
     tests = "; ".join(sorted(set(done["test"])))
-    text = (f"Sessions were averaged per animal; the unit of comparison is the {units}. " if units else "") + (
-        f"Tests: {tests}. " if tests else ""
-    )
+    text = (
+        f"Sessions were averaged per animal; the unit of comparison is the {units}. "
+        if units
+        else ""
+    ) + (f"Tests: {tests}. " if tests else "")
     text += (
         "Differences are given with 95 % intervals, and as Hedges' g relative to the standard deviation between "
         f"animals. p values are two-sided and corrected by Benjamini and Hochberg's procedure over {len(done)} tests "

@@ -45,7 +45,9 @@ class Units:
 CAGE, ANIMAL, PAIRED = "cage", "animal", "animal, in both groups"
 
 
-def find_units(rows: pd.DataFrame, groups: tuple[str, str], blocks: Sequence[str] = ("batch",)) -> Units:
+def find_units(
+    rows: pd.DataFrame, groups: tuple[str, str], blocks: Sequence[str] = ("batch",)
+) -> Units:
     """The units of a comparison of two groups from one row per session.
 
     rows: subject_id, group, cage, value and the columns named in `blocks`; an empty cage or block is not known.
@@ -54,7 +56,9 @@ def find_units(rows: pd.DataFrame, groups: tuple[str, str], blocks: Sequence[str
     rows = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
     nameless = int((rows["subject_id"] == "").sum())
     if nameless:
-        raise NotComparable(f"{nameless} sessions do not say which animal they are of; state subject_id in the study")
+        raise NotComparable(
+            f"{nameless} sessions do not say which animal they are of; state subject_id in the study"
+        )
     of_animal = rows.groupby("subject_id")["group"].nunique()
     both = [str(name) for name in of_animal.index[of_animal > 1]]
     if both and len(both) == len(of_animal):
@@ -68,7 +72,9 @@ def find_units(rows: pd.DataFrame, groups: tuple[str, str], blocks: Sequence[str
     second = (animals["group"] == groups[1]).to_numpy()
     for group, number in ((groups[0], int((~second).sum())), (groups[1], int(second.sum()))):
         if number < 2:
-            raise NotComparable(f"the group {group} has {number} animals with a value, and a comparison needs two")
+            raise NotComparable(
+                f"the group {group} has {number} animals with a value, and a comparison needs two"
+            )
     cage = animals["cage"].to_numpy(str)
     _check_cages(cage)
     crowded = len(set(cage)) < len(cage) and bool(cage[0])
@@ -84,7 +90,10 @@ def _animals(rows: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
     """One row per animal, its value the mean of its sessions'."""
     animal, names = pd.factorize(rows["subject_id"], sort=True)
     first = np.unique(animal, return_index=True)[1]
-    columns: dict[str, Any] = {"subject_id": names, "value": animal_means(rows["value"].to_numpy(float), animal)}
+    columns: dict[str, Any] = {
+        "subject_id": names,
+        "value": animal_means(rows["value"].to_numpy(float), animal),
+    }
     for name in ("group", "cage", *(block for block in blocks if block in rows)):
         of_session = rows[name].to_numpy(str)
         columns[name] = of_session[first]
@@ -111,16 +120,26 @@ def _holds_both(cage: NDArray[np.str_], second: NDArray[np.bool_]) -> bool:
     return any(0 < second[cage == name].sum() < (cage == name).sum() for name in np.unique(cage))
 
 
-def _blocks(animals: pd.DataFrame, names: Sequence[str], second: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _blocks(
+    animals: pd.DataFrame, names: Sequence[str], second: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """(n,) the block of each animal: what it may be exchanged within.
 
     A block of one group is no use; if all are so, group and block cannot be told apart, and the comparison is refused.
     """
-    known = [name for name in names if name in animals and (animals[name] != "").all() and animals[name].nunique() > 1]
+    known = [
+        name
+        for name in names
+        if name in animals and (animals[name] != "").all() and animals[name].nunique() > 1
+    ]
     block = np.zeros(len(animals), np.int64)
     for name in known:
-        block = np.unique(np.stack([block, pd.factorize(animals[name])[0]]), axis=1, return_inverse=True)[1].ravel()
-    if known and not any(0 < second[block == b].sum() < (block == b).sum() for b in np.unique(block)):
+        block = np.unique(
+            np.stack([block, pd.factorize(animals[name])[0]]), axis=1, return_inverse=True
+        )[1].ravel()
+    if known and not any(
+        0 < second[block == b].sum() < (block == b).sum() for b in np.unique(block)
+    ):
         raise NotComparable(
             f"every {' and '.join(known)} has animals of one group only, so a difference may be that of the "
             f"{known[0]}; record both groups in each"
@@ -128,17 +147,27 @@ def _blocks(animals: pd.DataFrame, names: Sequence[str], second: NDArray[np.bool
     return block
 
 
-def _whole_cages(animals: pd.DataFrame, second: NDArray[np.bool_], block: NDArray[np.int64]) -> Units:
+def _whole_cages(
+    animals: pd.DataFrame, second: NDArray[np.bool_], block: NDArray[np.int64]
+) -> Units:
     """One value per cage, the mean of its animals'."""
     table = animals.assign(second=second, block=block)
     cages = table.groupby("cage", sort=True).agg(
-        value=("value", "mean"), second=("second", "first"), block=("block", "first"), n=("value", "size"),
+        value=("value", "mean"),
+        second=("second", "first"),
+        block=("block", "first"),
+        n=("value", "size"),
         blocks=("block", "nunique"),
-    )  # fmt: skip
+    )
     if (cages["blocks"] > 1).any():
         raise NotComparable("some cages are in more than one batch; give each cage one")
-    return Units(CAGE, cages["value"].to_numpy(float), cages["second"].to_numpy(bool),
-                 cages["block"].to_numpy(np.int64), cages["n"].to_numpy(np.int64))  # fmt: skip
+    return Units(
+        CAGE,
+        cages["value"].to_numpy(float),
+        cages["second"].to_numpy(bool),
+        cages["block"].to_numpy(np.int64),
+        cages["n"].to_numpy(np.int64),
+    )
 
 
 def _own_differences(rows: pd.DataFrame, groups: tuple[str, str]) -> Units:

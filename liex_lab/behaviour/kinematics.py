@@ -27,16 +27,37 @@ from liex_lab.tracking.track import Track
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-HALF_WINDOW_S = 0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
+HALF_WINDOW_S = (
+    0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
+)
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 ERROR_LASTS_S = 0.3  # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
 _BLOCK = 16_384  # frames whose postures are in memory at a time
 _MOVING = (
-    "x_mm", "y_mm", "z_mm", "position_sd_mm", "speed_mm_s", "speed_sd_mm_s", "vertical_speed_mm_s", "step_mm",
-    "acceleration_mm_s2", "acceleration_sd_mm_s2", "heading_rad", "heading_sd_rad", "yaw_rate_rad_s",
-    "yaw_rate_sd_rad_s", "body_pitch_rad", "body_pitch_sd_rad",
-)  # fmt: skip
-_HEIGHTS = ("nose_height_mm", "nose_height_sd_mm", "back_height_mm", "nose_over_rump_mm", "reach_mm")
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "position_sd_mm",
+    "speed_mm_s",
+    "speed_sd_mm_s",
+    "vertical_speed_mm_s",
+    "step_mm",
+    "acceleration_mm_s2",
+    "acceleration_sd_mm_s2",
+    "heading_rad",
+    "heading_sd_rad",
+    "yaw_rate_rad_s",
+    "yaw_rate_sd_rad_s",
+    "body_pitch_rad",
+    "body_pitch_sd_rad",
+)
+_HEIGHTS = (
+    "nose_height_mm",
+    "nose_height_sd_mm",
+    "back_height_mm",
+    "nose_over_rump_mm",
+    "reach_mm",
+)
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
@@ -77,7 +98,9 @@ class Spans:
         """(m,) standard deviation of the rate of values with these (n,); the nearer two frames, the more they agree."""
         first, second = sd[self.before], sd[self.after]
         shared = np.exp(-self.span_s / ERROR_LASTS_S)
-        return np.asarray(np.sqrt(first**2 + second**2 - 2.0 * shared * first * second) / self.span_s)
+        return np.asarray(
+            np.sqrt(first**2 + second**2 - 2.0 * shared * first * second) / self.span_s
+        )
 
 
 def kinematics(
@@ -99,10 +122,19 @@ def kinematics(
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
     spans = Spans.of(time_s, observed, half_window_s)
-    block: dict[str, Any] = {name: _put_away(frames[name], room) for name in ("frame_index", "time_s", "dt_s")}
+    block: dict[str, Any] = {
+        name: _put_away(frames[name], room) for name in ("frame_index", "time_s", "dt_s")
+    }
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
-    block |= _moving(shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, room)
-    block |= {"length_mm": shape.length_mm, "straightness": shape.straightness, "bend_rad": shape.bend_rad, **heights}
+    block |= _moving(
+        shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, room
+    )
+    block |= {
+        "length_mm": shape.length_mm,
+        "straightness": shape.straightness,
+        "bend_rad": shape.bend_rad,
+        **heights,
+    }
     if body.swims:
         block |= _swimming(shape, time_s, segments(time_s, observed), surface_z_mm)
     return to_pandas(kinematics_columns(body.swims), block, copy=False)
@@ -152,19 +184,34 @@ def _moving(
         flat = np.abs(shape.pitch_rad[rows]) < STEEP_RAD
         heading[rows] = np.where(flat, shape.heading_rad[rows], np.nan)
         heading_sd[rows] = np.where(flat, shape.heading_sd_rad[rows], np.nan)
-        _put(columns, rows, {
-            "x_mm": centre[:, 0], "y_mm": centre[:, 1], "z_mm": centre[:, 2], "position_sd_mm": shape.centre_sd[rows],
-            "vertical_speed_mm_s": velocity[:, 2], "step_mm": speed[rows] * hold_s[rows],
-            "body_pitch_rad": shape.pitch_rad[rows], "body_pitch_sd_rad": shape.pitch_sd_rad[rows],
-        })  # fmt: skip
+        _put(
+            columns,
+            rows,
+            {
+                "x_mm": centre[:, 0],
+                "y_mm": centre[:, 1],
+                "z_mm": centre[:, 2],
+                "position_sd_mm": shape.centre_sd[rows],
+                "vertical_speed_mm_s": velocity[:, 2],
+                "step_mm": speed[rows] * hold_s[rows],
+                "body_pitch_rad": shape.pitch_rad[rows],
+                "body_pitch_sd_rad": shape.pitch_sd_rad[rows],
+            },
+        )
         shape.rest()
         let_go(*columns.values())
     for rows in blocks(len(hold_s), _BLOCK):  # now that those of the neighbours are known
         here = spans[rows]
-        _put(columns, rows, {
-            "acceleration_mm_s2": here.rate(speed), "acceleration_sd_mm_s2": here.sd(speed_sd),
-            "yaw_rate_rad_s": here.turning(heading), "yaw_rate_sd_rad_s": here.sd(heading_sd),
-        })  # fmt: skip
+        _put(
+            columns,
+            rows,
+            {
+                "acceleration_mm_s2": here.rate(speed),
+                "acceleration_sd_mm_s2": here.sd(speed_sd),
+                "yaw_rate_rad_s": here.turning(heading),
+                "yaw_rate_sd_rad_s": here.sd(heading_sd),
+            },
+        )
         let_go(*columns.values())
     return columns
 
@@ -173,24 +220,32 @@ def _walking(body: Body, xyz: Array, sd: Array) -> dict[str, Array]:
     """Heights of an animal that stands on the floor."""
     nose, rump = xyz[:, body.front], xyz[:, body.rear]
     return {
-        "nose_height_mm": nose[:, 2], "nose_height_sd_mm": sd[:, body.front],
+        "nose_height_mm": nose[:, 2],
+        "nose_height_sd_mm": sd[:, body.front],
         "back_height_mm": xyz[:, list(body.back), 2].max(axis=1),
         "nose_over_rump_mm": nose[:, 2] - rump[:, 2],
         "reach_mm": np.hypot(*(nose - rump)[:, :2].T),
-    }  # fmt: skip
+    }
 
 
-def _swimming(shape: Shape, time_s: Array, number: Rows, surface_z_mm: float | None) -> dict[str, Array]:
+def _swimming(
+    shape: Shape, time_s: Array, number: Rows, surface_z_mm: float | None
+) -> dict[str, Array]:
     """Curvature along the body, the tail's beat, and the depth below the surface."""
     beat = tail_beat(shape, time_s, number, median_step(time_s))
     surface = np.nan if surface_z_mm is None else surface_z_mm
     front, middle, rear = shape.thirds_rad.T
     return {
-        "bend_front_rad": front, "bend_middle_rad": middle, "bend_rear_rad": rear,
-        "tail_angle_rad": shape.tail_angle_rad, "tail_mm": shape.tail_mm,
-        "tail_extreme_rad": beat.extreme_rad, "tail_beat_hz": beat.frequency_hz,
-        "tail_beat_mm": beat.amplitude_mm, "below_surface_mm": surface - shape.centre[:, 2],
-    }  # fmt: skip
+        "bend_front_rad": front,
+        "bend_middle_rad": middle,
+        "bend_rear_rad": rear,
+        "tail_angle_rad": shape.tail_angle_rad,
+        "tail_mm": shape.tail_mm,
+        "tail_extreme_rad": beat.extreme_rad,
+        "tail_beat_hz": beat.frequency_hz,
+        "tail_beat_mm": beat.amplitude_mm,
+        "below_surface_mm": surface - shape.centre[:, 2],
+    }
 
 
 @dataclass(frozen=True)
@@ -207,11 +262,23 @@ class Joints:
     def of_table(poses: pd.DataFrame, n: int) -> Joints:
         """Those of the table `poses` of n frames."""
         column = poses["joint"]
-        names = column.cat.categories if isinstance(column.dtype, pd.CategoricalDtype) else pd.unique(column)
+        names = (
+            column.cat.categories
+            if isinstance(column.dtype, pd.CategoricalDtype)
+            else pd.unique(column)
+        )
         shape = (n, len(names))
         xyz = [poses[name].to_numpy(float).reshape(shape) for name in ("x_mm", "y_mm", "z_mm")]
-        sd = poses["sd_mm"].to_numpy(float).reshape(shape) if "sd_mm" in poses else np.full(shape, np.nan)
-        return Joints([str(name) for name in names], n, lambda rows: (_apart([one[rows] for one in xyz]), sd[rows]))
+        sd = (
+            poses["sd_mm"].to_numpy(float).reshape(shape)
+            if "sd_mm" in poses
+            else np.full(shape, np.nan)
+        )
+        return Joints(
+            [str(name) for name in names],
+            n,
+            lambda rows: (_apart([one[rows] for one in xyz]), sd[rows]),
+        )
 
     @staticmethod
     def of_track(track: Track) -> Joints:
@@ -234,17 +301,23 @@ def _apart(xyz: Sequence[Array]) -> Array:
 
 def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
     """(n,) the number of the unbroken stretch each frame belongs to: no missing frame, no lost animal inside."""
-    broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[: len(time_s)]
+    broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[
+        : len(time_s)
+    ]
     return np.asarray(np.cumsum(broken) - 1)
 
 
-def neighbours(time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S) -> tuple[Rows, Rows]:
+def neighbours(
+    time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S
+) -> tuple[Rows, Rows]:
     """(n,) rows to difference between: about `half_window_s` before and after, never outside the frame's own stretch.
 
     At the ends of a stretch the difference is one-sided; a stretch of one frame has none (before == after).
     """
     n, rows = len(time_s), np.arange(len(time_s))
-    reach = 0.75 * half_window_s  # at the camera's own rate the next frame counts, jitter of its clock or not
+    reach = (
+        0.75 * half_window_s
+    )  # at the camera's own rate the next frame counts, jitter of its clock or not
     before = np.searchsorted(time_s, time_s - reach, side="right") - 1
     after = np.searchsorted(time_s, time_s + reach, side="left")
     number = segments(time_s, observed)

@@ -16,7 +16,9 @@ from liex_lab.tables.schema import BOUTS, to_pandas
 
 Array = NDArray[np.float64]
 _MOST_LAG_S = 0.25  # a wave that takes longer for a third of the body is none
-_LEAST_CORRELATION = 0.5  # of the curvatures of two thirds of the body, for a wave that runs from one to the other
+_LEAST_CORRELATION = (
+    0.5  # of the curvatures of two thirds of the body, for a wave that runs from one to the other
+)
 
 
 def measure_bouts(bouts: pd.DataFrame, kinematics: pd.DataFrame) -> pd.DataFrame:
@@ -36,7 +38,9 @@ def measure_bouts(bouts: pd.DataFrame, kinematics: pd.DataFrame) -> pd.DataFrame
             block[column.name] = reader.since_last(bouts, spans)
         else:
             empty = 0 if column.dtype == "int64" else np.nan
-            block[column.name] = [m[column.name] if column.name in known else empty for m in measured]
+            block[column.name] = [
+                m[column.name] if column.name in known else empty for m in measured
+            ]
     return to_pandas([*BOUTS, *described], block)
 
 
@@ -61,7 +65,10 @@ class BoutReader:
         starts = np.searchsorted(self.frame_index, bouts["start_frame"].to_numpy())
         stops = np.searchsorted(self.frame_index, bouts["stop_frame"].to_numpy())
         n = len(self.frame_index)
-        return [(min(int(a), n - 1), min(max(int(b), int(a) + 1), n)) for a, b in zip(starts, stops, strict=True)]
+        return [
+            (min(int(a), n - 1), min(max(int(b), int(a) + 1), n))
+            for a, b in zip(starts, stops, strict=True)
+        ]
 
     def measure(self, start: int, stop: int) -> dict[str, float]:
         """All measures but the one that needs the bout before."""
@@ -76,7 +83,10 @@ class BoutReader:
         begin, end = bouts["start_s"].to_numpy(float), bouts["stop_s"].to_numpy(float)
         for k, action in enumerate(bouts["action"]):
             before = last.get(action)
-            if before is not None and number[spans[before][1] - 1] == number[min(spans[k][0], len(number) - 1)]:
+            if (
+                before is not None
+                and number[spans[before][1] - 1] == number[min(spans[k][0], len(number) - 1)]
+            ):
                 out[k] = begin[k] - end[before]
             last[action] = k
         return out
@@ -97,16 +107,25 @@ class BoutReader:
         off = self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
         top = known[speed[known].argmax()] if len(known) else None
         return {
-            "path_mm": path, "path_bl": path / self.length_mm,
-            "displacement_mm": float(np.linalg.norm(off if self.swims else off[:2])), "rise_mm": float(off[2]),
+            "path_mm": path,
+            "path_bl": path / self.length_mm,
+            "displacement_mm": float(np.linalg.norm(off if self.swims else off[:2])),
+            "rise_mm": float(off[2]),
             "mean_speed_mm_s": path / timed if timed > 0 else np.nan,
             "peak_speed_mm_s": np.nan if top is None else float(speed[top]),
-            "peak_speed_sd_mm_s": np.nan if top is None else float(self._cut("speed_sd_mm_s", start, stop)[top]),
-            "time_to_peak_s": np.nan if top is None else float(self.time_s[start + top] - self.time_s[start]),
-        }  # fmt: skip
+            "peak_speed_sd_mm_s": np.nan
+            if top is None
+            else float(self._cut("speed_sd_mm_s", start, stop)[top]),
+            "time_to_peak_s": np.nan
+            if top is None
+            else float(self.time_s[start + top] - self.time_s[start]),
+        }
 
     def _turn(self, start: int, stop: int) -> dict[str, float]:
-        heading, sd = self._cut("heading_rad", start, stop), self._cut("heading_sd_rad", start, stop)
+        heading, sd = (
+            self._cut("heading_rad", start, stop),
+            self._cut("heading_sd_rad", start, stop),
+        )
         known = np.isfinite(heading)
         way = np.append(0.0, np.cumsum(smallest_turn(np.diff(heading[known]))))
         pitch, bend = self._cut("body_pitch_rad", start, stop), self._cut("bend_rad", start, stop)
@@ -126,27 +145,41 @@ class BoutReader:
         top = known[nose[known].argmax()] if len(known) else None
         return {
             "peak_nose_height_mm": np.nan if top is None else float(nose[top]),
-            "time_to_peak_height_s": np.nan if top is None else float(self.time_s[start + top] - self.time_s[start]),
+            "time_to_peak_height_s": np.nan
+            if top is None
+            else float(self.time_s[start + top] - self.time_s[start]),
         }
 
     def _tail(self, start: int, stop: int) -> dict[str, float]:
-        angle, bends = self._cut("tail_angle_rad", start, stop), self._cut("tail_extreme_rad", start, stop)
+        angle, bends = (
+            self._cut("tail_angle_rad", start, stop),
+            self._cut("tail_extreme_rad", start, stop),
+        )
         beat, hold = self._cut("tail_beat_hz", start, stop), self.hold_s[start:stop]
         at = np.flatnonzero(np.isfinite(bends))
         size, n = np.abs(bends[at]), len(at)
         duration = float(self.time_s[stop - 1] + hold[-1] - self.time_s[start])
         left, right = max(_max(angle), 0.0), max(_max(-angle), 0.0)
         return {
-            "n_bends": n, "n_oscillations": n / 2.0, "tail_beat_hz": n / 2.0 / duration,
-            "tail_beat_max_hz": _max(beat), "tail_beat_mean_hz": _mean(beat), "tail_beat_median_hz": _median(beat),
-            "tail_max_rad": _max(size), "tail_mean_rad": _mean(size), "tail_median_rad": _median(size),
+            "n_bends": n,
+            "n_oscillations": n / 2.0,
+            "tail_beat_hz": n / 2.0 / duration,
+            "tail_beat_max_hz": _max(beat),
+            "tail_beat_mean_hz": _mean(beat),
+            "tail_beat_median_hz": _median(beat),
+            "tail_max_rad": _max(size),
+            "tail_mean_rad": _mean(size),
+            "tail_median_rad": _median(size),
             "first_bend_s": float(self.time_s[start + at[0]] - self.time_s[start]) if n else np.nan,
             "first_bend_rad": float(bends[at[0]]) if n else np.nan,
             "second_over_first": float(bends[at[1]] / bends[at[0]]) if n > 1 else np.nan,
-            "tail_angle_mean_rad": _mean_over(angle, hold), "tail_angle_mean_abs_rad": _mean_over(np.abs(angle), hold),
-            "tail_symmetry": min(left, right) / max(left, right) if max(left, right) > 0 else np.nan,
+            "tail_angle_mean_rad": _mean_over(angle, hold),
+            "tail_angle_mean_abs_rad": _mean_over(np.abs(angle), hold),
+            "tail_symmetry": min(left, right) / max(left, right)
+            if max(left, right) > 0
+            else np.nan,
             "wave_speed_mm_s": self._wave(start, stop) if n > 1 else np.nan,
-        }  # fmt: skip
+        }
 
     def _wave(self, start: int, stop: int) -> float:
         """Speed, mm/s, of the bend that runs from the middle third of the body to the rear one."""
@@ -154,7 +187,9 @@ class BoutReader:
         if not (np.isfinite(middle).all() and np.isfinite(rear).all()) or stop - start < 8:
             return np.nan
         time = self.time_s[start:stop]
-        fine: Array = np.arange(time[0], time[-1], 0.1 / self.fps)  # true times, on an even grid ten times as fine
+        fine: Array = np.arange(
+            time[0], time[-1], 0.1 / self.fps
+        )  # true times, on an even grid ten times as fine
         a, b = (np.interp(fine, time, curve) - curve.mean() for curve in (middle, rear))
         most = min(int(_MOST_LAG_S * 10 * self.fps), len(fine) // 2)
         agreement = [_correlation(a[: len(a) - lag], b[lag:]) for lag in range(most)]

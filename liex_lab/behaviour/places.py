@@ -39,7 +39,9 @@ def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> fl
     return height if height > 0 else None
 
 
-def visits(frames: pd.DataFrame, kinematics: pd.DataFrame, zones: Sequence[str], rules: MouseRules) -> pd.DataFrame:
+def visits(
+    frames: pd.DataFrame, kinematics: pd.DataFrame, zones: Sequence[str], rules: MouseRules
+) -> pd.DataFrame:
     """The table `zones`: one row per zone."""
     time_s = kinematics["time_s"].to_numpy(float)
     stop_s = stop_times(time_s)
@@ -53,13 +55,23 @@ def visits(frames: pd.DataFrame, kinematics: pd.DataFrame, zones: Sequence[str],
         here = inside & observed
         stays = list(tidy(here, observed, number, time_s, stop_s, rules))
         lengths = [stop_s[b - 1] - time_s[a] for a, b in stays]
-        rows.append((zone, hold[here].sum(), hold[here].sum() / hold.sum() if hold.sum() > 0 else np.nan, len(stays),
-                     time_s[stays[0][0]] - first if stays else np.nan, np.mean(lengths) if stays else np.nan,
-                     step[here].sum()))  # fmt: skip
+        rows.append(
+            (
+                zone,
+                hold[here].sum(),
+                hold[here].sum() / hold.sum() if hold.sum() > 0 else np.nan,
+                len(stays),
+                time_s[stays[0][0]] - first if stays else np.nan,
+                np.mean(lengths) if stays else np.nan,
+                step[here].sum(),
+            )
+        )
     names = [column.name for column in ZONES[2:]]
     values = zip(*rows, strict=True) if rows else [[] for _ in names]
     who = {name: [str(frames[name].iloc[0])] * len(rows) for name in ("session_id", "individual")}
-    return to_pandas(ZONES, {**who, **{name: list(column) for name, column in zip(names, values, strict=True)}})
+    return to_pandas(
+        ZONES, {**who, **{name: list(column) for name, column in zip(names, values, strict=True)}}
+    )
 
 
 def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
@@ -68,7 +80,10 @@ def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
         return []
     words = pd.Series(frames["zone"].astype(str))
     different = {text: set(text.split(SEPARATOR)) for text in words.unique()}
-    return [words.map({text: zone in names for text, names in different.items()}).to_numpy(bool) for zone in zones]
+    return [
+        words.map({text: zone in names for text, names in different.items()}).to_numpy(bool)
+        for zone in zones
+    ]
 
 
 def outer_margin_mm(arena: Arena) -> float:
@@ -83,21 +98,38 @@ def outer_margin_mm(arena: Arena) -> float:
 
 def place_measures(frames: pd.DataFrame, hold: Array, arena: Arena) -> dict[str, float]:
     """Distance from the walls; hold (n,) s is how long each observed frame counts, 0 for the others."""
-    wall = frames["wall_distance_mm"].to_numpy(float) if "wall_distance_mm" in frames else np.full(len(frames), np.nan)
+    wall = (
+        frames["wall_distance_mm"].to_numpy(float)
+        if "wall_distance_mm" in frames
+        else np.full(len(frames), np.nan)
+    )
     known = np.isfinite(wall) & (hold > 0)
     margin = outer_margin_mm(arena)
     time = float(hold[known].sum())
-    outer = float(hold[known & (wall < margin)].sum()) / time if time > 0 and np.isfinite(margin) else np.nan
-    return {"wall_distance_mm": float(np.median(wall[known])) if known.any() else np.nan, "outer_half_share": outer}
+    outer = (
+        float(hold[known & (wall < margin)].sum()) / time
+        if time > 0 and np.isfinite(margin)
+        else np.nan
+    )
+    return {
+        "wall_distance_mm": float(np.median(wall[known])) if known.any() else np.nan,
+        "outer_half_share": outer,
+    }
 
 
-def depth_measures(kinematics: pd.DataFrame, hold: Array, surface_z_mm: float | None) -> dict[str, float]:
+def depth_measures(
+    kinematics: pd.DataFrame, hold: Array, surface_z_mm: float | None
+) -> dict[str, float]:
     """Where in the water the animal was."""
     z, time_s = kinematics["z_mm"].to_numpy(float), kinematics["time_s"].to_numpy(float)
     known = np.isfinite(z)
     total = float(hold[known].sum())
-    out = {"mean_height_mm": float((z[known] * hold[known]).sum()) / total if total > 0 else np.nan,
-           "top_third_share": np.nan, "bottom_third_share": np.nan, "top_third_latency_s": np.nan}  # fmt: skip
+    out = {
+        "mean_height_mm": float((z[known] * hold[known]).sum()) / total if total > 0 else np.nan,
+        "top_third_share": np.nan,
+        "bottom_third_share": np.nan,
+        "top_third_latency_s": np.nan,
+    }
     if surface_z_mm is None or total <= 0:
         return out
     top = known & (z > 2.0 / 3.0 * surface_z_mm)

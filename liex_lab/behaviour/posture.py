@@ -40,9 +40,14 @@ class Posture:
         """From all joints (n, J, 3) mm and their sd (n, J)."""
         spine, trunk, (start, stop) = list(body.spine), list(body.trunk), body.axis
         return Posture(
-            body, xyz[:, spine], sd[:, spine], xyz[:, trunk].mean(axis=1), sd[:, trunk].mean(axis=1),
-            xyz[:, stop] - xyz[:, start], np.hypot(sd[:, start], sd[:, stop]),
-        )  # fmt: skip
+            body,
+            xyz[:, spine],
+            sd[:, spine],
+            xyz[:, trunk].mean(axis=1),
+            sd[:, trunk].mean(axis=1),
+            xyz[:, stop] - xyz[:, start],
+            np.hypot(sd[:, start], sd[:, stop]),
+        )
 
     @cached_property
     def pitch_rad(self) -> Array:
@@ -72,7 +77,9 @@ class Posture:
     @cached_property
     def straightness(self) -> Array:
         """(n,) distance of the chain's ends over its length: 1 is straight."""
-        return np.linalg.norm(self.spine[:, 0] - self.spine[:, -1], axis=1) / _positive(self.length_mm)
+        return np.linalg.norm(self.spine[:, 0] - self.spine[:, -1], axis=1) / _positive(
+            self.length_mm
+        )
 
     @cached_property
     def turns_rad(self) -> Array:
@@ -86,7 +93,11 @@ class Posture:
     @cached_property
     def bend_rad(self) -> Array:
         """(n,) the whole turn from the front bone to the rear one."""
-        return np.asarray(self.turns_rad.sum(axis=1)) if self.spine.shape[1] > 2 else np.full(len(self.spine), np.nan)
+        return (
+            np.asarray(self.turns_rad.sum(axis=1))
+            if self.spine.shape[1] > 2
+            else np.full(len(self.spine), np.nan)
+        )
 
     @cached_property
     def rear_sd_mm(self) -> Array:

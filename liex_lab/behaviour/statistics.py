@@ -55,23 +55,31 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
 
 def _within_blocks(units: Units) -> tuple[float, float, float]:
     """Least squares with a mean for each block: difference, its standard error, degrees of freedom."""
-    design = np.concatenate([units.second[:, None], units.block[:, None] == np.unique(units.block)], axis=1).astype(
-        float
-    )
+    design = np.concatenate(
+        [units.second[:, None], units.block[:, None] == np.unique(units.block)], axis=1
+    ).astype(float)
     found, _, rank, _ = np.linalg.lstsq(design, units.values, rcond=None)
     freedom = len(units.values) - int(rank)
     if freedom < 1:
         return float(found[0]), np.inf, 1.0
     residual = units.values - design @ found
     variance = float(residual @ residual) / freedom
-    return float(found[0]), float(np.sqrt(variance * np.linalg.pinv(design.T @ design)[0, 0])), float(freedom)
+    return (
+        float(found[0]),
+        float(np.sqrt(variance * np.linalg.pinv(design.T @ design)[0, 0])),
+        float(freedom),
+    )
 
 
 def spread_of_animals(values: Array, second: NDArray[np.bool_]) -> tuple[float, float]:
     """Standard deviation between animals within their groups, and Hedges' correction for so few of them."""
     a, b = values[~second], values[second]
     freedom = len(a) + len(b) - 2
-    pooled = np.sqrt((((a - a.mean()) ** 2).sum() + ((b - b.mean()) ** 2).sum()) / freedom) if freedom > 0 else np.nan
+    pooled = (
+        np.sqrt((((a - a.mean()) ** 2).sum() + ((b - b.mean()) ** 2).sum()) / freedom)
+        if freedom > 0
+        else np.nan
+    )
     return float(pooled), 1.0 - 3.0 / (4.0 * freedom - 1.0) if freedom > 1 else 1.0
 
 
@@ -79,14 +87,18 @@ def arrangements(units: Units) -> int:
     """In how many ways the groups could have been given to the units."""
     if units.paired:
         return int(2 ** len(units.values))
-    sizes = [(int((units.block == b).sum()), int(units.second[units.block == b].sum())) for b in np.unique(units.block)]
+    sizes = [
+        (int((units.block == b).sum()), int(units.second[units.block == b].sum()))
+        for b in np.unique(units.block)
+    ]
     return prod(comb(n, k) for n, k in sizes)
 
 
 def smallest_p(units: Units) -> float:
     """The smallest two-sided p that a permutation can give."""
     even = units.paired or all(
-        2 * int(units.second[units.block == b].sum()) == int((units.block == b).sum()) for b in np.unique(units.block)
+        2 * int(units.second[units.block == b].sum()) == int((units.block == b).sum())
+        for b in np.unique(units.block)
     )
     return (2.0 if even else 1.0) / arrangements(units)
 
@@ -96,7 +108,9 @@ def permutation(units: Units, rng: np.random.Generator) -> float:
     weight = _weights(units)
     observed = abs(float(weight @ units.values) if not units.paired else float(units.values.sum()))
     n_ways = arrangements(units)
-    least = observed * (1.0 - 1e-9) - 1e-12  # the same difference in another order of adding up is the same
+    least = (
+        observed * (1.0 - 1e-9) - 1e-12
+    )  # the same difference in another order of adding up is the same
     if n_ways <= MOST_EXACT:
         return float(np.mean(np.abs(_all_differences(units)) >= least))
     drawn = np.abs(_some_differences(units, rng))
@@ -168,19 +182,28 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
     if units.paired:
         return None
     if units.unit == CAGE:
-        data = data.groupby("subject_id").agg({"value": "mean", "group": "first", "cage": "first"}).reset_index()
+        data = (
+            data.groupby("subject_id")
+            .agg({"value": "mean", "group": "first", "cage": "first"})
+            .reset_index()
+        )
     clusters = data["cage" if units.unit == CAGE else "subject_id"].to_numpy(str)
     if len(np.unique(clusters)) == len(clusters) or len(np.unique(units.block)) > 1:
         return None  # nothing is nested, or animals are shuffled within blocks: the permutation says it all
-    fitted = _fit(data["value"].to_numpy(float), (data["group"] == groups[1]).to_numpy(float), clusters)
+    fitted = _fit(
+        data["value"].to_numpy(float), (data["group"] == groups[1]).to_numpy(float), clusters
+    )
     if fitted is None:
         return None
     difference, error = fitted
     freedom = len(np.unique(clusters)) - 2
     reach = float(t.ppf(0.975, freedom)) * error
     p = float(2.0 * t.sf(abs(difference) / error, freedom))
-    return ModelResult(Estimate(difference, difference - reach, difference + reach), p,
-                       "cage" if units.unit == CAGE else "animal")  # fmt: skip
+    return ModelResult(
+        Estimate(difference, difference - reach, difference + reach),
+        p,
+        "cage" if units.unit == CAGE else "animal",
+    )
 
 
 def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[float, float] | None:
@@ -193,13 +216,20 @@ def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[floa
     exog = np.column_stack([np.ones(len(values)), second])
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # whether it converged is asked below; lbfgs fails on singular matrices
+            warnings.simplefilter(
+                "ignore"
+            )  # whether it converged is asked below; lbfgs fails on singular matrices
             result = MixedLM(values / scale, exog, clusters).fit(reml=True, method=["powell"])
     except (np.linalg.LinAlgError, ValueError):
         return None
     error = float(result.bse_fe[1])
     variance = float(np.asarray(result.cov_re)[0, 0])
-    if not result.converged or not np.isfinite(error) or error <= 0 or variance < 1e-4 * float(result.scale):
+    if (
+        not result.converged
+        or not np.isfinite(error)
+        or error <= 0
+        or variance < 1e-4 * float(result.scale)
+    ):
         return None
     return float(result.fe_params[1]) * scale, error * scale
 
@@ -213,7 +243,9 @@ def check_reachable(units: Units, alpha: float) -> None:
     if units.paired:
         sizes = f"{len(units.values)} animals that were in both groups"
     else:
-        what = f"{units.unit}s" + (" within their blocks" if len(np.unique(units.block)) > 1 else "")
+        what = f"{units.unit}s" + (
+            " within their blocks" if len(np.unique(units.block)) > 1 else ""
+        )
         sizes = f"{int((~units.second).sum())} against {int(units.second.sum())} {what}"
     raise NotComparable(
         f"{sizes} can be arranged in {n_ways} ways, so p cannot be below {least:.2g}; more {units.unit.split(',')[0]}s "

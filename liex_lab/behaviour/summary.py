@@ -38,7 +38,17 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # of the table `frames`, what behaviour is measured by
-_FRAMES = ("session_id", "individual", "frame_index", "time_s", "dt_s", "wall_distance_mm", "zone", "spine_mm", "flag")
+_FRAMES = (
+    "session_id",
+    "individual",
+    "frame_index",
+    "time_s",
+    "dt_s",
+    "wall_distance_mm",
+    "zone",
+    "spine_mm",
+    "flag",
+)
 TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
 
 
@@ -64,9 +74,11 @@ class Behaviour:
     def for_session(self) -> dict[str, Any]:
         """The arguments that hand all of it to a session: `writer.close(**behaviour.for_session())`."""
         return {
-            "results": self.tables, "columns": self.vocabulary.columns, "actions": self.actions,
+            "results": self.tables,
+            "columns": self.vocabulary.columns,
+            "actions": self.actions,
             "record": {"rules": asdict(self.rules)},
-        }  # fmt: skip
+        }
 
 
 def measure(
@@ -87,7 +99,14 @@ def measure(
     definition; None takes the rules'. around: arena, zones and water. room: where the table `kinematics` is to lie.
     """
     rules, around = rules or MouseRules(), around or Surroundings()
-    moved = kinematics(frames, poses, rules.speed_half_window_s, rules.impossible_above_mm_s, around.surface_z_mm, room)
+    moved = kinematics(
+        frames,
+        poses,
+        rules.speed_half_window_s,
+        rules.impossible_above_mm_s,
+        around.surface_z_mm,
+        room,
+    )
     named = find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved)
     actions = dict(rules.definitions() if actions is None else actions)
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
@@ -97,16 +116,23 @@ def measure(
     summary = summarise(frames, moved, named, words, around)
     let_table_go(moved)
     behaviour = Behaviour(
-        moved, named, summary, transitions(named, words.words, gaps, rules.merge_pauses_s),
-        activity(moved, named, words.words), visits(frames, moved, words.zones, rules), rules, words, actions,
-    )  # fmt: skip
+        moved,
+        named,
+        summary,
+        transitions(named, words.words, gaps, rules.merge_pauses_s),
+        activity(moved, named, words.words),
+        visits(frames, moved, words.zones, rules),
+        rules,
+        words,
+        actions,
+    )
     let_table_go(moved)
     return behaviour
 
 
 def measure_rows(
     rows: Rows, rules: MouseRules | None = None, around: Surroundings | None = None, **how: Any
-) -> Behaviour:  # fmt: skip
+) -> Behaviour:
     """`measure` of a track that is not in a session yet; how: what else that may be told."""
     frames, gaps = rows.frames_table(_FRAMES), to_pandas(GAPS, rows.gaps())
     return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **how)
@@ -117,16 +143,27 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
     about = session.metadata
     known = about.get("rules") or {}
     stated = {name: known[name] for name in MouseRules.__dataclass_fields__ if name in known}
-    surface = surface_height_mm(about["camera"]["floor_distance_mm"], about["camera"].get("optics", {}))
-    return MouseRules(**stated), Surroundings(session.arena, [zone.name for zone in session.zones], surface)
+    surface = surface_height_mm(
+        about["camera"]["floor_distance_mm"], about["camera"].get("optics", {})
+    )
+    return MouseRules(**stated), Surroundings(
+        session.arena, [zone.name for zone in session.zones], surface
+    )
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:
     """The behaviour tables of a session made anew from its folder alone, with its own ethogram and thresholds."""
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
-    return measure(session.frames, poses, rules or stated, around, session.gaps,
-                   bouts=session.bouts, actions=session.metadata.get("actions", {}))  # fmt: skip
+    return measure(
+        session.frames,
+        poses,
+        rules or stated,
+        around,
+        session.gaps,
+        bouts=session.bouts,
+        actions=session.metadata.get("actions", {}),
+    )
 
 
 def summarise(
@@ -143,15 +180,19 @@ def summarise(
     hold = np.where(observed, stop_times(time_s) - time_s, 0.0)
     first = float(time_s[observed][0]) if observed.any() else np.nan
     block: dict[str, Any] = {
-        "session_id": str(frames["session_id"].iloc[0]), "individual": str(frames["individual"].iloc[0]),
-        "n_frames": len(frames), "n_lost": int((~observed).sum()),
+        "session_id": str(frames["session_id"].iloc[0]),
+        "individual": str(frames["individual"].iloc[0]),
+        "n_frames": len(frames),
+        "n_lost": int((~observed).sum()),
         "n_doubtful": int((frames["flag"] == "doubtful").sum()),
-        "duration_s": float(stop_times(time_s)[-1]), "observed_s": float(hold.sum()),
+        "duration_s": float(stop_times(time_s)[-1]),
+        "observed_s": float(hold.sum()),
         "spine_mm": _median(frames["spine_mm"]) if "spine_mm" in frames else np.nan,
-        **_motion(kinematics, hold), **place_measures(frames, hold, around.arena),
+        **_motion(kinematics, hold),
+        **place_measures(frames, hold, around.arena),
         **_budget(bouts, words.words, float(hold.sum()), first),
         **_time_in_zones(frames, words.zones, hold),
-    }  # fmt: skip
+    }
     if words.swims:
         block |= depth_measures(kinematics, hold, around.surface_z_mm)
         block |= {name: _median(kinematics[name]) for name in ("tail_beat_hz", "tail_beat_mm")}
@@ -168,7 +209,10 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
     distance, timed = float(np.nansum(step)), float(hold[known].sum())
     turning = kinematics["yaw_rate_rad_s"].to_numpy(float)
     turns = np.isfinite(turning)
-    turned, either = float((turning * hold)[turns].sum()), float((np.abs(turning) * hold)[turns].sum())
+    turned, either = (
+        float((turning * hold)[turns].sum()),
+        float((np.abs(turning) * hold)[turns].sum()),
+    )
     turn_s = float(hold[turns].sum())
     return {
         "distance_m": distance / 1000.0,
@@ -181,19 +225,22 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
     }
 
 
-def _budget(bouts: pd.DataFrame, words: Sequence[str], observed_s: float, first_s: float) -> dict[str, float]:
+def _budget(
+    bouts: pd.DataFrame, words: Sequence[str], observed_s: float, first_s: float
+) -> dict[str, float]:
     """Time, number and latency of each action, and the time that has no name."""
     found: dict[str, float] = {}
     for word in words:
         own = bouts[bouts["action"] == word]
         n, seconds = len(own), float(own["duration_s"].sum())
         found |= {
-            f"{word}_count": n, f"{word}_s": seconds,
+            f"{word}_count": n,
+            f"{word}_s": seconds,
             f"{word}_share": seconds / observed_s if observed_s > 0 else np.nan,
             f"{word}_mean_s": seconds / n if n else np.nan,
             f"{word}_per_min": 60.0 * n / observed_s if observed_s > 0 else np.nan,
             f"{word}_latency_s": float(own["start_s"].min()) - first_s if n else np.nan,
-        }  # fmt: skip
+        }
     rest = max(0.0, observed_s - sum(found[f"{word}_s"] for word in words))
     found["unlabelled_s"] = rest if rest > 1e-9 else 0.0  # rounding of sums of seconds
     found["unlabelled_share"] = found["unlabelled_s"] / observed_s if observed_s > 0 else np.nan
@@ -205,7 +252,9 @@ def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> d
     observed_s, found = float(hold.sum()), {}
     for zone, inside in zip(zones, inside_zones(frames, zones), strict=True):
         found[f"zone_{zone}_s"] = float(hold[inside].sum())
-        found[f"zone_{zone}_share"] = found[f"zone_{zone}_s"] / observed_s if observed_s > 0 else np.nan
+        found[f"zone_{zone}_share"] = (
+            found[f"zone_{zone}_s"] / observed_s if observed_s > 0 else np.nan
+        )
     return found
 
 

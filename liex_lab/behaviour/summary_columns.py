@@ -19,52 +19,165 @@ _GENERAL = (
     ("n_frames", "int64", "", "recorded frames"),
     ("n_lost", "int64", "", "recorded frames without a pose"),
     ("n_doubtful", "int64", "", "recorded frames whose pose is flagged as doubtful"),
-    ("duration_s", "float64", "s", "length of the recording, from the first frame to the end of the last"),
-    ("observed_s", "float64", "s", "time with a pose; what rates and shares are divided by",
-     "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt"),
-    ("spine_mm", "float64", "mm", "length of the animal's chain of joints", "median of spine_mm over the frames"),
-    ("distance_m", "float64", "m", "way of the body centre; at rest the tracking's jitter adds to it",
-     "sum of step_mm / 1000"),
-    ("mean_speed_mm_s", "float64", "mm/s", "mean speed over the time with a speed", "distance / time"),
+    (
+        "duration_s",
+        "float64",
+        "s",
+        "length of the recording, from the first frame to the end of the last",
+    ),
+    (
+        "observed_s",
+        "float64",
+        "s",
+        "time with a pose; what rates and shares are divided by",
+        "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt",
+    ),
+    (
+        "spine_mm",
+        "float64",
+        "mm",
+        "length of the animal's chain of joints",
+        "median of spine_mm over the frames",
+    ),
+    (
+        "distance_m",
+        "float64",
+        "m",
+        "way of the body centre; at rest the tracking's jitter adds to it",
+        "sum of step_mm / 1000",
+    ),
+    (
+        "mean_speed_mm_s",
+        "float64",
+        "mm/s",
+        "mean speed over the time with a speed",
+        "distance / time",
+    ),
     ("median_speed_mm_s", "float64", "mm/s", "median speed of the frames"),
     ("max_speed_mm_s", "float64", "mm/s", "fastest speed of a frame"),
-    ("speed_noise_mm_s", "float64", "mm/s", "the speed that errors of the pose alone may give; slower than this, "
-     "nobody can be sure that the animal moved", "median of speed_sd_mm_s", OWN),
-    ("mean_abs_yaw_rate_rad_s", "float64", "rad/s", "how fast the animal turns, whichever way",
-     "mean of |yaw_rate_rad_s|"),
-    ("turn_bias", "float64", "", "1: it turns to its left only, -1: to its right only",
-     "sum of yaw_rate_rad_s / sum of |yaw_rate_rad_s|", OWN),
-    ("wall_distance_mm", "float64", "mm", "distance from the nearest wall; empty where the arena's shape is not known",
-     "median of wall_distance_mm over the frames"),
-    ("outer_half_share", "float64", "", "share of the observed time in the outer half of the floor's area; 0.5 is no "
-     "preference", "time nearer to a wall than the margin that halves the area / observed_s", OWN),
-)  # fmt: skip
+    (
+        "speed_noise_mm_s",
+        "float64",
+        "mm/s",
+        "the speed that errors of the pose alone may give; slower than this, "
+        "nobody can be sure that the animal moved",
+        "median of speed_sd_mm_s",
+        OWN,
+    ),
+    (
+        "mean_abs_yaw_rate_rad_s",
+        "float64",
+        "rad/s",
+        "how fast the animal turns, whichever way",
+        "mean of |yaw_rate_rad_s|",
+    ),
+    (
+        "turn_bias",
+        "float64",
+        "",
+        "1: it turns to its left only, -1: to its right only",
+        "sum of yaw_rate_rad_s / sum of |yaw_rate_rad_s|",
+        OWN,
+    ),
+    (
+        "wall_distance_mm",
+        "float64",
+        "mm",
+        "distance from the nearest wall; empty where the arena's shape is not known",
+        "median of wall_distance_mm over the frames",
+    ),
+    (
+        "outer_half_share",
+        "float64",
+        "",
+        "share of the observed time in the outer half of the floor's area; 0.5 is no preference",
+        "time nearer to a wall than the margin that halves the area / observed_s",
+        OWN,
+    ),
+)
 
 _WALKER = (
-    ("distance_moving_m", "float64", "m", "way of the body centre within walk and run, free of jitter at rest",
-     "sum of path_mm within walk and run / 1000"),
-)  # fmt: skip
+    (
+        "distance_moving_m",
+        "float64",
+        "m",
+        "way of the body centre within walk and run, free of jitter at rest",
+        "sum of path_mm within walk and run / 1000",
+    ),
+)
 
 _SWIMMER = (
-    ("mean_height_mm", "float64", "mm", "mean height of the body centre above the floor", "mean of z_mm"),
-    ("top_third_share", "float64", "", "share of the observed time in the top third of the water; empty where the "
-     "surface's height is not known", "time above two thirds of the water's height / observed_s", "novel tank test"),
-    ("bottom_third_share", "float64", "", "share of the observed time in the bottom third of the water",
-     "time below a third of the water's height / observed_s", "novel tank test"),
-    ("top_third_latency_s", "float64", "s", "time from the first sight of the animal until it first was in the top "
-     "third; empty where it never was", "", "novel tank test"),
-    ("tail_beat_hz", "float64", "Hz", "median frequency of the tail's beat", "median of tail_beat_hz over the frames"),
-    ("tail_beat_mm", "float64", "mm", "median amplitude of the tail's beat", "median of tail_beat_mm over the frames"),
-)  # fmt: skip
+    (
+        "mean_height_mm",
+        "float64",
+        "mm",
+        "mean height of the body centre above the floor",
+        "mean of z_mm",
+    ),
+    (
+        "top_third_share",
+        "float64",
+        "",
+        "share of the observed time in the top third of the water; empty where the "
+        "surface's height is not known",
+        "time above two thirds of the water's height / observed_s",
+        "novel tank test",
+    ),
+    (
+        "bottom_third_share",
+        "float64",
+        "",
+        "share of the observed time in the bottom third of the water",
+        "time below a third of the water's height / observed_s",
+        "novel tank test",
+    ),
+    (
+        "top_third_latency_s",
+        "float64",
+        "s",
+        "time from the first sight of the animal until it first was in the top "
+        "third; empty where it never was",
+        "",
+        "novel tank test",
+    ),
+    (
+        "tail_beat_hz",
+        "float64",
+        "Hz",
+        "median frequency of the tail's beat",
+        "median of tail_beat_hz over the frames",
+    ),
+    (
+        "tail_beat_mm",
+        "float64",
+        "mm",
+        "median amplitude of the tail's beat",
+        "median of tail_beat_mm over the frames",
+    ),
+)
 
 
-def summary_columns(words: Sequence[str], zones: Sequence[str] = (), swims: bool = False) -> tuple[Column, ...]:
+def summary_columns(
+    words: Sequence[str], zones: Sequence[str] = (), swims: bool = False
+) -> tuple[Column, ...]:
     """The columns of the table `summary`: one row per animal."""
     named = [row for word in words for row in _of_action(word)]
     placed = [row for zone in zones for row in _of_zone(zone)]
     rest = (
-        ("unlabelled_s", "float64", "s", "observed time that has no name", "observed_s - time in bouts"),
-        ("unlabelled_share", "float64", "", "share of the observed time that has no name", "unlabelled_s / observed_s"),
+        (
+            "unlabelled_s",
+            "float64",
+            "s",
+            "observed time that has no name",
+            "observed_s - time in bouts",
+        ),
+        (
+            "unlabelled_share",
+            "float64",
+            "",
+            "share of the observed time that has no name",
+            "unlabelled_s / observed_s",
+        ),
     )
     return columns("summary", *_GENERAL, *(_SWIMMER if swims else _WALKER), *named, *rest, *placed)
 
@@ -73,67 +186,165 @@ def _of_action(word: str) -> tuple[tuple[str, ...], ...]:
     return (
         (f"{word}_count", "int64", "", f"number of bouts of {word}"),
         (f"{word}_s", "float64", "s", f"time in {word}", "sum of duration_s", OWN),
-        (f"{word}_share", "float64", "", f"share of the observed time in {word}; {_SHARE}", f"{word}_s / observed_s",
-         OWN),
-        (f"{word}_mean_s", "float64", "s", f"mean length of a bout of {word}; empty where there is none",
-         f"{word}_s / {word}_count"),
-        (f"{word}_per_min", "float64", "1/min", f"bouts of {word} per minute of observed time",
-         f"60 x {word}_count / observed_s"),
-        (f"{word}_latency_s", "float64", "s", f"time from the first sight of the animal to its first {word}; empty "
-         "where there is none"),
-    )  # fmt: skip
+        (
+            f"{word}_share",
+            "float64",
+            "",
+            f"share of the observed time in {word}; {_SHARE}",
+            f"{word}_s / observed_s",
+            OWN,
+        ),
+        (
+            f"{word}_mean_s",
+            "float64",
+            "s",
+            f"mean length of a bout of {word}; empty where there is none",
+            f"{word}_s / {word}_count",
+        ),
+        (
+            f"{word}_per_min",
+            "float64",
+            "1/min",
+            f"bouts of {word} per minute of observed time",
+            f"60 x {word}_count / observed_s",
+        ),
+        (
+            f"{word}_latency_s",
+            "float64",
+            "s",
+            f"time from the first sight of the animal to its first {word}; empty "
+            "where there is none",
+        ),
+    )
 
 
 def _of_zone(zone: str) -> tuple[tuple[str, ...], ...]:
     return (
-        (f"zone_{zone}_s", "float64", "s", f"time in which the centroid lay in the zone {zone}",
-         "sum over its frames of the time to the next frame", OWN),
-        (f"zone_{zone}_share", "float64", "", f"share of the observed time in the zone {zone}; zones may overlap",
-         f"zone_{zone}_s / observed_s", OWN),
-    )  # fmt: skip
+        (
+            f"zone_{zone}_s",
+            "float64",
+            "s",
+            f"time in which the centroid lay in the zone {zone}",
+            "sum over its frames of the time to the next frame",
+            OWN,
+        ),
+        (
+            f"zone_{zone}_share",
+            "float64",
+            "",
+            f"share of the observed time in the zone {zone}; zones may overlap",
+            f"zone_{zone}_s / observed_s",
+            OWN,
+        ),
+    )
 
 
 TRANSITIONS: tuple[Column, ...] = columns(
-    "transitions", *_WHO,
+    "transitions",
+    *_WHO,
     ("from_action", "string", "", "the action before"),
-    ("to_action", "string", "", "the action after, with no gap and no nameless stretch of more than the plan's "
-     "behaviour.merge_pauses_s in between"),
+    (
+        "to_action",
+        "string",
+        "",
+        "the action after, with no gap and no nameless stretch of more than the plan's "
+        "behaviour.merge_pauses_s in between",
+    ),
     ("n", "int64", "", "how often the second followed upon the first"),
     ("n_from", "int64", "", "how often any other action followed upon the first"),
-    ("probability", "float64", "", "share of the first action's successors that were the second", "n / n_from"),
-    ("by_chance", "float64", "", "the same if actions followed each other by chance, each as often as it does and "
-     "never upon itself", "quasi-independence, fitted by iterative scaling", "Goodman 1968"),
-    ("p", "float64", "", "probability of an n at least as far from chance, to either side; empty where chance leaves "
-     "no choice", "binomial test of n out of n_from", OWN),
-    ("p_fdr", "float64", "", "p, corrected for the number of pairs in this session", "Benjamini-Hochberg"),
-)  # fmt: skip
+    (
+        "probability",
+        "float64",
+        "",
+        "share of the first action's successors that were the second",
+        "n / n_from",
+    ),
+    (
+        "by_chance",
+        "float64",
+        "",
+        "the same if actions followed each other by chance, each as often as it does and "
+        "never upon itself",
+        "quasi-independence, fitted by iterative scaling",
+        "Goodman 1968",
+    ),
+    (
+        "p",
+        "float64",
+        "",
+        "probability of an n at least as far from chance, to either side; empty where chance leaves "
+        "no choice",
+        "binomial test of n out of n_from",
+        OWN,
+    ),
+    (
+        "p_fdr",
+        "float64",
+        "",
+        "p, corrected for the number of pairs in this session",
+        "Benjamini-Hochberg",
+    ),
+)
 
 ZONES: tuple[Column, ...] = columns(
-    "zones", *_WHO,
+    "zones",
+    *_WHO,
     ("zone", "string", "", "a zone of the plan's arena.zones"),
-    ("time_s", "float64", "s", "time in which the centroid lay in it", "sum over its frames of the time to the next"),
+    (
+        "time_s",
+        "float64",
+        "s",
+        "time in which the centroid lay in it",
+        "sum over its frames of the time to the next",
+    ),
     ("share", "float64", "", "share of the observed time", "time_s / observed_s"),
-    ("n_visits", "int64", "", "how often the animal was there; shorter absences than the plan's "
-     "behaviour.merge_pauses_s are bridged, then shorter visits than behaviour.min_bout_s dropped", "", OWN),
-    ("latency_s", "float64", "s", "time from the first sight of the animal to its first visit; empty where it never "
-     "came"),
+    (
+        "n_visits",
+        "int64",
+        "",
+        "how often the animal was there; shorter absences than the plan's "
+        "behaviour.merge_pauses_s are bridged, then shorter visits than behaviour.min_bout_s dropped",
+        "",
+        OWN,
+    ),
+    (
+        "latency_s",
+        "float64",
+        "s",
+        "time from the first sight of the animal to its first visit; empty where it never came",
+    ),
     ("mean_visit_s", "float64", "s", "mean length of a visit"),
     ("distance_mm", "float64", "mm", "way of the body centre within the zone", "sum of step_mm"),
-)  # fmt: skip
+)
 
 
 def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
     """The columns of the table `activity`: one row per minute, or per tenth of a recording of less than ten."""
     return columns(
-        "activity", *_WHO,
+        "activity",
+        *_WHO,
         ("start_s", "float64", "s", "beginning of the interval, since the first frame"),
         ("stop_s", "float64", "s", "its end, exclusive"),
         ("observed_s", "float64", "s", "time with a pose in it"),
         ("distance_mm", "float64", "mm", "way of the body centre in it", "sum of step_mm"),
-        ("mean_speed_mm_s", "float64", "mm/s", "mean speed over the time with a speed", "distance / time"),
-        *((f"{word}_s", "float64", "s", f"time in {word} in it", "overlap of its bouts with the interval")
-          for word in words),
-    )  # fmt: skip
+        (
+            "mean_speed_mm_s",
+            "float64",
+            "mm/s",
+            "mean speed over the time with a speed",
+            "distance / time",
+        ),
+        *(
+            (
+                f"{word}_s",
+                "float64",
+                "s",
+                f"time in {word} in it",
+                "overlap of its bouts with the interval",
+            )
+            for word in words
+        ),
+    )
 
 
 @dataclass(frozen=True)
@@ -148,6 +359,10 @@ class Vocabulary:
     def columns(self) -> tuple[Column, ...]:
         """Every column of the behaviour tables."""
         return (
-            *kinematics_columns(self.swims), *bout_columns(self.swims),
-            *summary_columns(self.words, self.zones, self.swims), *TRANSITIONS, *ZONES, *activity_columns(self.words),
-        )  # fmt: skip
+            *kinematics_columns(self.swims),
+            *bout_columns(self.swims),
+            *summary_columns(self.words, self.zones, self.swims),
+            *TRANSITIONS,
+            *ZONES,
+            *activity_columns(self.words),
+        )

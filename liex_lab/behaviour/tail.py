@@ -13,7 +13,9 @@ from liex_lab.tables.rows import stretches
 Array = NDArray[np.float64]
 
 SLOWEST_HZ = 1.0  # a slower swing to and fro is a turn of the body and no beat
-TRUSTED_SHARE = 0.25  # of the frame rate: a faster beat may be another one seen through the camera's shutter
+TRUSTED_SHARE = (
+    0.25  # of the frame rate: a faster beat may be another one seen through the camera's shutter
+)
 _LEAST_SHARE = 0.05  # of the body's length: a smaller swing is none
 _LEAST_SD = 2.0  # nor is one of fewer standard deviations
 
@@ -78,17 +80,24 @@ def turning_points(values: Array, least: float) -> NDArray[np.int64]:
         elif rising is not True and value - values[low] >= least:
             found.append(low)
             rising, high = True, k
-    if found and np.ptp(values[: found[0] + 1]) < least:  # only where the tail lay before it began to swing
+    if (
+        found and np.ptp(values[: found[0] + 1]) < least
+    ):  # only where the tail lay before it began to swing
         found = found[1:]
     return np.array(found, np.int64)
 
 
-def vertex_times(time_s: Array, values: Array, rows: NDArray[np.int64], start: int, stop: int) -> Array:
+def vertex_times(
+    time_s: Array, values: Array, rows: NDArray[np.int64], start: int, stop: int
+) -> Array:
     """Times of turning points `rows`, from the parabola through each and its two neighbours in [start, stop)."""
     inner = rows[(rows > start) & (rows < stop - 1)]
     at = time_s[rows].copy()
     t0, t1, t2 = time_s[inner - 1], time_s[inner], time_s[inner + 1]
-    left, right = (values[inner] - values[inner - 1]) / (t1 - t0), (values[inner + 1] - values[inner]) / (t2 - t1)
+    left, right = (
+        (values[inner] - values[inner - 1]) / (t1 - t0),
+        (values[inner + 1] - values[inner]) / (t2 - t1),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         vertex = (t0 + t1) / 2.0 - left * (t2 - t0) / (2.0 * (right - left))
     at[np.isin(rows, inner)] = np.where(np.isfinite(vertex), np.clip(vertex, t0, t2), t1)

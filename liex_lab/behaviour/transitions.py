@@ -17,7 +17,9 @@ Counts = NDArray[np.int64]
 _ROUNDS = 500  # of iterative scaling; it converges in some dozens
 
 
-def transitions(bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float) -> pd.DataFrame:
+def transitions(
+    bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float
+) -> pd.DataFrame:
     """The table `transitions` of one animal: every ordered pair of different actions.
 
     Chance: each action is followed by another one in proportion to how often those occur. One bout's action depends on
@@ -27,17 +29,29 @@ def transitions(bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, l
     expected = by_chance(counts)
     rows, columns = np.nonzero(~np.eye(len(words), dtype=bool))
     n, n_from, chance = counts[rows, columns], counts.sum(axis=1)[rows], expected[rows, columns]
-    p = np.array([_binomial(int(k), int(total), q) for k, total, q in zip(n, n_from, chance, strict=True)])
+    p = np.array(
+        [_binomial(int(k), int(total), q) for k, total, q in zip(n, n_from, chance, strict=True)]
+    )
     names = np.array(words, dtype=object)
-    return to_pandas(TRANSITIONS, {
-        **{name: [_first(bouts, name)] * len(n) for name in ("session_id", "individual")},
-        "from_action": names[rows], "to_action": names[columns], "n": n, "n_from": n_from,
-        "probability": np.divide(n, n_from, out=np.full(len(n), np.nan), where=n_from > 0), "by_chance": chance,
-        "p": p, "p_fdr": false_discovery(p),
-    })  # fmt: skip
+    return to_pandas(
+        TRANSITIONS,
+        {
+            **{name: [_first(bouts, name)] * len(n) for name in ("session_id", "individual")},
+            "from_action": names[rows],
+            "to_action": names[columns],
+            "n": n,
+            "n_from": n_from,
+            "probability": np.divide(n, n_from, out=np.full(len(n), np.nan), where=n_from > 0),
+            "by_chance": chance,
+            "p": p,
+            "p_fdr": false_discovery(p),
+        },
+    )
 
 
-def count_transitions(bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float) -> Counts:
+def count_transitions(
+    bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float
+) -> Counts:
     """(k, k) how often word j followed upon word i != j, without a gap or a longer nameless stretch in between."""
     place = {word: k for k, word in enumerate(words)}
     code = np.array([place[word] for word in bouts["action"]], np.int64)
@@ -61,8 +75,12 @@ def by_chance(counts: Counts) -> Array:
     rows, columns = counts.sum(axis=1).astype(float), counts.sum(axis=0).astype(float)
     fitted = (~np.eye(len(counts), dtype=bool)).astype(float) * np.outer(rows > 0, columns > 0)
     for _ in range(_ROUNDS):
-        fitted *= np.divide(rows, fitted.sum(axis=1), out=np.zeros_like(rows), where=fitted.sum(axis=1) > 0)[:, None]
-        off = np.divide(columns, fitted.sum(axis=0), out=np.zeros_like(rows), where=fitted.sum(axis=0) > 0)
+        fitted *= np.divide(
+            rows, fitted.sum(axis=1), out=np.zeros_like(rows), where=fitted.sum(axis=1) > 0
+        )[:, None]
+        off = np.divide(
+            columns, fitted.sum(axis=0), out=np.zeros_like(rows), where=fitted.sum(axis=0) > 0
+        )
         fitted *= off
         if np.abs(off[columns > 0] - 1.0).max(initial=0.0) < 1e-9:
             break

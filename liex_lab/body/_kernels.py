@@ -16,9 +16,21 @@ def exp_so3(w, out):
         th = np.sqrt(th2)
         a, b = np.sin(th) / th, 2.0 * np.sin(th / 2.0) ** 2 / th2
     x, y, z = w[0], w[1], w[2]
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    out[1, 0], out[1, 1], out[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
-    out[2, 0], out[2, 1], out[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    out[0, 0], out[0, 1], out[0, 2] = (
+        1.0 - b * (y * y + z * z),
+        b * x * y - a * z,
+        b * x * z + a * y,
+    )
+    out[1, 0], out[1, 1], out[1, 2] = (
+        b * x * y + a * z,
+        1.0 - b * (x * x + z * z),
+        b * y * z - a * x,
+    )
+    out[2, 0], out[2, 1], out[2, 2] = (
+        b * x * z - a * y,
+        b * y * z + a * x,
+        1.0 - b * (x * x + y * y),
+    )
 
 
 @njit(cache=True)
@@ -51,6 +63,8 @@ def place_joints(parents, offsets, rest, moves, rotation, translation, angles, s
             for a in range(3):
                 for b in range(3):
                     if moves[j]:
-                        turned[j, a, b] = step[a, 0] * own[0, b] + step[a, 1] * own[1, b] + step[a, 2] * own[2, b]
+                        turned[j, a, b] = (
+                            step[a, 0] * own[0, b] + step[a, 1] * own[1, b] + step[a, 2] * own[2, b]
+                        )
                     else:
                         turned[j, a, b] = step[a, b]

@@ -86,8 +86,19 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
     inverse = np.empty(depth.shape[1:])
     for i in range(len(vertices)):
         inverse[:] = 0.0
-        draw(vertices[i], faces, rotation[i], translation[i], intrinsics[i, 0], intrinsics[i, 1], intrinsics[i, 2],
-             intrinsics[i, 3], origin[i, 0], origin[i, 1], inverse)  # fmt: skip
+        draw(
+            vertices[i],
+            faces,
+            rotation[i],
+            translation[i],
+            intrinsics[i, 0],
+            intrinsics[i, 1],
+            intrinsics[i, 2],
+            intrinsics[i, 3],
+            origin[i, 0],
+            origin[i, 1],
+            inverse,
+        )
         to_depth(inverse, depth[i])
 
 
@@ -96,6 +107,17 @@ def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, orig
     """Depth (n, H, W) mm of meshes (n, V, 3) on all threads; arguments as in `draw`, leading axis n."""
     for i in prange(len(vertices)):
         inverse = np.zeros(depth.shape[1:])
-        draw(vertices[i], faces, rotation[i], translation[i], intrinsics[i, 0], intrinsics[i, 1], intrinsics[i, 2],
-             intrinsics[i, 3], origin[i, 0], origin[i, 1], inverse)  # fmt: skip
+        draw(
+            vertices[i],
+            faces,
+            rotation[i],
+            translation[i],
+            intrinsics[i, 0],
+            intrinsics[i, 1],
+            intrinsics[i, 2],
+            intrinsics[i, 3],
+            origin[i, 0],
+            origin[i, 1],
+            inverse,
+        )
         to_depth(inverse, depth[i])

@@ -72,7 +72,11 @@ def spine_frame(joints, rotations, arc, station, out):
         if k < n_joints - 2:
             after = (joints[k + 2, axis] - there) / after_length
             stop = (after * length + bone * after_length) / (length + after_length)
-        forward = (6 * s2 - 6 * s) * (here - there) / length + (3 * s2 - 4 * s + 1) * start + (3 * s2 - 2 * s) * stop
+        forward = (
+            (6 * s2 - 6 * s) * (here - there) / length
+            + (3 * s2 - 4 * s + 1) * start
+            + (3 * s2 - 2 * s) * stop
+        )
         centre = (2 * s3 - 3 * s2 + 1) * here + (s3 - 2 * s2 + s) * length * start
         centre += (3 * s2 - 2 * s3) * there + (s3 - s2) * length * stop
         out[0, axis] = centre + beyond * forward
@@ -113,7 +117,9 @@ def chain_arc(joints, arc):
 
 
 @njit(cache=True)
-def _body(joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, start):
+def _body(
+    joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, start
+):
     """The trunk: a superellipse across the mid-axis at every station; the first and last stations are the poles."""
     n, at = len(stations), start
     for r in range(n):
@@ -131,7 +137,9 @@ def _body(joints, rotations, arc, girth, stations, half_width, half_height, powe
                 c = math.copysign(abs(c) ** (2.0 / power), c)
                 s = math.copysign(abs(s) ** (2.0 / power), s)
             for axis in range(3):
-                out[at, axis] = frame[0, axis] + wide * c * frame[2, axis] + high * s * frame[3, axis]
+                out[at, axis] = (
+                    frame[0, axis] + wide * c * frame[2, axis] + high * s * frame[3, axis]
+                )
             at += 1
     return at
 
@@ -147,7 +155,12 @@ def ellipsoid(frame, radii, out, start):
             phi = 2.0 * math.pi * k / BLOB_SEGMENTS
             left, up = across * math.cos(phi) * radii[1], across * math.sin(phi) * radii[2]
             for axis in range(3):
-                out[at, axis] = frame[0, axis] + along * frame[1, axis] + left * frame[2, axis] + up * frame[3, axis]
+                out[at, axis] = (
+                    frame[0, axis]
+                    + along * frame[1, axis]
+                    + left * frame[2, axis]
+                    + up * frame[3, axis]
+                )
             at += 1
     return at
 
@@ -174,7 +187,9 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
             out[start + k, 0], out[start + k, 1], out[start + k, 2] = x, y, z
         return start + TAIL_RINGS * TAIL_SEGMENTS + 2
     heading = math.atan2(-frame[1, 1], -frame[1, 0])
-    if math.hypot(frame[1, 0], frame[1, 1]) < 0.35:  # an upright rump: the tail leaves away from the belly
+    if (
+        math.hypot(frame[1, 0], frame[1, 1]) < 0.35
+    ):  # an upright rump: the tail leaves away from the belly
         heading = math.atan2(frame[3, 1], frame[3, 0])
     step = girth * tail[0] / TAIL_RINGS
     at = start
@@ -199,30 +214,60 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
 
 
 @njit(cache=True)
-def skin_tube(joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out):
+def skin_tube(
+    joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
+):
     """Vertices (V, 3) mm of one animal with a tubular body: trunk, blobs, tail. Shapes as in `BodyShape`."""
     arc, frame = np.empty(joints.shape[0]), np.empty((4, 3))
     chain_arc(joints, arc)
-    at = _body(joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, 0)
+    at = _body(
+        joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, 0
+    )
     for b in range(blobs.shape[0]):
         at = _blob(joints, rotations, arc, girth, blobs[b], frame, out, at)
     _tail(joints, rotations, arc, girth, stations[0], tail, bends, frame, out, at)
 
 
 @njit(cache=True)
-def skin_tubes(joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out):
+def skin_tubes(
+    joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
+):
     """`skin_tube` for a batch (n, ...), one after the other; stations (R,) are shared."""
     for i in range(len(joints)):
-        skin_tube(joints[i], rotations[i], girth[i], stations, half_width[i], half_height[i], power[i], blobs[i],
-                  tail[i], bends[i], out[i])  # fmt: skip
+        skin_tube(
+            joints[i],
+            rotations[i],
+            girth[i],
+            stations,
+            half_width[i],
+            half_height[i],
+            power[i],
+            blobs[i],
+            tail[i],
+            bends[i],
+            out[i],
+        )
 
 
 @njit(cache=True, parallel=True)
-def skin_tubes_parallel(joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out):
+def skin_tubes_parallel(
+    joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
+):
     """`skin_tube` for a batch (n, ...) on all threads; stations (R,) are shared."""
     for i in prange(len(joints)):
-        skin_tube(joints[i], rotations[i], girth[i], stations, half_width[i], half_height[i], power[i], blobs[i],
-                  tail[i], bends[i], out[i])  # fmt: skip
+        skin_tube(
+            joints[i],
+            rotations[i],
+            girth[i],
+            stations,
+            half_width[i],
+            half_height[i],
+            power[i],
+            blobs[i],
+            tail[i],
+            bends[i],
+            out[i],
+        )
 
 
 @njit(cache=True, parallel=True)
@@ -239,7 +284,15 @@ def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out):
                     ends[e, axis] = joints[i, j, axis]
                     for k in range(3):
                         ends[e, axis] += scale[i] * rotations[i, j, axis, k] * offsets[i, c, e, k]
-            at = _capsule(ends[0], ends[1], girth[i] * radii[i, c, 0], girth[i] * radii[i, c, 1], frame, out[i], at)
+            at = _capsule(
+                ends[0],
+                ends[1],
+                girth[i] * radii[i, c, 0],
+                girth[i] * radii[i, c, 1],
+                frame,
+                out[i],
+                at,
+            )
 
 
 @njit(cache=True)
@@ -267,8 +320,16 @@ def _capsule(first, last, first_radius, last_radius, frame, out, start):
         along = -radius * math.cos(theta) if near else length + radius * math.cos(theta)
         for k in range(1 if r == 0 or r == CAPSULE_RINGS + 1 else CAPSULE_SEGMENTS):
             phi = 2.0 * math.pi * k / CAPSULE_SEGMENTS
-            left, up = radius * math.sin(theta) * math.cos(phi), radius * math.sin(theta) * math.sin(phi)
+            left, up = (
+                radius * math.sin(theta) * math.cos(phi),
+                radius * math.sin(theta) * math.sin(phi),
+            )
             for axis in range(3):
-                out[at, axis] = first[axis] + along * frame[1, axis] + left * frame[2, axis] + up * frame[3, axis]
+                out[at, axis] = (
+                    first[axis]
+                    + along * frame[1, axis]
+                    + left * frame[2, axis]
+                    + up * frame[3, axis]
+                )
             at += 1
     return at

@@ -37,13 +37,17 @@ class Capsules:
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> Capsules:
         """One body, or some, out of a batch."""
-        return replace(self, offsets=self.offsets[index], radii=self.radii[index], fur=self.fur[index])
+        return replace(
+            self, offsets=self.offsets[index], radii=self.radii[index], fur=self.fur[index]
+        )
 
     def broadcast(self, n: int) -> Capsules:
         """A batch (n,) of this one body, or this batch."""
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
-        offsets, radii, fur = (np.broadcast_to(a, (n, *a.shape)).copy() for a in (self.offsets, self.radii, self.fur))
+        offsets, radii, fur = (
+            np.broadcast_to(a, (n, *a.shape)).copy() for a in (self.offsets, self.radii, self.fur)
+        )
         return replace(self, offsets=offsets, radii=radii, fur=fur)
 
     @staticmethod
@@ -79,7 +83,9 @@ class Capsules:
     @property
     def faces(self) -> NDArray[np.int32]:
         """Triangles (F, 3) of the vertices that `vertices` makes."""
-        return _skin.joined_faces([(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * len(self.joints))
+        return _skin.joined_faces(
+            [(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * len(self.joints)
+        )
 
     @property
     def n_vertices(self) -> int:
@@ -93,11 +99,15 @@ class Capsules:
         """
         body = self.broadcast(len(positions))
         out = np.empty((len(positions), self.n_vertices, 3))
-        _skin.skin_capsules(rotations, positions, scale, girth, self.joints, body.offsets, body.radii, out)
+        _skin.skin_capsules(
+            rotations, positions, scale, girth, self.joints, body.offsets, body.radii, out
+        )
         return out
 
 
-def _parsed(table: Any, skeleton: Skeleton, part: str) -> tuple[list[int], list[list[float]], list[float]]:
+def _parsed(
+    table: Any, skeleton: Skeleton, part: str
+) -> tuple[list[int], list[list[float]], list[float]]:
     """Joints, offsets and radii of one [[surface.capsules]] or [[surface.beyond]]."""
     where = f"the [[surface.{part}]] of '{skeleton.name}'"
     if not isinstance(table, dict) or not set(table) <= _KEYS:
@@ -108,7 +118,12 @@ def _parsed(table: Any, skeleton: Skeleton, part: str) -> tuple[list[int], list[
             raise LiexError(f"{where} run from a joint to a joint, but there is no joint {name!r}")
     offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
     radii = table.get("radii_mm", [])
-    if not (_numbers(offsets[0], 3) and _numbers(offsets[1], 3) and _numbers(radii, 2) and min(radii) > 0):
+    if not (
+        _numbers(offsets[0], 3)
+        and _numbers(offsets[1], 3)
+        and _numbers(radii, 2)
+        and min(radii) > 0
+    ):
         raise LiexError(
             f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, got {table}"
         )
@@ -116,4 +131,8 @@ def _parsed(table: Any, skeleton: Skeleton, part: str) -> tuple[list[int], list[
 
 
 def _numbers(value: Any, n: int) -> bool:
-    return isinstance(value, list) and len(value) == n and all(isinstance(x, int | float) for x in value)
+    return (
+        isinstance(value, list)
+        and len(value) == n
+        and all(isinstance(x, int | float) for x in value)
+    )

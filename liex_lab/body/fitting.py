@@ -67,7 +67,10 @@ def fit_poses(
         tried_cost, tried_residual = _cost(skeleton, tried, points, points_of_joints, middle)
         better = tried_cost < cost
         pose = _chosen(better, tried, pose)
-        cost, residual = np.where(better, tried_cost, cost), np.where(better[:, None, None], tried_residual, residual)
+        cost, residual = (
+            np.where(better, tried_cost, cost),
+            np.where(better[:, None, None], tried_residual, residual),
+        )
         damping = np.clip(np.where(better, damping / 5.0, damping * 4.0), *_DAMPING[1:])
     return Fit(pose, np.linalg.norm(residual, axis=-1))
 
@@ -77,14 +80,18 @@ def _free(skeleton: Skeleton) -> list[tuple[int, int]]:
     return [(j, k) for j in range(1, skeleton.n_joints) for k in range(3) if skeleton.axes[j, k]]
 
 
-def _cost(skeleton: Skeleton, pose: Pose, points: Array, points_of_joints: Array, middle: Array) -> tuple[Array, Array]:
+def _cost(
+    skeleton: Skeleton, pose: Pose, points: Array, points_of_joints: Array, middle: Array
+) -> tuple[Array, Array]:
     """Sum of squares (n,) and residuals (n, M, 3) mm."""
     residual = np.einsum("mj,njd->nmd", points_of_joints, pose.joints(skeleton)) - points
     bent = ((pose.angles - middle) * skeleton.axes)[:, 1:]
     return np.sum(residual**2, axis=(1, 2)) + _REST_MM**2 * np.sum(bent**2, axis=(1, 2)), residual
 
 
-def _jacobian(skeleton: Skeleton, pose: Pose, points_of_joints: Array, free: list[tuple[int, int]]) -> Array:
+def _jacobian(
+    skeleton: Skeleton, pose: Pose, points_of_joints: Array, free: list[tuple[int, int]]
+) -> Array:
     """Derivatives (n, 3 M, 7 + free axes) of the points by base twist, joint angles and log scale."""
     rotation, position = forward_kinematics(skeleton, pose.root, pose.angles, pose.scale)
     n, n_joints = position.shape[:2]
@@ -95,10 +102,14 @@ def _jacobian(skeleton: Skeleton, pose: Pose, points_of_joints: Array, free: lis
     by[..., 3:6] = rotation[:, None, 0]
     by[..., -1] = out
     below = _descendants(skeleton)
-    turns = so3.left_jacobian(-pose.angles)  # the right Jacobian: how a change of the rotation vector turns the joint
+    turns = so3.left_jacobian(
+        -pose.angles
+    )  # the right Jacobian: how a change of the rotation vector turns the joint
     for c, (j, k) in enumerate(free, start=6):
         axis = np.einsum("nij,nj->ni", rotation[:, j], turns[:, j, :, k])
-        by[..., c][:, below[j]] = np.cross(axis[:, None], position[:, below[j]] - position[:, j : j + 1])
+        by[..., c][:, below[j]] = np.cross(
+            axis[:, None], position[:, below[j]] - position[:, j : j + 1]
+        )
     return np.einsum("mj,njdc->nmdc", points_of_joints, by).reshape(n, -1, by.shape[-1])
 
 
@@ -119,15 +130,23 @@ def _step(curvature: Array, gradient: Array, damping: Array, held: NDArray[np.bo
     matrix[:, index, index] += 1e-9
     matrix[held[:, :, None] | held[:, None, :]] = 0.0
     matrix[:, index, index] += held
-    return -np.asarray(np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None]), float)[..., 0]
+    return -np.asarray(np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None]), float)[
+        ..., 0
+    ]
 
 
-def _moved(pose: Pose, step: Array, free: list[tuple[int, int]], lower: Array, upper: Array) -> Pose:
+def _moved(
+    pose: Pose, step: Array, free: list[tuple[int, int]], lower: Array, upper: Array
+) -> Pose:
     """The poses after steps (n, P)."""
     angles = pose.angles.copy()
     for c, (j, k) in enumerate(free, start=6):
         angles[:, j, k] = np.clip(angles[:, j, k] + step[:, c], lower[j, k], upper[j, k])
-    return Pose(pose.root @ SE3.exp(step[:, :6]), angles, pose.scale * np.exp(np.clip(step[:, -1], -0.3, 0.3)))
+    return Pose(
+        pose.root @ SE3.exp(step[:, :6]),
+        angles,
+        pose.scale * np.exp(np.clip(step[:, -1], -0.3, 0.3)),
+    )
 
 
 def _chosen(first: NDArray[np.bool_], a: Pose, b: Pose) -> Pose:

@@ -89,14 +89,20 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
     radii *= np.where(of_finger[None, :], draw(0.06)[:, None], 1.0)[..., None]
     wrist = rng.uniform(22.0, 29.0, n) * np.sqrt(girth)
     sleeve = np.where(rng.random(n) < 0.5, rng.uniform(0.0, 0.7, n), 1.0)
-    arm = np.stack([wrist, wrist * rng.uniform(1.15, 1.55, n), rng.uniform(1.1, 1.45, n), sleeve], axis=1)
+    arm = np.stack(
+        [wrist, wrist * rng.uniform(1.15, 1.55, n), rng.uniform(1.1, 1.45, n), sleeve], axis=1
+    )
     ends = np.broadcast_to(flesh.offsets, (n, *flesh.offsets.shape)).copy()
     return HandShape(offsets, Capsules(flesh.joints, ends, radii, np.zeros(n)), arm)
 
 
 def forearms(
-    rng: np.random.Generator, rotations: Array, positions: Array, scale: Array, bent: Array | None = None
-) -> tuple[Array, Array]:  # fmt: skip
+    rng: np.random.Generator,
+    rotations: Array,
+    positions: Array,
+    scale: Array,
+    bent: Array | None = None,
+) -> tuple[Array, Array]:
     """Frames (n, 3, 3) of forearms, x from the elbow to the wrist, and elbows (n, 3) mm of hands in the camera frame.
 
     rotations (n, J, 3, 3), positions (n, J, 3) mm; scale (n,). The wrist bends as wrists do, and further where the arm
@@ -106,7 +112,9 @@ def forearms(
     n = len(scale)
     bend = np.zeros((n, 3))
     if bent is None:
-        bent = np.radians(np.stack([np.zeros(n), rng.normal(0.0, 22.0, n), rng.normal(0.0, 12.0, n)], axis=1))
+        bent = np.radians(
+            np.stack([np.zeros(n), rng.normal(0.0, 22.0, n), rng.normal(0.0, 12.0, n)], axis=1)
+        )
     bend[:, 1], bend[:, 2] = np.clip(bent[:, 1], -1.0, 1.0), np.clip(bent[:, 2], -0.4, 0.4)
     turned = rotations[:, 0] @ so3.exp(bend)
     forward = turned[:, :, 0].copy()

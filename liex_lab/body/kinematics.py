@@ -11,7 +11,9 @@ from liex_lab.geometry import SE3, so3
 Array = NDArray[np.float64]
 
 
-def forward_kinematics(skeleton: Skeleton, root: SE3, angles: Array, scale: Array) -> tuple[Array, Array]:
+def forward_kinematics(
+    skeleton: Skeleton, root: SE3, angles: Array, scale: Array
+) -> tuple[Array, Array]:
     """Joint rotations (..., J, 3, 3) and positions (..., J, 3) mm by the product of exponentials (Lie-X section 3).
 
     root: T_frame_root (...); angles (..., J, 3) rad relative to the parent; scale (...) of the bones.
@@ -43,7 +45,9 @@ def aim(direction_from: Array, direction_to: Array) -> Array:
         return cross / sine * angle
     # any axis perpendicular to a will do when the cross product vanishes
     helper = np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    axis = np.where(sine > 1e-12, cross / np.where(sine > 1e-12, sine, 1.0), _unit(so3.cross(a, helper)))
+    axis = np.where(
+        sine > 1e-12, cross / np.where(sine > 1e-12, sine, 1.0), _unit(so3.cross(a, helper))
+    )
     return axis * angle
 
 

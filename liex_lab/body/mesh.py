@@ -46,8 +46,11 @@ class MeshBody:
         """A batch (n,) of this one body, or this batch."""
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
-        return replace(self, width=np.broadcast_to(self.width, (n, self.width.shape[-1])).copy(),
-                       fur=np.broadcast_to(self.fur, n).copy())  # fmt: skip
+        return replace(
+            self,
+            width=np.broadcast_to(self.width, (n, self.width.shape[-1])).copy(),
+            fur=np.broadcast_to(self.fur, n).copy(),
+        )
 
     @staticmethod
     def of(skeleton: Skeleton) -> MeshBody:
@@ -55,35 +58,54 @@ class MeshBody:
         table = skeleton.surface
         vertices, faces = np.array(table["vertices_mm"], float), np.array(table["faces"], np.int64)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
-            raise LiexError(f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm")
-        if faces.ndim != 2 or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
-            raise LiexError(f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its vertices")
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm"
+            )
+        if (
+            faces.ndim != 2
+            or faces.shape[1:] != (3,)
+            or faces.min() < 0
+            or faces.max() >= len(vertices)
+        ):
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its vertices"
+            )
         home = Pose.home(skeleton).frames(skeleton)
         ends = np.arange(1, skeleton.n_joints)
         carriers = skeleton.parents[ends]
         start, stop = home.translation[carriers], home.translation[ends]
         bone = stop - start
         length2 = np.maximum(np.sum(bone**2, axis=-1), 1e-12)
-        share = np.clip(np.einsum("vbd,bd->vb", vertices[:, None] - start, bone) / length2, 0.0, 1.0)
+        share = np.clip(
+            np.einsum("vbd,bd->vb", vertices[:, None] - start, bone) / length2, 0.0, 1.0
+        )
         far = np.linalg.norm(vertices[:, None] - start - share[..., None] * bone, axis=-1)
         n_bones = min(_BONES, len(ends))
         near = np.argsort(far, axis=1, kind="stable")[:, :n_bones]
         pull = 1.0 / np.maximum(np.take_along_axis(far, near, axis=1), 1e-6) ** _SHARPNESS
         carrier = carriers[near]
-        local = np.einsum("vbji,vbj->vbi", home.rotation[carrier], vertices[:, None] - home.translation[carrier])
+        local = np.einsum(
+            "vbji,vbj->vbi", home.rotation[carrier], vertices[:, None] - home.translation[carrier]
+        )
         direction = skeleton.offsets[ends] / np.sqrt(length2)[:, None]
         along = np.einsum("vbi,vbi->vb", local, direction[near])[..., None] * direction[near]
         return MeshBody(
-            faces.astype(np.int32), ends[near], pull / pull.sum(axis=1, keepdims=True), along, local - along,
+            faces.astype(np.int32),
+            ends[near],
+            pull / pull.sum(axis=1, keepdims=True),
+            along,
+            local - along,
             np.ones(skeleton.n_joints),
-        )  # fmt: skip
+        )
 
     @property
     def n_vertices(self) -> int:
         """Vertices of one pose's mesh."""
         return len(self.weight)
 
-    def vertices(self, skeleton: Skeleton, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
+    def vertices(
+        self, skeleton: Skeleton, rotations: Array, positions: Array, scale: Array, girth: Array
+    ) -> Array:
         """Mesh vertices (n, V, 3) mm for joints (n, J, 3, 3) and (n, J, 3) mm.
 
         scale (n,) multiplies lengths along the bones, girth (n,) those across.
@@ -91,13 +113,26 @@ class MeshBody:
         body = self.broadcast(len(positions))
         out = np.empty((len(positions), self.n_vertices, 3))
         carrier = skeleton.parents[self.bones]
-        _skin_mesh(rotations, positions, scale, girth, carrier, self.bones, self.weight, self.along, self.across,
-                   body.width, out)  # fmt: skip
+        _skin_mesh(
+            rotations,
+            positions,
+            scale,
+            girth,
+            carrier,
+            self.bones,
+            self.weight,
+            self.along,
+            self.across,
+            body.width,
+            out,
+        )
         return out
 
 
 @njit(cache=True, parallel=True)
-def _skin_mesh(rotations, positions, scale, girth, carrier, bones, weight, along, across, width, out):
+def _skin_mesh(
+    rotations, positions, scale, girth, carrier, bones, weight, along, across, width, out
+):
     """Linear blending for a batch; shapes as in `MeshBody`, out (n, V, 3)."""
     for i in prange(len(positions)):
         for v in range(len(weight)):
@@ -109,5 +144,7 @@ def _skin_mesh(rotations, positions, scale, girth, carrier, bones, weight, along
                 for axis in range(3):
                     total = positions[i, j, axis]
                     for k in range(3):
-                        total += rotations[i, j, axis, k] * (scale[i] * along[v, b, k] + thick * across[v, b, k])
+                        total += rotations[i, j, axis, k] * (
+                            scale[i] * along[v, b, k] + thick * across[v, b, k]
+                        )
                     out[i, v, axis] += weight[v, b] * total

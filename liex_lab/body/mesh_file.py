@@ -21,7 +21,9 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     picture shows. unit_mm: how many mm one unit of the file is; origin names the TOML in errors. Raises LiexError.
     """
     if not path.is_file():
-        raise LiexError(f"{origin}: [surface] mesh should be a file beside the TOML, but there is no {path}")
+        raise LiexError(
+            f"{origin}: [surface] mesh should be a file beside the TOML, but there is no {path}"
+        )
     try:
         import open3d
     except (ImportError, OSError) as error:

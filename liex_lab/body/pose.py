@@ -33,9 +33,15 @@ class Pose:
         """The straight pose at the origin, pointing along x, or a batch of it."""
         return Pose(SE3.identity(*batch), np.zeros((*batch, skeleton.n_joints, 3)), np.ones(batch))
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]) -> Pose:
+    def __getitem__(
+        self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]
+    ) -> Pose:
         """Some poses out of a batch."""
-        return Pose(SE3(self.root.rotation[index], self.root.translation[index]), self.angles[index], self.scale[index])
+        return Pose(
+            SE3(self.root.rotation[index], self.root.translation[index]),
+            self.angles[index],
+            self.scale[index],
+        )
 
     def frames(self, skeleton: Skeleton) -> SE3:
         """T_frame_joint of every joint, a batch (..., J)."""
@@ -53,8 +59,17 @@ class Pose:
     @staticmethod
     def join(parts: Sequence[Pose]) -> Pose:
         """The poses of several batches (n), one after the other."""
-        root = SE3(*(np.concatenate([getattr(p.root, name) for p in parts]) for name in ("rotation", "translation")))
-        return Pose(root, np.concatenate([p.angles for p in parts]), np.concatenate([p.scale for p in parts]))
+        root = SE3(
+            *(
+                np.concatenate([getattr(p.root, name) for p in parts])
+                for name in ("rotation", "translation")
+            )
+        )
+        return Pose(
+            root,
+            np.concatenate([p.angles for p in parts]),
+            np.concatenate([p.scale for p in parts]),
+        )
 
     @staticmethod
     def from_joints(skeleton: Skeleton, joints: ArrayLike, up: ArrayLike) -> Pose:
@@ -63,5 +78,7 @@ class Pose:
         Each joint turns by the smallest rotation that aims its bone; the base's roll is chosen so that its z axis lies
         as near to `up` (3,) as its bone allows. Bones keep their proportions; the scale comes from the total length.
         """
-        root, angles, scale = chain_from_joints(skeleton, np.asarray(joints, float), np.asarray(up, float))
+        root, angles, scale = chain_from_joints(
+            skeleton, np.asarray(joints, float), np.asarray(up, float)
+        )
         return Pose(root, angles, scale)

@@ -44,7 +44,10 @@ class BodyShape:
                 "of the next; give radii_mm instead"
             )
         try:
-            width, height = np.array(table["half_width_mm"], float), np.array(table["half_height_mm"], float)
+            width, height = (
+                np.array(table["half_width_mm"], float),
+                np.array(table["half_height_mm"], float),
+            )
             blobs = [
                 [pair["station"], side * pair["left_mm"], pair["up_mm"], *pair["radii_mm"]]
                 for pair in table.get("pairs", [])
@@ -52,7 +55,9 @@ class BodyShape:
             ]
             tail = np.array(table.get("tail_mm", [0.0, 0.0, 0.0]), float)
         except (KeyError, TypeError, ValueError) as error:
-            raise LiexError(f"the [surface] of the skeleton '{skeleton.name}' is incomplete: {error}") from None
+            raise LiexError(
+                f"the [surface] of the skeleton '{skeleton.name}' is incomplete: {error}"
+            ) from None
         if not len(width) == len(height) == len(table["stations"]) >= 4:
             raise LiexError(
                 f"the [surface] of '{skeleton.name}' needs equally many stations, half_width_mm and half_height_mm, "
@@ -60,7 +65,7 @@ class BodyShape:
             )
         return BodyShape(
             width, height, np.array(2.0), np.array(blobs, float).reshape(-1, 6), tail, np.array(0.5)
-        )  # fmt: skip
+        )
 
     def bare(self) -> BodyShape:
         """The same trunk without ears, feet and tail: what a model of unknown limbs should be drawn with."""
@@ -98,7 +103,10 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
     if family == "augmented":
         free = wild & (rng.random(n) < _HULL_SHARE)
         hull_width, hull_height = _hulls(rng, default, stations, n)
-        width, height = np.where(free[:, None], hull_width, width), np.where(free[:, None], hull_height, height)
+        width, height = (
+            np.where(free[:, None], hull_width, width),
+            np.where(free[:, None], hull_height, height),
+        )
     names = [pair["name"] for pair in skeleton.surface.get("pairs", []) for _ in range(2)]
     blobs = np.broadcast_to(default.blobs, (n, *default.blobs.shape)).copy()
     for b in range(len(names)):
@@ -120,7 +128,9 @@ def draw_tail_bends(rng: np.random.Generator, n: int) -> Array:
     ring = np.arange(TAIL_RINGS) / TAIL_RINGS
     first, second = rng.normal(0.0, 0.12, (2, n, 1))
     phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
-    bends = first + second * np.sin(2.0 * np.pi * ring + phase) + rng.normal(0.0, 0.04, (n, TAIL_RINGS))
+    bends = (
+        first + second * np.sin(2.0 * np.pi * ring + phase) + rng.normal(0.0, 0.04, (n, TAIL_RINGS))
+    )
     bends[:, 0] += rng.normal(0.0, 0.35, n)
     return bends
 
@@ -162,7 +172,9 @@ def _varied(
     return width, height
 
 
-def _hulls(rng: np.random.Generator, default: BodyShape, stations: Array, n: int) -> tuple[Array, Array]:
+def _hulls(
+    rng: np.random.Generator, default: BodyShape, stations: Array, n: int
+) -> tuple[Array, Array]:
     """Half widths and heights (n, R) of bodies that owe the default profile nothing: any smooth closed outline whose
     rear is broader than its snout, with a waist, a neck, both or neither.
     """
@@ -176,9 +188,14 @@ def _hulls(rng: np.random.Generator, default: BodyShape, stations: Array, n: int
     whole = rng.random((n, 1))
     share = np.clip(0.6 * whole + 0.4 * rng.random((n, len(knots))), 0.0, 1.0)
     # square roots are drawn through the knots, so that both ends close round as an ellipse does
-    outline = np.maximum(PchipInterpolator(knots, (low + share * (high - low)) ** 2, axis=1)(u), 0.0) ** 0.5
+    outline = (
+        np.maximum(PchipInterpolator(knots, (low + share * (high - low)) ** 2, axis=1)(u), 0.0)
+        ** 0.5
+    )
     outline /= outline.max(axis=1, keepdims=True)
-    width = default.half_width.max() * np.exp(rng.uniform(np.log(0.65), np.log(1.4), (n, 1))) * outline
+    width = (
+        default.half_width.max() * np.exp(rng.uniform(np.log(0.65), np.log(1.4), (n, 1))) * outline
+    )
     ratio = default.half_height.max() / default.half_width.max() * rng.uniform(0.75, 1.2, (n, 1))
     return width, width * ratio * _waves(rng, stations, n, 0.05)
 
@@ -196,11 +213,15 @@ def _waves(rng: np.random.Generator, stations: Array, n: int, sd: float) -> Arra
     total = np.zeros((n, len(stations)))
     for cycles in (0.5, 1.0, 1.5, 2.0):
         phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
-        total += rng.normal(0.0, sd / np.sqrt(2.0), (n, 1)) * np.sin(2.0 * np.pi * cycles * stations + phase)
+        total += rng.normal(0.0, sd / np.sqrt(2.0), (n, 1)) * np.sin(
+            2.0 * np.pi * cycles * stations + phase
+        )
     return np.exp(total)
 
 
-def _foreign(rng: np.random.Generator, default: BodyShape, stations: Array, n: int) -> tuple[Array, Array]:
+def _foreign(
+    rng: np.random.Generator, default: BodyShape, stations: Array, n: int
+) -> tuple[Array, Array]:
     """Half widths and heights (n, R) of builds that 'train' does not hold.
 
     Every mouse is blunt behind and pointed in front; beyond that nothing is shared with 'train'. Half of them are long
@@ -226,14 +247,21 @@ def _foreign(rng: np.random.Generator, default: BodyShape, stations: Array, n: i
 
 
 def _vary_pair(
-    rng: np.random.Generator, blobs: Array, rows: list[int], name: str, family: str, largest_ear: Array
+    rng: np.random.Generator,
+    blobs: Array,
+    rows: list[int],
+    name: str,
+    family: str,
+    largest_ear: Array,
 ) -> None:
     """Ears and feet of another size, place and presence, the same on both sides."""
     n = len(blobs)
     if name == "ear":
         size = rng.uniform(1.25, 1.7, n) if family == "other" else rng.uniform(0.6, largest_ear)
         present = rng.random(n) < (1.0 if family == "other" else 0.65)
-        factors = np.stack([rng.uniform(0.7, 1.6, n), rng.uniform(0.8, 1.1, n), rng.uniform(0.45, 1.1, n)], axis=-1)
+        factors = np.stack(
+            [rng.uniform(0.7, 1.6, n), rng.uniform(0.8, 1.1, n), rng.uniform(0.45, 1.1, n)], axis=-1
+        )
     else:
         size, present = rng.uniform(0.7, 1.3, n), rng.random(n) < 0.6
         factors = rng.uniform(0.85, 1.15, (n, 3))

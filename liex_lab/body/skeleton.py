@@ -23,7 +23,9 @@ AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the jo
 PRESETS = Path(__file__).parent / "presets"
 _JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
 _ROOT_DOF = 6
-REFERENCE_MM = 52.834  # home length of the mouse: lengths that hold for every animal are stated for it
+REFERENCE_MM = (
+    52.834  # home length of the mouse: lengths that hold for every animal are stated for it
+)
 VIEWS = ("floor", "camera")
 FOREGROUNDS = ("background", "nearest")
 _BEHIND_MM, _SMOOTH_MM = 120.0, 2.0  # of an animal of the reference length
@@ -59,15 +61,25 @@ class View:
             raise LiexError(f"{origin}: [view] is a table, got {table!r}")
         for key in table:
             if key not in known:
-                raise LiexError(f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}")
+                raise LiexError(
+                    f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}"
+                )
         frame, area = table.get("frame", VIEWS[0]), table.get("area", list(_AREA))
         foreground = table.get("foreground", FOREGROUNDS[0])
         if foreground not in FOREGROUNDS:
-            raise LiexError(f"{origin}: [view] foreground is one of {', '.join(FOREGROUNDS)}, got {foreground!r}")
+            raise LiexError(
+                f"{origin}: [view] foreground is one of {', '.join(FOREGROUNDS)}, got {foreground!r}"
+            )
         if frame not in VIEWS:
             raise LiexError(f"{origin}: [view] frame is one of {', '.join(VIEWS)}, got {frame!r}")
-        if not (isinstance(area, list) and [_is_number(a) for a in area] == [True, True] and 0 < area[0] < area[1]):
-            raise LiexError(f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got {area}")
+        if not (
+            isinstance(area, list)
+            and [_is_number(a) for a in area] == [True, True]
+            and 0 < area[0] < area[1]
+        ):
+            raise LiexError(
+                f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got {area}"
+            )
         lengths = {
             "behind_mm": _BEHIND_MM * relative_size,
             "smooth_mm": _SMOOTH_MM * relative_size,
@@ -78,7 +90,9 @@ class View:
             if not (_is_number(value) and value > 0):
                 raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
-        return View(frame=frame, area=(float(area[0]), float(area[1])), foreground=foreground, **lengths)
+        return View(
+            frame=frame, area=(float(area[0]), float(area[1])), foreground=foreground, **lengths
+        )
 
 
 MOUSE_VIEW = View()
@@ -115,7 +129,11 @@ class Skeleton:
         if not path.is_file():
             known = sorted(p.stem for p in PRESETS.glob("*.toml"))
             near = difflib.get_close_matches(str(animal), known, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}, or give a .toml file"
+            hint = (
+                f"did you mean '{near[0]}'?"
+                if near
+                else f"known are {', '.join(known)}, or give a .toml file"
+            )
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -136,9 +154,13 @@ class Skeleton:
         parents = []
         for k, row in enumerate(rows):
             if k == 0 and row.parent:
-                raise LiexError(f"{origin}: the first joint is the base and has no parent, got '{row.parent}'")
+                raise LiexError(
+                    f"{origin}: the first joint is the base and has no parent, got '{row.parent}'"
+                )
             if k > 0 and row.parent not in names[:k]:
-                raise LiexError(f"{origin}: the parent '{row.parent}' of '{row.name}' must be a joint listed before it")
+                raise LiexError(
+                    f"{origin}: the parent '{row.parent}' of '{row.name}' must be a joint listed before it"
+                )
             parents.append(names.index(row.parent) if k else -1)
         if len(set(names)) != len(names):
             raise LiexError(f"{origin}: two joints have the same name; every joint needs its own")
@@ -147,7 +169,9 @@ class Skeleton:
         offsets = np.array([row.offset for row in rows], float)
         relative_size = _relative_size(parents, offsets)
         if not 0.0 < relative_size < math.inf:
-            raise LiexError(f"{origin}: a skeleton needs a second joint at some distance from the first one")
+            raise LiexError(
+                f"{origin}: a skeleton needs a second joint at some distance from the first one"
+            )
         return Skeleton(
             name=table["name"],
             names=tuple(names),
@@ -262,15 +286,23 @@ class _Joint:
         where = f"{origin}: joint '{name}'"
         for key in table:
             if key not in _JOINT_KEYS:
-                raise LiexError(f"{where} has an unknown key '{key}'; known are {', '.join(sorted(_JOINT_KEYS))}")
+                raise LiexError(
+                    f"{where} has an unknown key '{key}'; known are {', '.join(sorted(_JOINT_KEYS))}"
+                )
         axes = table.get("axes", [])
         if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
             raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
         limits_deg = table.get("limits_deg", {})
         usual = {axis: [-180.0, 180.0] if axis in axes else [0.0, 0.0] for axis in AXES}
-        limits = [limits_deg.get(axis, usual[axis]) for axis in AXES] if isinstance(limits_deg, dict) else []
+        limits = (
+            [limits_deg.get(axis, usual[axis]) for axis in AXES]
+            if isinstance(limits_deg, dict)
+            else []
+        )
         if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
-            raise LiexError(f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}")
+            raise LiexError(
+                f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}"
+            )
         return _Joint(
             name,
             table.get("parent", ""),
@@ -282,7 +314,11 @@ class _Joint:
 
 
 def _is_range(pair: Any) -> bool:
-    return isinstance(pair, list) and [_is_number(x) for x in pair] == [True, True] and pair[0] <= pair[1]
+    return (
+        isinstance(pair, list)
+        and [_is_number(x) for x in pair] == [True, True]
+        and pair[0] <= pair[1]
+    )
 
 
 def _triple(value: Any, where: str) -> list[float]:

@@ -57,15 +57,22 @@ class Balls:
         )
 
 
-def _along(skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array) -> list[tuple[Any, ...]]:
+def _along(
+    skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array
+) -> list[tuple[Any, ...]]:
     """Balls along capsules, so near to one another at home that they make a body: rows of the fields of `Balls`."""
     home, rows = _home(skeleton), []
     bones = {(p, j) for p, j in skeleton.edges}
     for (a, b), (at_a, at_b), (first, last) in zip(ends, offsets, radii, strict=True):
         length = float(np.linalg.norm(home[b] + at_b - home[a] - at_a))
-        is_bone = (int(a), int(b)) in bones and not np.any(at_a) and not np.any(at_b)  # another ends where it begins
+        is_bone = (
+            (int(a), int(b)) in bones and not np.any(at_a) and not np.any(at_b)
+        )  # another ends where it begins
         n = max(1, round(length / (_SPACING * 0.5 * (first + last))))
-        rows += [(a, b, at_a, at_b, s, first + s * (last - first)) for s in np.arange(int(is_bone), n + 1) / n]
+        rows += [
+            (a, b, at_a, at_b, s, first + s * (last - first))
+            for s in np.arange(int(is_bone), n + 1) / n
+        ]
     return rows
 
 

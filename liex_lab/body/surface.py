@@ -27,7 +27,10 @@ from liex_lab.runtime.threads import threads
 Array = NDArray[np.float64]
 Body = BodyShape | Capsules | MeshBody
 Window = tuple[int, int, int, int]
-_FAR, _SILHOUETTE_PX = 50.0, 400  # a silhouette is seen from so many times its reach, in a picture of so many pixels
+_FAR, _SILHOUETTE_PX = (
+    50.0,
+    400,
+)  # a silhouette is seen from so many times its reach, in a picture of so many pixels
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,14 @@ class Surface:
         try:
             with np.errstate(all="raise", under="ignore"):
                 return Surface._of(skeleton)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            IndexError,
+            AttributeError,
+            ArithmeticError,
+        ) as error:
             raise LiexError(
                 f"the [surface] of '{skeleton.name}' cannot be read ({type(error).__name__}: {one_line(error)}); "
                 "compare it with that of a bundled skeleton"
@@ -80,12 +90,20 @@ class Surface:
     @property
     def n_trunk_vertices(self) -> int:
         """The leading vertices that belong to the trunk, without ears, feet and tail."""
-        return (len(self.stations) - 2) * _skin.BODY_SEGMENTS + 2 if self.shape is not None else self.n_vertices
+        return (
+            (len(self.stations) - 2) * _skin.BODY_SEGMENTS + 2
+            if self.shape is not None
+            else self.n_vertices
+        )
 
     @property
     def n_trunk_faces(self) -> int:
         """The leading faces that belong to the trunk."""
-        return 2 * (len(self.stations) - 2) * _skin.BODY_SEGMENTS if self.shape is not None else len(self.faces)
+        return (
+            2 * (len(self.stations) - 2) * _skin.BODY_SEGMENTS
+            if self.shape is not None
+            else len(self.faces)
+        )
 
     @property
     def area_mm2(self) -> float:
@@ -98,14 +116,22 @@ class Surface:
             along = np.linalg.norm((last - first)[:, :2], axis=-1)
             return float((along * self.capsules.radii.sum(axis=-1)).sum())
         assert self.shape is not None
-        return float(np.trapezoid(2.0 * self.shape.half_width, self.stations * self.skeleton.length))
+        return float(
+            np.trapezoid(2.0 * self.shape.half_width, self.stations * self.skeleton.length)
+        )
 
     def _silhouette_mm2(self) -> float:
         """The area of the home pose from straight above, counted in a picture from very far away."""
         mesh = self.vertices(Pose.home(self.skeleton))
         reach = float(np.abs(mesh).max())
-        camera = Camera(_FAR * _SILHOUETTE_PX / 2, _FAR * _SILHOUETTE_PX / 2, _SILHOUETTE_PX / 2, _SILHOUETTE_PX / 2,
-                        _SILHOUETTE_PX, _SILHOUETTE_PX)  # fmt: skip
+        camera = Camera(
+            _FAR * _SILHOUETTE_PX / 2,
+            _FAR * _SILHOUETTE_PX / 2,
+            _SILHOUETTE_PX / 2,
+            _SILHOUETTE_PX / 2,
+            _SILHOUETTE_PX,
+            _SILHOUETTE_PX,
+        )
         above = SE3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, _FAR * reach]))
         seen = render_mesh(mesh, self.faces, camera, T_camera_mesh=above) > 0
         return float(seen.sum()) * (2.0 * reach / _SILHOUETTE_PX) ** 2
@@ -128,13 +154,17 @@ class Surface:
         batch = frames.translation.shape[:-2]
         joints = np.ascontiguousarray(frames.translation).reshape(-1, self.skeleton.n_joints, 3)
         n = len(joints)
-        size = np.broadcast_to(pose.scale if girth is None else girth, batch).astype(float).reshape(n)
+        size = (
+            np.broadcast_to(pose.scale if girth is None else girth, batch).astype(float).reshape(n)
+        )
         rotations = np.ascontiguousarray(frames.rotation).reshape(n, self.skeleton.n_joints, 3, 3)
         if self.mesh is not None:
             own = shape if isinstance(shape, MeshBody) else self.mesh
             scale = np.broadcast_to(pose.scale, batch).astype(float).reshape(n)
             with threads(parallel):
-                return own.vertices(self.skeleton, rotations, joints, scale, size).reshape(*batch, -1, 3)
+                return own.vertices(self.skeleton, rotations, joints, scale, size).reshape(
+                    *batch, -1, 3
+                )
         if self.capsules is not None:
             flesh = shape if isinstance(shape, Capsules) else self.capsules
             scale = np.broadcast_to(pose.scale, batch).astype(float).reshape(n)
@@ -145,8 +175,19 @@ class Surface:
         body = (shape if isinstance(shape, BodyShape) else self.shape.bare()).broadcast(n)
         turns = np.zeros((n, _skin.TAIL_RINGS)) if bends is None else np.asarray(bends, float)
         skin = _skin.skin_tubes_parallel if parallel and n > 16 else _skin.skin_tubes
-        skin(joints, rotations, size, self.stations, body.half_width, body.half_height, body.power, body.blobs,
-             body.tail, turns, out)  # fmt: skip
+        skin(
+            joints,
+            rotations,
+            size,
+            self.stations,
+            body.half_width,
+            body.half_height,
+            body.power,
+            body.blobs,
+            body.tail,
+            turns,
+            out,
+        )
         return out.reshape(*batch, -1, 3)
 
     def render(
@@ -178,8 +219,19 @@ def render_mesh(
     T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
     u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
     inverse, depth = np.zeros((height, width)), np.empty((height, width), np.float32)
-    _render.draw(np.ascontiguousarray(vertices), faces, T.rotation, T.translation, camera.fx, camera.fy, camera.cx,
-                 camera.cy, float(u0), float(v0), inverse)  # fmt: skip
+    _render.draw(
+        np.ascontiguousarray(vertices),
+        faces,
+        T.rotation,
+        T.translation,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        float(u0),
+        float(v0),
+        inverse,
+    )
     _render.to_depth(inverse, depth)
     return depth
 
@@ -200,6 +252,13 @@ def render_meshes(
     """
     depth = np.empty((len(vertices), size[1], size[0]), np.float32)
     drive = _render.draw_batch_parallel if parallel else _render.draw_batch
-    drive(vertices, faces, T_camera_mesh.rotation, T_camera_mesh.translation, np.asarray(intrinsics, float),
-          np.asarray(origin, float), depth)  # fmt: skip
+    drive(
+        vertices,
+        faces,
+        T_camera_mesh.rotation,
+        T_camera_mesh.translation,
+        np.asarray(intrinsics, float),
+        np.asarray(origin, float),
+        depth,
+    )
     return depth

@@ -36,7 +36,9 @@ def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int)
         reach = joint_reaches(skeleton)
         wide, high = _factors(rng, reach, family, n)
         around = np.sqrt(wide * high)[:, surface.capsules.joints]
-        return replace(surface.capsules.broadcast(n), radii=surface.capsules.radii * around, fur=fur)
+        return replace(
+            surface.capsules.broadcast(n), radii=surface.capsules.radii * around, fur=fur
+        )
     assert surface.shape is not None
     wide, high = _factors(rng, np.clip(surface.stations, 0.0, 1.0), family, n)
     shape = surface.shape.broadcast(n)
@@ -49,7 +51,9 @@ def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int)
             blobs[:, b, 2] *= high[:, nearest]
             blobs[:, b, 3:] *= size[:, None]
     power = rng.uniform(1.8, 2.4, n)
-    return BodyShape(shape.half_width * wide, shape.half_height * high, power, blobs, shape.tail, fur)
+    return BodyShape(
+        shape.half_width * wide, shape.half_height * high, power, blobs, shape.tail, fur
+    )
 
 
 def joint_reaches(skeleton: Skeleton) -> Array:
@@ -72,9 +76,17 @@ def _factors(rng: np.random.Generator, along: Array, family: str, n: int) -> tup
     else:
         more = np.where(wild, 2.0, 1.0)
         log_girth, tilt = more * sign[0] * 0.12 * size, more * sign[1] * 0.15 * slope
-        squeeze, bulge, rough = more * sign[2] * 0.08 * flat, more * (0.2 * belly - 0.05), np.where(wild, 0.08, 0.03)
-    log_width = log_girth + tilt * (along - 0.4) + np.log1p(bulge * np.exp(-(((along - at) / 0.18) ** 2)))
-    log_height = log_girth + tilt * (along - 0.4) + 0.5 * (log_width - log_girth - tilt * (along - 0.4))
+        squeeze, bulge, rough = (
+            more * sign[2] * 0.08 * flat,
+            more * (0.2 * belly - 0.05),
+            np.where(wild, 0.08, 0.03),
+        )
+    log_width = (
+        log_girth + tilt * (along - 0.4) + np.log1p(bulge * np.exp(-(((along - at) / 0.18) ** 2)))
+    )
+    log_height = (
+        log_girth + tilt * (along - 0.4) + 0.5 * (log_width - log_girth - tilt * (along - 0.4))
+    )
     waves = [_waves(rng, along, n) * rough for _ in range(2)]
     return np.exp(log_width + squeeze + waves[0]), np.exp(log_height - squeeze + waves[1])
 
@@ -84,5 +96,7 @@ def _waves(rng: np.random.Generator, along: Array, n: int) -> Array:
     total = np.zeros((n, len(along)))
     for cycles in _WAVES:
         phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
-        total += rng.normal(0.0, np.sqrt(0.5), (n, 1)) * np.sin(2.0 * np.pi * cycles * along + phase)
+        total += rng.normal(0.0, np.sqrt(0.5), (n, 1)) * np.sin(
+            2.0 * np.pi * cycles * along + phase
+        )
     return total

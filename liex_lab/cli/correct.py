@@ -22,16 +22,26 @@ correct = typer.Typer(
     no_args_is_help=True,
 )
 
-SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
-Author = Annotated[str, typer.Option("--by", metavar="NAME", help="Who says so; else who is logged in.")]
-NewWord = Annotated[bool, typer.Option("--new-word", help="The action need not be one of the ethogram's words.")]
+SessionPath = Annotated[
+    Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
+]
+Author = Annotated[
+    str, typer.Option("--by", metavar="NAME", help="Who says so; else who is logged in.")
+]
+NewWord = Annotated[
+    bool, typer.Option("--new-word", help="The action need not be one of the ethogram's words.")
+]
 
 
 @correct.command()
 def flip(
     session: SessionPath,
-    start_s: Annotated[float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")],
-    stop_s: Annotated[float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")],
+    start_s: Annotated[
+        float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")
+    ],
+    stop_s: Annotated[
+        float, typer.Option("--to", metavar="S", help="Seconds since the first frame, exclusive.")
+    ],
     by: Author = "",
 ) -> None:
     """Head and tail are exchanged in a span."""
@@ -46,11 +56,14 @@ def joint(
     frame: Annotated[int, typer.Option("--frame", help="The frame's index, as in frames.parquet.")],
     name: Annotated[str, typer.Option("--joint", help="The joint's name.")],
     to_mm: Annotated[
-        tuple[float, float, float] | None, typer.Option("--to-mm", metavar="X Y Z", help="Its place in the arena.")
+        tuple[float, float, float] | None,
+        typer.Option("--to-mm", metavar="X Y Z", help="Its place in the arena."),
     ] = None,
     to_px: Annotated[
         tuple[float, float] | None,
-        typer.Option("--to-px", metavar="U V", help="The pixel of the depth picture that it lies under."),
+        typer.Option(
+            "--to-px", metavar="U V", help="The pixel of the depth picture that it lies under."
+        ),
     ] = None,
     by: Author = "",
 ) -> None:
@@ -58,7 +71,9 @@ def joint(
     from liex_lab.sessions.correcting import joint_move, joint_move_at_pixel
 
     if (to_mm is None) == (to_px is None):
-        raise SessionError("a joint's place is given in one way: --to-mm X Y Z in the arena, or --to-px U V")
+        raise SessionError(
+            "a joint's place is given in one way: --to-mm X Y Z in the arena, or --to-px U V"
+        )
     opened = _opened(session)
     if to_px is not None:
         _do(session, [joint_move_at_pixel(opened, frame, name, *to_px)], by)
@@ -69,13 +84,24 @@ def joint(
 @correct.command()
 def bout(
     session: SessionPath,
-    at_s: Annotated[float | None, typer.Option("--at", metavar="S", help="A time within the bout to edit.")] = None,
-    action: Annotated[str | None, typer.Option("--action", help="What the animal does there.")] = None,
-    start_s: Annotated[float | None, typer.Option("--from", metavar="S", help="Seconds since the first frame.")] = None,
-    stop_s: Annotated[float | None, typer.Option("--to", metavar="S", help="Seconds, exclusive.")] = None,
+    at_s: Annotated[
+        float | None, typer.Option("--at", metavar="S", help="A time within the bout to edit.")
+    ] = None,
+    action: Annotated[
+        str | None, typer.Option("--action", help="What the animal does there.")
+    ] = None,
+    start_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Seconds since the first frame.")
+    ] = None,
+    stop_s: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Seconds, exclusive.")
+    ] = None,
     delete: Annotated[bool, typer.Option("--delete", help="There is no such bout.")] = False,
     labels: Annotated[
-        Path | None, typer.Option("--labels", metavar="FILE", help="A whole ethogram: .csv, .parquet or .boris.")
+        Path | None,
+        typer.Option(
+            "--labels", metavar="FILE", help="A whole ethogram: .csv, .parquet or .boris."
+        ),
     ] = None,
     new_word: NewWord = False,
     by: Author = "",
@@ -120,7 +146,9 @@ def list_corrections(session: SessionPath) -> None:
     for entry in log.entries:
         what = str(entry.what) if entry.what is not None else f"{entry.undoes} taken back"
         gone = entry.what is not None and entry.number not in standing
-        table.add_row(str(entry.number), what, entry.author, entry.made_at, "taken back" if gone else "")
+        table.add_row(
+            str(entry.number), what, entry.author, entry.made_at, "taken back" if gone else ""
+        )
     if not log.entries:
         typer.echo(f"{opened.path} has no corrections")
         return
@@ -135,7 +163,9 @@ def list_corrections(session: SessionPath) -> None:
 @correct.command()
 def undo(
     session: SessionPath,
-    numbers: Annotated[list[int] | None, typer.Argument(metavar="[NUMBER]...", help="The last one if none.")] = None,
+    numbers: Annotated[
+        list[int] | None, typer.Argument(metavar="[NUMBER]...", help="The last one if none.")
+    ] = None,
     by: Author = "",
 ) -> None:
     """Take corrections back, by their numbers in `liex correct list`."""

@@ -7,10 +7,19 @@ from typing import Annotated
 
 import typer
 
-from liex_lab.cli.options import AnimalName, JsonFile, RowName, SessionPath, keep_numbers, tell_numbers
+from liex_lab.cli.options import (
+    AnimalName,
+    JsonFile,
+    RowName,
+    SessionPath,
+    keep_numbers,
+    tell_numbers,
+)
 from liex_lab.runtime.progress import progress_bar
 
-evaluate = typer.Typer(help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True)
+evaluate = typer.Typer(
+    help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True
+)
 
 
 @evaluate.command("pose")
@@ -18,10 +27,17 @@ def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[str, typer.Option("--split", help="clean, hard or other-body.")] = "clean",
     variant: RowName = "default",
-    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
-    n_frames: Annotated[int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")
+    ] = None,
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")
+    ] = None,
     spine_mm: Annotated[
-        float | None, typer.Option("--spine-mm", min=1.0, help="Render animals of this size instead of the split's.")
+        float | None,
+        typer.Option(
+            "--spine-mm", min=1.0, help="Render animals of this size instead of the split's."
+        ),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -29,7 +45,15 @@ def evaluate_pose(
     from liex_lab.pipelines.evaluation.pose import evaluate_pose as measure
 
     with progress_bar() as progress:
-        result = measure(animal, split, variant, model=model, n_frames=n_frames, spine_mm=spine_mm, progress=progress)
+        result = measure(
+            animal,
+            split,
+            variant,
+            model=model,
+            n_frames=n_frames,
+            spine_mm=spine_mm,
+            progress=progress,
+        )
     tell_numbers(result, json_file)
 
 
@@ -37,7 +61,10 @@ def evaluate_pose(
 def evaluate_speed(
     animal: AnimalName = "mouse",
     recordings: Annotated[
-        bool, typer.Option("--recordings", help="Measure how fast recordings of each format are read instead.")
+        bool,
+        typer.Option(
+            "--recordings", help="Measure how fast recordings of each format are read instead."
+        ),
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
@@ -72,25 +99,37 @@ def evaluate_sizes(
 
 @evaluate.command("tables")
 def evaluate_tables(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")
+    ],
     animals: Annotated[
-        list[str] | None, typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model.")
+        list[str] | None,
+        typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model."),
     ] = None,
     n_frames: Annotated[
         int | None, typer.Option("--frames", min=1, help="Only this many frames of each split.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="See within minutes that everything runs; the numbers mean nothing.")
+        bool,
+        typer.Option(
+            "--quick", help="See within minutes that everything runs; the numbers mean nothing."
+        ),
     ] = False,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Train and measure every row anew, which takes hours; use no kept result.")
+        bool,
+        typer.Option(
+            "--fresh",
+            help="Train and measure every row anew, which takes hours; use no kept result.",
+        ),
     ] = False,
 ) -> None:
     """Every row of the paper's Tables 1 to 3 and its figures, measured now or kept from earlier."""
     from liex_lab.api import run_tables
 
     with progress_bar() as progress:
-        written = run_tables(out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress)
+        written = run_tables(
+            out, animals or (), n_frames=n_frames, quick=quick, fresh=fresh, progress=progress
+        )
     for path in written:
         typer.echo(path)
 
@@ -98,12 +137,19 @@ def evaluate_tables(
 @evaluate.command("actions")
 def evaluate_actions(
     animal: AnimalName = "fish",
-    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
-    pose_model: Annotated[
-        str | None, typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz.")
+    model: Annotated[
+        str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
     ] = None,
-    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")] = 30.0,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")] = None,
+    pose_model: Annotated[
+        str | None,
+        typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz."),
+    ] = None,
+    minutes: Annotated[
+        float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")
+    ] = 30.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
@@ -116,7 +162,12 @@ def evaluate_actions(
     figure = None if out is None else out / f"{animal}_confusion.png"
     with progress_bar() as progress:
         result = measure(
-            animal, model=model, pose_model=pose_model, minutes=minutes, figure=figure, progress=progress
+            animal,
+            model=model,
+            pose_model=pose_model,
+            minutes=minutes,
+            figure=figure,
+            progress=progress,
         )
     tell_numbers(result, json_file)
 
@@ -125,23 +176,33 @@ def evaluate_actions(
 def evaluate_tracking(
     animal: AnimalName = "mouse",
     sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
-    model: Annotated[str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")] = None,
-    n_frames: Annotated[int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")] = None,
-    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")
+    ] = None,
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
     from liex_lab.api import evaluate_tracking as measure
 
     with progress_bar() as progress:
-        result = measure(animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress)
+        result = measure(
+            animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress
+        )
     tell_numbers(result, json_file)
 
 
 @evaluate.command("live")
 def evaluate_live(
     animal: AnimalName = "fish",
-    n_frames: Annotated[int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")] = 1500,
+    n_frames: Annotated[
+        int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")
+    ] = 1500,
     json_file: JsonFile = None,
 ) -> None:
     """How late skeletons are while a virtual animal is filmed."""
@@ -154,7 +215,9 @@ def evaluate_live(
 
 @evaluate.command("statistics")
 def evaluate_statistics(
-    n_studies: Annotated[int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")] = 2000,
+    n_studies: Annotated[
+        int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")
+    ] = 2000,
     effect: Annotated[
         float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
     ] = 1.0,
@@ -171,7 +234,9 @@ def evaluate_statistics(
 @evaluate.command("report")
 def evaluate_report(
     session: SessionPath,
-    minutes: Annotated[float, typer.Option("--minutes", min=1.0, help="Of the long session.")] = 60.0,
+    minutes: Annotated[
+        float, typer.Option("--minutes", min=1.0, help="Of the long session.")
+    ] = 60.0,
     json_file: JsonFile = None,
 ) -> None:
     """How long the report of a long session takes, and its memory: SESSION repeated until it is so long."""
@@ -185,9 +250,16 @@ def evaluate_report(
 @evaluate.command("nyu")
 def evaluate_nyu(
     reference: Annotated[
-        Path, typer.Option("--reference", metavar="DIR", help="Labels, published answers and frames of the NYU data.")
+        Path,
+        typer.Option(
+            "--reference",
+            metavar="DIR",
+            help="Labels, published answers and frames of the NYU data.",
+        ),
     ],
-    model: Annotated[str | None, typer.Option("--model", help="A hand model of your own, .npz.")] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", help="A hand model of your own, .npz.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and ours."""
@@ -205,7 +277,8 @@ def evaluate_nyu(
 def evaluate_reference(
     session: SessionPath,
     reference: Annotated[
-        Path, typer.Option("--reference", metavar="CSV", help="The reference's table, one row a frame.")
+        Path,
+        typer.Option("--reference", metavar="CSV", help="The reference's table, one row a frame."),
     ],
     json_file: JsonFile = None,
 ) -> None:
@@ -217,9 +290,12 @@ def evaluate_reference(
 
 @evaluate.command("scale")
 def evaluate_scale(
-    n_frames: Annotated[int, typer.Option("--frames", min=2000, help="Of each virtual recording.")] = 3000,
+    n_frames: Annotated[
+        int, typer.Option("--frames", min=2000, help="Of each virtual recording.")
+    ] = 3000,
     minutes: Annotated[
-        list[float] | None, typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable.")
+        list[float] | None,
+        typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable."),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:

@@ -35,7 +35,15 @@ from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import progress_bar
 
 FAULT = 70  # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
-_USERS_TO_MEND = {errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.ENAMETOOLONG, errno.ENOTDIR}
+_USERS_TO_MEND = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOSPC,
+    errno.EROFS,
+    errno.EDQUOT,
+    errno.ENAMETOOLONG,
+    errno.ENOTDIR,
+}
 
 app = typer.Typer(
     name="liex",
@@ -62,7 +70,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")
+    ] = False,
 ) -> None:
     """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
 
@@ -84,13 +94,25 @@ def run(
     out: OutFolder = Path(),
     topic: TopicName = None,
     settings: Settings = None,
-    no_depth: Annotated[bool, typer.Option("--no-depth", help="A replay without the depth pictures.")] = False,
-    candidates: Annotated[
-        bool, typer.Option("--candidates", help="A replay with every pose that single frames thought possible.")
+    no_depth: Annotated[
+        bool, typer.Option("--no-depth", help="A replay without the depth pictures.")
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is already there.")] = False,
+    candidates: Annotated[
+        bool,
+        typer.Option(
+            "--candidates", help="A replay with every pose that single frames thought possible."
+        ),
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a session that is already there.")
+    ] = False,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, help="Processes that share a long recording; the tables are the same.")
+        int,
+        typer.Option(
+            "--workers",
+            min=1,
+            help="Processes that share a long recording; the tables are the same.",
+        ),
     ] = 1,
 ) -> None:
     """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
@@ -98,11 +120,15 @@ def run(
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
     asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
-    chosen = Plan.load(plan).with_settings([*asked, *(settings or [])])  # first: a wrong plan is told at once
+    chosen = Plan.load(plan).with_settings(
+        [*asked, *(settings or [])]
+    )  # first: a wrong plan is told at once
     from liex_lab.api import run_session
 
     with progress_bar() as progress:
-        session = run_session(recording, chosen, out, overwrite=overwrite, workers=workers, progress=progress)
+        session = run_session(
+            recording, chosen, out, overwrite=overwrite, workers=workers, progress=progress
+        )
     _tell_session(session)
 
 
@@ -110,7 +136,9 @@ def run(
 def doctor(
     recording: RecordingPath,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
-    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
+    ] = None,
     topic: TopicName = None,
     plan: PlanName = "mouse",
     settings: Settings = None,
@@ -133,22 +161,41 @@ def doctor(
 def convert(
     recording: RecordingPath,
     to: Annotated[
-        Path, typer.Option("--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures.")
+        Path,
+        typer.Option(
+            "--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures."
+        ),
     ],
-    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")] = None,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
+    ] = None,
     topic: TopicName = None,
     step_mm: Annotated[
-        float | None, typer.Option("--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP.")
+        float | None,
+        typer.Option(
+            "--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP."
+        ),
     ] = None,
-    ros: Annotated[bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under this name.")] = False,
+    ros: Annotated[
+        bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
+    ] = False,
 ) -> None:
     """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG pictures."""
     from liex_lab.pipelines.convert import convert as job
 
     with progress_bar() as progress:
         done = job(
-            recording, to, fps=fps, topic=topic, step_mm=step_mm, ros=ros, overwrite=overwrite, progress=progress
+            recording,
+            to,
+            fps=fps,
+            topic=topic,
+            step_mm=step_mm,
+            ros=ros,
+            overwrite=overwrite,
+            progress=progress,
         )
     typer.echo(f"recording: {done.path} ({done.n_frames} frames)")
     for sentence in (*done.problems, *done.notes):
@@ -158,26 +205,43 @@ def convert(
 @app.command()
 def train(
     animal: Annotated[
-        str, typer.Argument(metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking.")
+        str,
+        typer.Argument(
+            metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking."
+        ),
     ],
     variant: VariantName = "default",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="The model file, .npz (of actions: .skops).")
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="The model file, .npz (of actions: .skops)."),
     ] = None,
-    workers: Annotated[int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")] = 0,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")
+    ] = 0,
     n_images: Annotated[
-        int | None, typer.Option("--images", min=512, help="Pictures to train on, for a quick look.")
+        int | None,
+        typer.Option("--images", min=512, help="Pictures to train on, for a quick look."),
     ] = None,
-    of: Annotated[str, typer.Option("--animal", help="Of `train actions` and `tracking`: which animal.")] = "mouse",
+    of: Annotated[
+        str, typer.Option("--animal", help="Of `train actions` and `tracking`: which animal.")
+    ] = "mouse",
     sessions: Annotated[
-        list[Path] | None, typer.Option("--session", help="Of `train actions`: a labelled session; repeatable.")
+        list[Path] | None,
+        typer.Option("--session", help="Of `train actions`: a labelled session; repeatable."),
     ] = None,
     labels: Annotated[
         list[Path] | None,
-        typer.Option("--labels", metavar="FILE", help="Of `train actions`: .csv, .parquet, or .boris; repeatable."),
+        typer.Option(
+            "--labels",
+            metavar="FILE",
+            help="Of `train actions`: .csv, .parquet, or .boris; repeatable.",
+        ),
     ] = None,
     pose_model: Annotated[
-        str | None, typer.Option("--model", metavar="FILE", help="Of `train actions`: the model that measures poses.")
+        str | None,
+        typer.Option(
+            "--model", metavar="FILE", help="Of `train actions`: the model that measures poses."
+        ),
     ] = None,
 ) -> None:
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
@@ -190,9 +254,13 @@ def train(
 
         with progress_bar() as progress:
             model, report = train_actions(
-                out or Path(f"{of}-actions.skops"), animal=of, sessions=sessions or (), labels=labels or (),
-                pose_model=pose_model, progress=progress,
-            )  # fmt: skip
+                out or Path(f"{of}-actions.skops"),
+                animal=of,
+                sessions=sessions or (),
+                labels=labels or (),
+                pose_model=pose_model,
+                progress=progress,
+            )
         if report:
             tell_numbers(report, None)
         typer.echo(f"model: {model}")
@@ -201,21 +269,27 @@ def train(
         from liex_lab.pipelines.training.motion_model import train_tracking
 
         with progress_bar() as progress:
-            table = train_tracking(of, out or Path("tunings.toml"), workers=workers, progress=progress)
+            table = train_tracking(
+                of, out or Path("tunings.toml"), workers=workers, progress=progress
+            )
         typer.echo(f"tunings: {table}")
         return
     from liex_lab.pipelines.training.pose_model import train_model
 
     with progress_bar() as progress:
         path = out or Path(f"{Path(animal).stem}.npz")
-        model = train_model(animal, variant, path, workers=workers, n_images=n_images, progress=progress)
+        model = train_model(
+            animal, variant, path, workers=workers, n_images=n_images, progress=progress
+        )
     typer.echo(f"model: {model}")
 
 
 @app.command()
 def suggest(
     session: SessionPath,
-    model: Annotated[str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")] = None,
+    model: Annotated[
+        str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
+    ] = None,
     n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
 ) -> None:
     """List the stretches of a session most worth labelling next: where the recogniser is least sure."""
@@ -230,12 +304,20 @@ def suggest(
 
 @app.command()
 def live(
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")],
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
+    ],
     plan: PlanName = "mouse",
     settings: Settings = None,
-    replay: Annotated[bool, typer.Option("--replay", help="Send a whole recording at its own pace.")] = False,
-    to: Annotated[str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")] = "viewer",
-    patience_s: Annotated[float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")] = 3.0,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Send a whole recording at its own pace.")
+    ] = False,
+    to: Annotated[
+        str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
+    ] = "viewer",
+    patience_s: Annotated[
+        float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")
+    ] = 3.0,
     json_file: JsonFile = None,
 ) -> None:
     """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
@@ -245,15 +327,21 @@ def live(
     from liex_lab.api import follow_live
 
     with progress_bar() as progress:
-        result = follow_live(source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress)
+        result = follow_live(
+            source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
+        )
     tell_numbers(result, json_file)
 
 
 @app.command()
 def show(
     session: SessionPath,
-    web: Annotated[bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")] = False,
-    at_s: Annotated[float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
+    ] = False,
+    at_s: Annotated[
+        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
+    ] = None,
 ) -> None:
     """Open a session's replay in Rerun."""
     from liex_lab.sessions import Session
@@ -262,7 +350,9 @@ def show(
     replay = Session.open(session).path / "session.rrd"
     if at_s is not None:
         if web:
-            raise typer.BadParameter("a moment can be shown in a window only; leave out --web or --at")
+            raise typer.BadParameter(
+                "a moment can be shown in a window only; leave out --web or --at"
+            )
         show_replay(replay, at_s).wait()
         return
     if not web and not has_screen():
@@ -271,15 +361,29 @@ def show(
         )
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser does not heed it
     if web:
-        typer.echo("Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the window does not")
+        typer.echo(
+            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the window does not"
+        )
     shown = [str(file) for file in replays_with(replay)]
-    command = [sys.executable, "-m", "rerun", *shown, "--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
-    raise typer.Exit(subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode)
+    command = [
+        sys.executable,
+        "-m",
+        "rerun",
+        *shown,
+        "--bind",
+        "127.0.0.1",
+        *(["--web-viewer"] if web else []),
+    ]
+    raise typer.Exit(
+        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
+    )
 
 
 @app.command()
 def info(
-    plan: Annotated[str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")] = None,
+    plan: Annotated[
+        str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
+    ] = None,
 ) -> None:
     """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of your own."""
     from liex_lab.plan import Plan, known_plans
@@ -294,7 +398,11 @@ def info(
     facts["plans"] = ", ".join(known_plans())
     models = bundled_models()
     facts["models"] = ", ".join(models) or "none"
-    facts |= {f"model {name}: {key}": value for name, card in models.items() for key, value in card.items()}
+    facts |= {
+        f"model {name}: {key}": value
+        for name, card in models.items()
+        for key, value in card.items()
+    }
     tell_numbers(facts, None)
 
 
@@ -308,7 +416,9 @@ def main() -> None:
         if error.errno not in _USERS_TO_MEND:
             _fault()
         where = f" {error.filename}" if error.filename else ""
-        _fail(f"the system refused{where}: {error.strerror}; make room, correct the permissions or name another place")
+        _fail(
+            f"the system refused{where}: {error.strerror}; make room, correct the permissions or name another place"
+        )
     except Exception:
         _fault()
 

@@ -11,20 +11,39 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")]
-SessionPath = Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")]
-PlanName = Annotated[str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")]
-OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")]
+RecordingPath = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")
+]
+SessionPath = Annotated[
+    Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
+]
+PlanName = Annotated[
+    str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")
+]
+OutFolder = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")
+]
 TopicName = Annotated[
-    str | None, typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth.")
+    str | None,
+    typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth."),
 ]
 Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable."),
 ]
-AnimalName = Annotated[str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")]
-VariantName = Annotated[str, typer.Option("--variant", help="default, or paper: as the paper describes it.")]
-RowName = Annotated[str, typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")]
+AnimalName = Annotated[
+    str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")
+]
+VariantName = Annotated[
+    str, typer.Option("--variant", help="default, or paper: as the paper describes it.")
+]
+RowName = Annotated[
+    str,
+    typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn."),
+]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")
+]
 
 
 def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:

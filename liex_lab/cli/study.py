@@ -15,24 +15,42 @@ if TYPE_CHECKING:
 
 SOME_FAILED = 3  # the exit code of a study in which a session failed
 
-StudyOrInit = Annotated[str, typer.Argument(metavar="STUDY|init", help="A study's .toml file; or init, to begin one.")]
-InitFolder = Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="With init: where the recordings are.")]
-OnlyIds = Annotated[list[str] | None, typer.Option("--only", metavar="ID", help="Only this session; repeatable.")]
-Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")]
-SlurmFile = Annotated[str | None, typer.Option("--slurm", metavar="FILE", help="How to ask Slurm for workers.")]
+StudyOrInit = Annotated[
+    str, typer.Argument(metavar="STUDY|init", help="A study's .toml file; or init, to begin one.")
+]
+InitFolder = Annotated[
+    Path | None, typer.Argument(metavar="[FOLDER]", help="With init: where the recordings are.")
+]
+OnlyIds = Annotated[
+    list[str] | None, typer.Option("--only", metavar="ID", help="Only this session; repeatable.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")
+]
+SlurmFile = Annotated[
+    str | None, typer.Option("--slurm", metavar="FILE", help="How to ask Slurm for workers.")
+]
 
 
 def cohort(
     study: StudyOrInit,
     folder: InitFolder = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done, and why.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what would be done, and why.")
+    ] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Try the failed sessions again.")] = False,
-    again: Annotated[bool, typer.Option("--again", help="Do every session again, also those that are done.")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Do every session again, also those that are done.")
+    ] = False,
     only: OnlyIds = None,
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: one for every two cores.")] = 0,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="Processes; 0: one for every two cores.")
+    ] = 0,
     scheduler: Scheduler = None,
     slurm: SlurmFile = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="With init: replace a study file.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="With init: replace a study file.")
+    ] = False,
 ) -> None:
     """Measure every session of a study; what is done is left out, what fails stops no other (exit code 3)."""
     if study == "init":
@@ -41,13 +59,21 @@ def cohort(
         typer.echo(f"study: {begin_study(folder or Path(), overwrite)}")
         return
     if folder is not None:
-        raise typer.BadParameter("a folder is named only after init, as in `liex cohort init FOLDER`")
+        raise typer.BadParameter(
+            "a folder is named only after init, as in `liex cohort init FOLDER`"
+        )
     from liex_lab.api import run_study
 
     standings = run_study(
-        study, workers=workers, scheduler=scheduler, slurm=slurm, retry=retry, again=again, only=only or (),
+        study,
+        workers=workers,
+        scheduler=scheduler,
+        slurm=slurm,
+        retry=retry,
+        again=again,
+        only=only or (),
         dry_run=dry_run,
-    )  # fmt: skip
+    )
     failed = _tell_study(standings, dry_run)
     if failed and not dry_run:
         typer.echo(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
@@ -56,12 +82,20 @@ def cohort(
 
 def dashboard(
     study: Annotated[
-        Path, typer.Argument(metavar="STUDY", help="A study's .toml file, or a folder with sessions in it.")
+        Path,
+        typer.Argument(
+            metavar="STUDY", help="A study's .toml file, or a folder with sessions in it."
+        ),
     ],
     host: Annotated[
-        str, typer.Option("--host", help="Another address than this machine's own; visitors then need a token.")
+        str,
+        typer.Option(
+            "--host", help="Another address than this machine's own; visitors then need a token."
+        ),
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = 8050,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")
+    ] = 8050,
     open_browser: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
 ) -> None:
     """Look at a study in the browser: sessions, ethograms, groups, any frame; Ctrl+C ends it."""
@@ -79,9 +113,12 @@ def dashboard(
 
 
 def verify(
-    session: Annotated[Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")],
+    session: Annotated[
+        Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
+    ],
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Measure this recording again and compare the tables.")
+        Path | None,
+        typer.Option("--recording", help="Measure this recording again and compare the tables."),
     ] = None,
 ) -> None:
     """Check a session: its hashes, what it says of its origin and, with --recording, whether it comes out again."""
@@ -103,5 +140,8 @@ def _tell_study(standings: list[Standing], all_of_them: bool) -> int:
         if all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
             typer.echo(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
-    typer.echo(f"{len(standings)} sessions: " + ", ".join(f"{n} {state}" for state, n in sorted(counts.items())))
+    typer.echo(
+        f"{len(standings)} sessions: "
+        + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
+    )
     return counts.get("failed", 0)

@@ -110,11 +110,33 @@ def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
         root = trees.roots[forest, t]
         for first in range(0, n, LANES):
             if n_views == 0:
-                walk_one_view(trees.nodes, root, lanes.pixels, lanes.base, lanes.scalar_base, lanes.inverse,
-                              lanes.views, n_lanes, side, lanes.leaf, first)  # fmt: skip
+                walk_one_view(
+                    trees.nodes,
+                    root,
+                    lanes.pixels,
+                    lanes.base,
+                    lanes.scalar_base,
+                    lanes.inverse,
+                    lanes.views,
+                    n_lanes,
+                    side,
+                    lanes.leaf,
+                    first,
+                )
             else:
-                walk_views(trees.nodes, root, lanes.pixels, lanes.base, lanes.scalar_base, lanes.inverse,
-                           lanes.views, VIEW * n_views, side, lanes.leaf, first)  # fmt: skip
+                walk_views(
+                    trees.nodes,
+                    root,
+                    lanes.pixels,
+                    lanes.base,
+                    lanes.scalar_base,
+                    lanes.inverse,
+                    lanes.views,
+                    VIEW * n_views,
+                    side,
+                    lanes.leaf,
+                    first,
+                )
         for k in range(n):
             at = leaf_base + lanes.leaf[k] * width
             for d in range(width):
@@ -133,7 +155,9 @@ def _write_scalars(lanes, k, first, scalars):
     """Put a lane's scalars behind the pixels, from number `first` on, rounded down."""
     at = lanes.scalar_base[k] + first
     for c in range(scalars.size):
-        lanes.pixels[at + c] = np.int16(np.floor(min(max(scalars[c], np.float32(-32768.0)), np.float32(32767.0))))
+        lanes.pixels[at + c] = np.int16(
+            np.floor(min(max(scalars[c], np.float32(-32768.0)), np.float32(32767.0)))
+        )
 
 
 @njit(cache=True)
@@ -143,10 +167,14 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
     view, scalars = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32)
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
-        fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
+        fill_view(
+            rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view
+        )
         for c in range(VIEW):
             lanes.views[c * n_lanes + s] = view[c]
-        fill_scalars(rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars)
+        fill_scalars(
+            rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars
+        )
         _write_scalars(lanes, s, 0, scalars)
 
 
@@ -154,18 +182,35 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
 def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, positions, scales):
     """Fill the lanes' views from all joints, and their scalars from the base and from the posed body."""
     n_joints = positions.shape[2]
-    view, scalars, fit = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32), np.empty(N_FIT, np.float32)
+    view, scalars, fit = (
+        np.empty(VIEW, np.float32),
+        np.empty(N_SCALARS, np.float32),
+        np.empty(N_FIT, np.float32),
+    )
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
         for joint in range(n_joints):
-            fill_view(rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view)
+            fill_view(
+                rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view
+            )
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
-        fill_scalars(rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars)
+        fill_scalars(
+            rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars
+        )
         _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
-            explain_pose(heights[i], looks[i], moments[i, 5], rotations[i, k], positions[i, k], scales[i, k], size,
-                         body, fit)  # fmt: skip
+            explain_pose(
+                heights[i],
+                looks[i],
+                moments[i, 5],
+                rotations[i, k],
+                positions[i, k],
+                scales[i, k],
+                size,
+                body,
+                fit,
+            )
             _write_scalars(lanes, s, N_SCALARS, fit)
 
 
@@ -187,7 +232,9 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
             base[s], frame[s], pose[s] = (s // n_poses) * area, frames[s // n_poses], s % n_poses
     inverse = np.full(n_lanes, 1.0 / size, np.float32)
     views = np.zeros(VIEW * n_lanes * n_joints, np.float32)
-    return _Lanes(pixels, base, scalar_base, inverse, views, np.zeros(n_lanes, np.int32), frame, pose)
+    return _Lanes(
+        pixels, base, scalar_base, inverse, views, np.zeros(n_lanes, np.int32), frame, pose
+    )
 
 
 @njit(cache=True)
@@ -220,13 +267,36 @@ def choose_survivors(rotations, scores, chosen):
 
 
 @njit(cache=True)
-def _solve_joint(joint, j, chain, regressors, tuning, lanes, n, side, looks, moments, size, rotations, positions,
-                 scales, values):  # fmt: skip
+def _solve_joint(
+    joint,
+    j,
+    chain,
+    regressors,
+    tuning,
+    lanes,
+    n,
+    side,
+    looks,
+    moments,
+    size,
+    rotations,
+    positions,
+    scales,
+    values,
+):
     """All rounds of one joint, the j-th solved one, for n lanes."""
     for s in range(n):
         if joint > 0:
             i, k = lanes.frame[s], lanes.pose[s]
-            place_joint(joint, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k], positions[i, k])
+            place_joint(
+                joint,
+                chain.parents,
+                chain.offsets,
+                chain.rest,
+                scales[i, k],
+                rotations[i, k],
+                positions[i, k],
+            )
     first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
     for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
         forest = first + c
@@ -235,18 +305,34 @@ def _solve_joint(joint, j, chain, regressors, tuning, lanes, n, side, looks, mom
         for s in range(n):
             i, k = lanes.frame[s], lanes.pose[s]
             if joint > 0:
-                correct_joint(rotations[i, k, joint], chain.axes[joint], values[s], tuning.levers[1])
+                correct_joint(
+                    rotations[i, k, joint], chain.axes[joint], values[s], tuning.levers[1]
+                )
                 continue
             for d in range(3):
                 values[s, d] /= tuning.levers[0]
             values[s, 6] = values[s, 6] / tuning.levers[2] if regressors.widths[forest] > 6 else 0.0
-            scales[i, k] = correct_base(rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], size)
+            scales[i, k] = correct_base(
+                rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], size
+            )
 
 
 @njit(cache=True)
 def _estimate_block(
-    heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, body, starts, poses
-):  # fmt: skip
+    heights,
+    looks,
+    moments,
+    frames,
+    size,
+    chain,
+    regressors,
+    pruner,
+    metric,
+    tuning,
+    body,
+    starts,
+    poses,
+):
     """Candidates of a few frames: `starts` (rotations, positions, scales) of their bases in, `poses` and scores out."""
     start_rotations, start_positions, start_scales = starts
     rotations, positions, scales, scores = poses
@@ -254,11 +340,40 @@ def _estimate_block(
     lanes = _lanes_for(heights, frames, n_starts, 1, size)
     n = frames.size * n_starts
     values = np.empty((lanes.base.size, 7))
-    first, no_view = np.int64(0), np.int64(0)  # typed as numbers: a kernel is compiled anew for every literal
-    _solve_joint(chain.solved[0], first, chain, regressors, tuning, lanes, n, side, looks, moments, size,
-                 start_rotations, start_positions, start_scales, values)  # fmt: skip
+    first, no_view = (
+        np.int64(0),
+        np.int64(0),
+    )  # typed as numbers: a kernel is compiled anew for every literal
+    _solve_joint(
+        chain.solved[0],
+        first,
+        chain,
+        regressors,
+        tuning,
+        lanes,
+        n,
+        side,
+        looks,
+        moments,
+        size,
+        start_rotations,
+        start_positions,
+        start_scales,
+        values,
+    )
     if tuning.keep < n_starts:
-        _see(lanes, n, 0, looks, moments, size, tuning.reach, start_rotations, start_positions, start_scales)
+        _see(
+            lanes,
+            n,
+            0,
+            looks,
+            moments,
+            size,
+            tuning.reach,
+            start_rotations,
+            start_positions,
+            start_scales,
+        )
         _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
     chosen, early = np.arange(tuning.keep), np.empty(n_starts)
     for m in range(frames.size):
@@ -276,20 +391,58 @@ def _estimate_block(
     lanes = _lanes_for(heights, frames, tuning.keep, n_joints, size)
     n = frames.size * tuning.keep
     for j in range(1, chain.solved.size):
-        _solve_joint(chain.solved[j], j, chain, regressors, tuning, lanes, n, side, looks, moments, size, rotations,
-                     positions, scales, values)  # fmt: skip
+        _solve_joint(
+            chain.solved[j],
+            j,
+            chain,
+            regressors,
+            tuning,
+            lanes,
+            n,
+            side,
+            looks,
+            moments,
+            size,
+            rotations,
+            positions,
+            scales,
+            values,
+        )
     for s in range(n):
         i, k = lanes.frame[s], lanes.pose[s]
-        place_rest(chain.solved, chain.parents, chain.offsets, chain.rest, scales[i, k], rotations[i, k],
-                   positions[i, k])  # fmt: skip
-    _see_all(lanes, n, heights, looks, moments, size, tuning.reach, body, rotations, positions, scales)
+        place_rest(
+            chain.solved,
+            chain.parents,
+            chain.offsets,
+            chain.rest,
+            scales[i, k],
+            rotations[i, k],
+            positions[i, k],
+        )
+    _see_all(
+        lanes, n, heights, looks, moments, size, tuning.reach, body, rotations, positions, scales
+    )
     _predict(metric, first, lanes, n, n_joints, side, 0.0, values)
     for s in range(n):
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner, metric, tuning, body, starts, poses):
+def estimate_all(
+    heights,
+    looks,
+    moments,
+    seen,
+    size,
+    chain,
+    regressors,
+    pruner,
+    metric,
+    tuning,
+    body,
+    starts,
+    poses,
+):
     """Algorithm 1 for the frames `seen`, in which an animal was found.
 
     starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it moves; poses: rotations
@@ -298,5 +451,18 @@ def estimate_all(heights, looks, moments, seen, size, chain, regressors, pruner,
     n_blocks = (seen.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):
         frames = seen[b * FRAMES : (b + 1) * FRAMES]
-        _estimate_block(heights, looks, moments, frames, size, chain, regressors, pruner, metric, tuning, body, starts,
-                        poses)  # fmt: skip
+        _estimate_block(
+            heights,
+            looks,
+            moments,
+            frames,
+            size,
+            chain,
+            regressors,
+            pruner,
+            metric,
+            tuning,
+            body,
+            starts,
+            poses,
+        )

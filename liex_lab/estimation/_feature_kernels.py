@@ -57,7 +57,9 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     scalars[8] = _LOG_UNIT * rotation[2, 1]
     # the sine of twice the angle from the joint's heading to the long axis, without asking for the heading's angle
     twice = np.sin(2.0 * moments[5]) * (c * c - s * s) - np.cos(2.0 * moments[5]) * 2.0 * s * c
-    scalars[9] = _LOG_UNIT * twice / norm * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
+    scalars[9] = (
+        _LOG_UNIT * twice / norm * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
+    )
     scalars[10] = _LOG_UNIT * np.log(scale / size)
 
 
@@ -70,9 +72,21 @@ def so3_exp(wx, wy, wz, out):
     else:
         th = np.sqrt(th2)
         a, b = np.sin(th) / th, 2.0 * np.sin(th / 2.0) ** 2 / th2
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - b * (wy * wy + wz * wz), b * wx * wy - a * wz, b * wx * wz + a * wy
-    out[1, 0], out[1, 1], out[1, 2] = b * wx * wy + a * wz, 1.0 - b * (wx * wx + wz * wz), b * wy * wz - a * wx
-    out[2, 0], out[2, 1], out[2, 2] = b * wx * wz - a * wy, b * wy * wz + a * wx, 1.0 - b * (wx * wx + wy * wy)
+    out[0, 0], out[0, 1], out[0, 2] = (
+        1.0 - b * (wy * wy + wz * wz),
+        b * wx * wy - a * wz,
+        b * wx * wz + a * wy,
+    )
+    out[1, 0], out[1, 1], out[1, 2] = (
+        b * wx * wy + a * wz,
+        1.0 - b * (wx * wx + wz * wz),
+        b * wy * wz - a * wx,
+    )
+    out[2, 0], out[2, 1], out[2, 2] = (
+        b * wx * wz - a * wy,
+        b * wy * wz + a * wx,
+        1.0 - b * (wx * wx + wy * wy),
+    )
 
 
 @njit(cache=True)
@@ -155,16 +169,32 @@ def place_all(j, parents, offsets, rest, scale, rotations, positions):
 
 
 @njit(cache=True, parallel=True)
-def look_all(joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars):
+def look_all(
+    joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars
+):
     """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars (n, N_SCALARS) of
     the first of them, for a batch.
     """
     for s in prange(scale.size):
         i = image[s]
         for v in range(joints.size):
-            fill_view(rotations[s, joints[v]], positions[s, joints[v]], looks[i], size[s], reach[v], views[s, v])
+            fill_view(
+                rotations[s, joints[v]],
+                positions[s, joints[v]],
+                looks[i],
+                size[s],
+                reach[v],
+                views[s, v],
+            )
         if scalars.shape[1] > 0:
-            fill_scalars(rotations[s, joints[0]], positions[s, joints[0]], scale[s], moments[i], size[s], scalars[s])
+            fill_scalars(
+                rotations[s, joints[0]],
+                positions[s, joints[0]],
+                scale[s],
+                moments[i],
+                size[s],
+                scalars[s],
+            )
 
 
 @njit(cache=True, parallel=True)

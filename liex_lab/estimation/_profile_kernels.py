@@ -88,4 +88,6 @@ def look_along(heights, looks, positions, length, most_share, out):
         for end in range(2):
             k, before = (m - 1, m - 2) if end else (0, 1)
             reach = _END_SHARE * length[i]
-            out[i, 2 * m + end] = end_past(heights[i], looks[i], positions[i, k], positions[i, before], reach)
+            out[i, 2 * m + end] = end_past(
+                heights[i], looks[i], positions[i, k], positions[i, before], reach
+            )

@@ -61,7 +61,9 @@ def nearest_reading(heights, r, c, known):
     reach = 1
     while reach < side and reach * reach < least:
         for a in range(max(r - reach, 0), min(r + reach + 1, side)):
-            hop = 1 if abs(a - r) == reach else 2 * reach  # whole rows above and below, else both ends of the row
+            hop = (
+                1 if abs(a - r) == reach else 2 * reach
+            )  # whole rows above and below, else both ends of the row
             for b in range(c - reach, c + reach + 1, hop):
                 if 0 <= b < side and heights[a, b] > 0:
                     off = (a - r) ** 2 + (b - c) ** 2
@@ -142,7 +144,9 @@ def turning_axes(free, angles, rotations, axes):
             e[1] += c * (w2 * x - w0 * z) - b * y
             e[2] += c * (w0 * y - w1 * x) - b * z
         for i in range(3):
-            axes[f, i] = rotations[j, i, 0] * e[0] + rotations[j, i, 1] * e[1] + rotations[j, i, 2] * e[2]
+            axes[f, i] = (
+                rotations[j, i, 0] * e[0] + rotations[j, i, 1] * e[1] + rotations[j, i, 2] * e[2]
+            )
 
 
 @njit(cache=True)
@@ -152,7 +156,11 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
     x0, y0, z0 = ball[0] - positions[0, 0], ball[1] - positions[0, 1], ball[2] - positions[0, 2]
     for k in range(3):
         ax, ay, az = rotations[0, 0, k], rotations[0, 1, k], rotations[0, 2, k]
-        slope[0, k], slope[1, k], slope[2, k] = ay * z0 - az * y0, az * x0 - ax * z0, ax * y0 - ay * x0
+        slope[0, k], slope[1, k], slope[2, k] = (
+            ay * z0 - az * y0,
+            az * x0 - ax * z0,
+            ax * y0 - ay * x0,
+        )
         slope[0, 3 + k], slope[1, 3 + k], slope[2, 3 + k] = ax, ay, az
     slope[0, 6], slope[1, 6], slope[2, 6] = x0, y0, z0
     for e in range(2):
@@ -160,10 +168,29 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
         share = body.share[b] if e == 1 else 1.0 - body.share[b]
         if share == 0.0:
             continue
-        u, v, w = scale * body.offsets[b, e, 0], scale * body.offsets[b, e, 1], scale * body.offsets[b, e, 2]
-        ex = positions[j, 0] + rotations[j, 0, 0] * u + rotations[j, 0, 1] * v + rotations[j, 0, 2] * w
-        ey = positions[j, 1] + rotations[j, 1, 0] * u + rotations[j, 1, 1] * v + rotations[j, 1, 2] * w
-        ez = positions[j, 2] + rotations[j, 2, 0] * u + rotations[j, 2, 1] * v + rotations[j, 2, 2] * w
+        u, v, w = (
+            scale * body.offsets[b, e, 0],
+            scale * body.offsets[b, e, 1],
+            scale * body.offsets[b, e, 2],
+        )
+        ex = (
+            positions[j, 0]
+            + rotations[j, 0, 0] * u
+            + rotations[j, 0, 1] * v
+            + rotations[j, 0, 2] * w
+        )
+        ey = (
+            positions[j, 1]
+            + rotations[j, 1, 0] * u
+            + rotations[j, 1, 1] * v
+            + rotations[j, 1, 2] * w
+        )
+        ez = (
+            positions[j, 2]
+            + rotations[j, 2, 0] * u
+            + rotations[j, 2, 1] * v
+            + rotations[j, 2, 2] * w
+        )
         for m in range(tree.turns.shape[1]):
             f = tree.turns[b, m]
             if f < 0:
@@ -314,8 +341,20 @@ def _readings(heights, look):
 
 
 @njit(cache=True)
-def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_rotation, root_position, angles,
-               scale):  # fmt: skip
+def refine_one(
+    heights,
+    look,
+    known,
+    points,
+    tree,
+    body,
+    wishes,
+    n_steps,
+    root_rotation,
+    root_position,
+    angles,
+    scale,
+):
     """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale.
 
     known (S, S, 2) as in `nearest_reading`, points (n, 3) as `_readings` of the height map.
@@ -332,10 +371,33 @@ def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_r
         turning_axes(tree.free, angles, rotations, axes)
         for b in range(body.n_own):
             ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
-        gradient, curvature, radius = np.zeros(n_values), np.zeros((n_values, n_values)), body.radius * scale
+        gradient, curvature, radius = (
+            np.zeros(n_values),
+            np.zeros((n_values, n_values)),
+            body.radius * scale,
+        )
         _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
-        _push(heights, look, known, balls, radius, slopes, wishes.robust, wishes.beside, gradient, curvature)
-        _hold(tree, wishes.prior, moved, np.log(scale / first_scale), angles - first_angles, gradient, curvature)
+        _push(
+            heights,
+            look,
+            known,
+            balls,
+            radius,
+            slopes,
+            wishes.robust,
+            wishes.beside,
+            gradient,
+            curvature,
+        )
+        _hold(
+            tree,
+            wishes.prior,
+            moved,
+            np.log(scale / first_scale),
+            angles - first_angles,
+            gradient,
+            curvature,
+        )
         for i in range(n_values):
             curvature[i, i] *= 1.0 + _DAMPING
         if not _solve(curvature, gradient, step):
@@ -346,7 +408,9 @@ def refine_one(heights, look, known, points, tree, body, wishes, n_steps, root_r
 
 
 @njit(cache=True, parallel=True)
-def refine_all(heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales):
+def refine_all(
+    heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales
+):
     """`refine_one` for the K poses of each of n frames."""
     for i in prange(len(scales)):
         known = np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32)

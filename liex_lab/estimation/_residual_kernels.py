@@ -14,7 +14,9 @@ from numba import njit, prange
 N_FIT = 8
 BESIDE, OUT_OF, APART = 0, 2, 4  # of the fit: see `explain`
 SHARE_UNIT, MM_UNIT = 1000.0, 50.0  # thresholds are integers
-_MOST_MM = 30.0  # in tenths of the balls' usual radius, as the next two: farther off is simply wrong
+_MOST_MM = (
+    30.0  # in tenths of the balls' usual radius, as the next two: farther off is simply wrong
+)
 _HIDDEN_MM = 12.0
 _APART_MM = 8.0
 _STRIDE = 6  # every so many crop pixels a reading is looked at
@@ -104,7 +106,10 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
             dx = (look[14] + look[16] * c - look[2]) / look[0]
             dy = (look[15] + look[16] * r - look[3]) / look[1]
             z = (heights[r, c] / 16.0 - look[13]) / (look[10] * dx + look[11] * dy + look[12])
-            px, py = z * (look[4] * dx + look[5] * dy + look[6]), z * (look[7] * dx + look[8] * dy + look[9])
+            px, py = (
+                z * (look[4] * dx + look[5] * dy + look[6]),
+                z * (look[7] * dx + look[8] * dy + look[9]),
+            )
             pz = heights[r, c] / 16.0
             nearest, which = nearest_ball(px, py, pz, balls, radius, gaps)
             if which >= n_own:
@@ -115,7 +120,11 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
             apart += min(max(nearest, 0.0), _MOST_MM)
             within += min(max(-nearest, 0.0), _MOST_MM)
     many = max(n_read, 1)
-    out[4], out[5], out[6] = MM_UNIT * apart / many, SHARE_UNIT * far / many, MM_UNIT * within / many
+    out[4], out[5], out[6] = (
+        MM_UNIT * apart / many,
+        SHARE_UNIT * far / many,
+        MM_UNIT * within / many,
+    )
 
 
 @njit(cache=True)
@@ -134,4 +143,14 @@ def explain_all(heights, looks, moments, image, rotations, positions, scale, siz
     """`explain_pose` for a batch of n poses on some of the images (n,); out (n, N_FIT)."""
     for s in prange(len(image)):
         i = image[s]
-        explain_pose(heights[i], looks[i], moments[i, 5], rotations[s], positions[s], scale[s], size[s], body, out[s])
+        explain_pose(
+            heights[i],
+            looks[i],
+            moments[i, 5],
+            rotations[s],
+            positions[s],
+            scale[s],
+            size[s],
+            body,
+            out[s],
+        )

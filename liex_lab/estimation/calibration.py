@@ -31,11 +31,20 @@ _SIZE_SD, _SETTLED_SIZE_SD, _GUESS_SD = 0.05, 0.02, 0.08
 _DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
 _GROUP = 50  # images share a size guess, as the frames of a recording do
 _EXPECTATION = GrowthPlan(
-    n_trees=120, max_depth=6, min_leaf=40, n_tests=60, one_probe_share=0.0, scalar_share=1.0, depth_share=0.3,
+    n_trees=120,
+    max_depth=6,
+    min_leaf=40,
+    n_tests=60,
+    one_probe_share=0.0,
+    scalar_share=1.0,
+    depth_share=0.3,
     bag_share=0.5,
-)  # fmt: skip
+)
 _SHRINKAGE = 0.12
-_CORRECTED_MM, _CORRECTION_SHRINKAGE = 12.0, 0.1  # at the reference length: what is farther off is another pose
+_CORRECTED_MM, _CORRECTION_SHRINKAGE = (
+    12.0,
+    0.1,
+)  # at the reference length: what is farther off is another pose
 _FOLDS = 4
 
 
@@ -65,7 +74,9 @@ class _Group:
     scores: Array
 
 
-def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd: float = _SIZE_SD) -> Iterator[_Group]:
+def _choices(
+    model: Model, data: TrainingSet, rng: np.random.Generator, size_sd: float = _SIZE_SD
+) -> Iterator[_Group]:
     """Let a model choose. Images of animals are taken in order of size, and each group of them shares one guess, off by
     size_sd (log).
     """
@@ -78,9 +89,14 @@ def _choices(model: Model, data: TrainingSet, rng: np.random.Generator, size_sd:
         images = data.images[rows]
         looks = images.looks
         crops = Crops(
-            images.heights, looks[:, 14:16].astype(np.int32), looks[:, 16].astype(np.int32), np.full(len(rows), 1),
-            images.moments, looks[:, 13], np.ones(len(rows), np.int64),
-        )  # fmt: skip
+            images.heights,
+            looks[:, 14:16].astype(np.int32),
+            looks[:, 16].astype(np.int32),
+            np.full(len(rows), 1),
+            images.moments,
+            looks[:, 13],
+            np.ones(len(rows), np.int64),
+        )
         rotations, positions, _, scores = estimator.candidates(crops, looks, size)
         chosen = estimator.pick(images, size, rotations, positions, scores)
         yield _Group(rows, images, size, chosen, positions, scores)
@@ -90,9 +106,13 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
     """The choices of a model for the animals among the images, and how far off they are."""
     skeleton = model.skeleton
     scores_of, spreads, joint_errors, clues = [], [], [], []
-    for group in _choices(model, data, rng, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD):
+    for group in _choices(
+        model, data, rng, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD
+    ):
         picked, images = group.chosen, group.images
-        off = np.linalg.norm(picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1)
+        off = np.linalg.norm(
+            picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1
+        )
         scores_of.append(picked.score)
         spreads.append(picked.spread)
         joint_errors.append(off / group.size)
@@ -101,10 +121,15 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
     scalars = np.concatenate(clues)
     n = len(scalars)
     samples = Samples(
-        blank.heights, np.zeros(n, np.int32), np.ones(n, np.float32),
-        np.zeros((n, 1, blank.views.shape[2]), np.float32), scalars,
-    )  # fmt: skip
-    return Trial(np.concatenate(scores_of), np.concatenate(spreads), np.concatenate(joint_errors), samples)
+        blank.heights,
+        np.zeros(n, np.int32),
+        np.ones(n, np.float32),
+        np.zeros((n, 1, blank.views.shape[2]), np.float32),
+        scalars,
+    )
+    return Trial(
+        np.concatenate(scores_of), np.concatenate(spreads), np.concatenate(joint_errors), samples
+    )
 
 
 def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
@@ -123,13 +148,20 @@ def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) ->
         near = np.flatnonzero(off < worst * group.size)
         samples = pose_samples(group.chosen.pose, model, group.images, group.size)
         samples = Samples(
-            data.images.heights, group.rows.astype(np.int32), samples.inverse_size, samples.views, samples.scalars
+            data.images.heights,
+            group.rows.astype(np.int32),
+            samples.inverse_size,
+            samples.views,
+            samples.scalars,
         )
         parts.append(samples[near])
         moves.append(moves_to(group.chosen.pose, model, true, group.size)[near])
     labels = np.concatenate(moves).astype(np.float32)
     return replace(
-        model, corrector=quantised(boost_forest(Samples.join(parts), labels, plan, _CORRECTION_SHRINKAGE, rng))
+        model,
+        corrector=quantised(
+            boost_forest(Samples.join(parts), labels, plan, _CORRECTION_SHRINKAGE, rng)
+        ),
     )
 
 
@@ -141,7 +173,9 @@ def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> M
     rows = np.concatenate([group.rows for group in groups])
     sizes = np.concatenate([np.full(len(group.rows), group.size) for group in groups])
     pose = Pose.join([group.chosen.pose for group in groups])
-    settler = Settler.fit(model.skeleton, pose, data.images[rows], sizes, data.truth.positions[rows], data.size[rows])
+    settler = Settler.fit(
+        model.skeleton, pose, data.images[rows], sizes, data.truth.positions[rows], data.size[rows]
+    )
     return replace(model, settler=settler.table)
 
 
@@ -157,11 +191,18 @@ def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
         true = data.truth.positions[group.rows]
         along = true[:, skeleton.tip] - true[:, 0]
         best, opposite, behind, _ = both_ways(group.positions, group.scores, skeleton.tip)
-        for k, there in ((best, np.isfinite(group.scores.min(axis=1))), (opposite, np.isfinite(behind))):
+        for k, there in (
+            (best, np.isfinite(group.scores.min(axis=1))),
+            (opposite, np.isfinite(behind)),
+        ):
             rows = np.flatnonzero(there)
             joints = group.positions[rows, k[rows]]
-            pictures.append(laid_along(skeleton, group.images[rows], joints, np.full(len(rows), group.size)))
-            right.append(np.einsum("nd,nd->n", joints[:, skeleton.tip] - joints[:, 0], along[rows]) > 0)
+            pictures.append(
+                laid_along(skeleton, group.images[rows], joints, np.full(len(rows), group.size))
+            )
+            right.append(
+                np.einsum("nd,nd->n", joints[:, skeleton.tip] - joints[:, 0], along[rows]) > 0
+            )
     return replace(model, facing=Facing.fit(np.concatenate(pictures), np.concatenate(right), seed))
 
 
@@ -169,9 +210,12 @@ def _rows(samples: Samples, index: NDArray[np.int64]) -> Samples:
     """Some of the samples, each on a map of its own so that bags are drawn over samples."""
     n = len(index)
     return Samples(
-        np.zeros((n, 1, 1), np.int16), np.arange(n, dtype=np.int32), samples.inverse_size[index], samples.views[index],
+        np.zeros((n, 1, 1), np.int16),
+        np.arange(n, dtype=np.int32),
+        samples.inverse_size[index],
+        samples.views[index],
         samples.scalars[index],
-    )  # fmt: skip
+    )
 
 
 def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
@@ -195,7 +239,9 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     predicted = np.maximum(gain * predicted, LEAST_MM * model.skeleton.relative_size)
     low, high = np.quantile(error / predicted, [0.05, 0.95])
     shifted = target + np.float32(LOG_UNIT * np.log(gain))
-    expectation = quantised(boost_forest(_rows(trial.clues, np.arange(n)), shifted, _EXPECTATION, _SHRINKAGE, rng))
+    expectation = quantised(
+        boost_forest(_rows(trial.clues, np.arange(n)), shifted, _EXPECTATION, _SHRINKAGE, rng)
+    )
     design = np.stack([np.ones(n), trial.score, trial.spread], axis=1)
     line, *_ = np.linalg.lstsq(design, capped, rcond=None)
     calibration = Calibration(
@@ -203,7 +249,9 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
         slope=float(line[1]),
         spread_slope=float(line[2]),
         quantiles=(float(low), float(high)),
-        joint_share=tuple(float(x) for x in np.median(trial.joint_error, axis=0) / np.median(error)),
+        joint_share=tuple(
+            float(x) for x in np.median(trial.joint_error, axis=0) / np.median(error)
+        ),
         doubtful_mm=float(np.quantile(predicted, _DOUBTFUL_SHARE)),
         area_mm2=model.calibration.area_mm2,
         logarithmic=True,

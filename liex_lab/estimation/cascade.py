@@ -38,7 +38,12 @@ class Candidates:
 
     @staticmethod
     def start(
-        skeleton: Skeleton, image: NDArray[np.int32], rotation: Array, position: Array, scale: Array, size: Array
+        skeleton: Skeleton,
+        image: NDArray[np.int32],
+        rotation: Array,
+        position: Array,
+        scale: Array,
+        size: Array,
     ) -> Candidates:
         """Candidates with only their base in place."""
         n, j = len(image), skeleton.n_joints
@@ -86,8 +91,15 @@ class Cascade:
     def place(self, candidates: Candidates, joint: int) -> None:
         """Put a joint where its parent carries it."""
         s = self.skeleton
-        kernels.place_all(joint, s.parents, s.offsets, s.rest, candidates.scale, candidates.rotations,
-                          candidates.positions)  # fmt: skip
+        kernels.place_all(
+            joint,
+            s.parents,
+            s.offsets,
+            s.rest,
+            candidates.scale,
+            candidates.rotations,
+            candidates.positions,
+        )
 
     def steps(self, images: ImageSet, candidates: Candidates) -> Iterator[tuple[int, int]]:
         """Algorithm 1 as it is written: move the candidates, each by itself, by one forest after the other; yields the
@@ -97,7 +109,9 @@ class Cascade:
             if joint:
                 self.place(candidates, joint)
             for c, forest in enumerate(rounds):
-                self.apply(candidates, joint, predict(forest, self.samples(images, candidates, [joint])))
+                self.apply(
+                    candidates, joint, predict(forest, self.samples(images, candidates, [joint]))
+                )
                 yield joint, c
         self.place_ends(candidates)
 
@@ -113,10 +127,18 @@ class Cascade:
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
         kernels.look_all(
-            np.array(joints), images.looks, images.moments, candidates.image, candidates.size,
+            np.array(joints),
+            images.looks,
+            images.moments,
+            candidates.image,
+            candidates.size,
             self.method.reaches(self.skeleton.n_joints)[joints],
-            candidates.rotations, candidates.positions, candidates.scale, views, scalars,
-        )  # fmt: skip
+            candidates.rotations,
+            candidates.positions,
+            candidates.scale,
+            views,
+            scalars,
+        )
         inverse_size = (1.0 / candidates.size).astype(np.float32)
         return Samples(images.heights, candidates.image, inverse_size, views, scalars)
 
@@ -132,9 +154,17 @@ class Cascade:
             return samples
         fit = np.empty((len(candidates), explaining.N_FIT), np.float32)
         explaining.explain_all(
-            images.heights, images.looks, images.moments, candidates.image, candidates.rotations, candidates.positions,
-            candidates.scale, candidates.size, body_of(self.balls), fit,
-        )  # fmt: skip
+            images.heights,
+            images.looks,
+            images.moments,
+            candidates.image,
+            candidates.rotations,
+            candidates.positions,
+            candidates.scale,
+            candidates.size,
+            body_of(self.balls),
+            fit,
+        )
         return replace(samples, scalars=np.concatenate([samples.scalars, fit], axis=1))
 
     def apply(self, candidates: Candidates, joint: int, values: NDArray[np.float32]) -> None:
@@ -142,13 +172,26 @@ class Cascade:
         method = self.method
         if joint == 0:
             levers = np.array([method.base_lever_mm, method.scale_lever_mm])
-            kernels.correct_base_all(candidates.rotations, candidates.positions, candidates.scale, values, levers,
-                                     candidates.size)  # fmt: skip
+            kernels.correct_base_all(
+                candidates.rotations,
+                candidates.positions,
+                candidates.scale,
+                values,
+                levers,
+                candidates.size,
+            )
         else:
-            kernels.correct_joint_all(joint, candidates.rotations, self.skeleton.axes[joint], values,
-                                      method.joint_lever_mm)  # fmt: skip
+            kernels.correct_joint_all(
+                joint,
+                candidates.rotations,
+                self.skeleton.axes[joint],
+                values,
+                method.joint_lever_mm,
+            )
 
-    def labels(self, candidates: Candidates, joint: int, truth: Truth) -> tuple[Array, NDArray[np.bool_]]:
+    def labels(
+        self, candidates: Candidates, joint: int, truth: Truth
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Corrections (n, n_values) that lead to the truth, in lever units, and which samples are worth learning from.
 
         Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size. Other joints: the rotation about the free axes
@@ -168,7 +211,9 @@ class Cascade:
             return np.concatenate([twist, grow[:, None]], axis=1), keep
         if method.point_at:
             child = self.skeleton.next_joint[joint]
-            ahead = (truth.positions[i, child] - estimate.translation)[:, None, :] @ estimate.rotation
+            ahead = (truth.positions[i, child] - estimate.translation)[
+                :, None, :
+            ] @ estimate.rotation
             turn = aim_about(self.skeleton.offsets[child], ahead[:, 0], self.skeleton.axes[joint])
         else:
             turn = so3.log(np.swapaxes(estimate.rotation, 1, 2) @ true.rotation)
@@ -180,7 +225,9 @@ class Cascade:
 
 def body_of(balls: Balls) -> explaining.Body:
     """A body of balls as the kernels want it."""
-    return explaining.Body(balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius)
+    return explaining.Body(
+        balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius
+    )
 
 
 @dataclass(frozen=True)
@@ -202,5 +249,7 @@ def aim_about(bone: Array, wanted: Array, axes: NDArray[np.bool_]) -> Array:
     axis = axes.astype(float)
     flat_bone = bone - (bone @ axis) * axis
     flat = wanted - (wanted @ axis)[:, None] * axis
-    angle = np.arctan2(np.cross(np.broadcast_to(flat_bone, flat.shape), flat) @ axis, flat @ flat_bone)
+    angle = np.arctan2(
+        np.cross(np.broadcast_to(flat_bone, flat.shape), flat) @ axis, flat @ flat_bone
+    )
     return angle[:, None] * axis

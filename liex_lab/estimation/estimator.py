@@ -34,7 +34,9 @@ from liex_lab.runtime.threads import threads
 Array = NDArray[np.float64]
 
 _START_SEED = 20170125
-_SIZE_PASSES = 8  # of estimating the size with the size just found; each goes about a third of the way
+_SIZE_PASSES = (
+    8  # of estimating the size with the size just found; each goes about a third of the way
+)
 _MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error, at
 # the reference length
 
@@ -64,8 +66,13 @@ class _Sight:
     scores: Array
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> _Sight:
-        return _Sight(self.crops[index], self.looks[index], self.rotations[index], self.positions[index],
-                      self.scores[index])  # fmt: skip
+        return _Sight(
+            self.crops[index],
+            self.looks[index],
+            self.rotations[index],
+            self.positions[index],
+            self.scores[index],
+        )
 
     @staticmethod
     def join(parts: Sequence[_Sight]) -> _Sight:
@@ -96,13 +103,19 @@ class _Sight:
         `usable`, from base to `tip`; the best of them takes the others' places, so that their number stays.
         """
         _, other, _, away = both_ways(self.positions, self.scores, tip)
-        rows, scores = np.arange(len(self.scores)), np.where(away & usable[:, None], self.scores, np.inf)
+        rows, scores = (
+            np.arange(len(self.scores)),
+            np.where(away & usable[:, None], self.scores, np.inf),
+        )
         taken = np.where(away, np.arange(scores.shape[1]), other[:, None])
         some = away.any(axis=1) & usable
         return _Sight(
-            self.crops, self.looks, self.rotations[rows[:, None], taken], self.positions[rows[:, None], taken],
+            self.crops,
+            self.looks,
+            self.rotations[rows[:, None], taken],
+            self.positions[rows[:, None], taken],
             np.where(some[:, None], np.take_along_axis(scores, taken, axis=1), np.inf),
-        )  # fmt: skip
+        )
 
 
 _OF_SIGHT = ("looks", "rotations", "positions", "scores")
@@ -137,22 +150,29 @@ class PoseEstimator:
     @cached_property
     def _chain(self) -> kernels.Chain:
         s = self.skeleton
-        return kernels.Chain(s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None]))
+        return kernels.Chain(
+            s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None])
+        )
 
     def _tuning(self, n_starts: int) -> kernels.Tuning:
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.Tuning(
-            method.rounds_of(0), method.rounds, method.reaches(self.skeleton.n_joints),
-            np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]), method.mean_shift_mm,
+            method.rounds_of(0),
+            method.rounds,
+            method.reaches(self.skeleton.n_joints),
+            np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]),
+            method.mean_shift_mm,
             min(keep or n_starts, n_starts),
-        )  # fmt: skip
+        )
 
     @cached_property
     def _body(self) -> Body:
         """The body that candidates are held against the picture with."""
         if not self.model.method.explains:
-            return Body(1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+            return Body(
+                1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0)
+            )
         return body_of(self.model.cascade.balls)
 
     @cached_property
@@ -176,29 +196,54 @@ class PoseEstimator:
         n, k = len(looks), self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
-            crops.moments, self._starts, sizes, skeleton.length, base_at_front(skeleton), method.axis_start,
-            method.camera_view, method.home_turn,
-        )  # fmt: skip
+            crops.moments,
+            self._starts,
+            sizes,
+            skeleton.length,
+            base_at_front(skeleton),
+            method.axis_start,
+            method.camera_view,
+            method.home_turn,
+        )
         if self.model.cascade.proposals is not None:
             images = ImageSet(crops.heights, looks, crops.moments)
-            base_rotation, base_position = propose(self.model.cascade.proposals, images, sizes[:, 0], method)
+            base_rotation, base_position = propose(
+                self.model.cascade.proposals, images, sizes[:, 0], method
+            )
         tuning = self._tuning(k)
-        starts = np.ascontiguousarray(base_rotation[:, :, None]), base_position[:, :, None].copy(), scales
+        starts = (
+            np.ascontiguousarray(base_rotation[:, :, None]),
+            base_position[:, :, None].copy(),
+            scales,
+        )
         rotations = np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3))
         positions = np.zeros((n, tuning.keep, skeleton.n_joints, 3))
         poses = rotations, positions, np.zeros((n, tuning.keep)), np.full((n, tuning.keep), np.inf)
         with threads(parallel):
             kernels.estimate_all(
-                crops.heights, looks, crops.moments, np.flatnonzero(crops.found), size, self._chain, *self._packed,
-                tuning, self._body, starts, poses,
-            )  # fmt: skip
+                crops.heights,
+                looks,
+                crops.moments,
+                np.flatnonzero(crops.found),
+                size,
+                self._chain,
+                *self._packed,
+                tuning,
+                self._body,
+                starts,
+                poses,
+            )
             if self.model.facing is None or not n:
                 return poses
             facing = Facing(skeleton, self.model.facing)
-            scores = facing.judged(ImageSet(crops.heights, looks, crops.moments), poses[1], poses[3], size)
+            scores = facing.judged(
+                ImageSet(crops.heights, looks, crops.moments), poses[1], poses[3], size
+            )
         return *poses[:3], scores
 
-    def estimate(self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True) -> Estimates:
+    def estimate(
+        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+    ) -> Estimates:
         """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
         size = size if self.model.method.session_size else 1.0
         return self._estimates(self._look(depths, scene, size, parallel)[0], size, parallel)
@@ -218,7 +263,9 @@ class PoseEstimator:
         size = size if self.model.method.session_size else 1.0
         return self._estimates(self._sighted(crops, looks, size, parallel), size, parallel)
 
-    def both_ways(self, crops: Crops, looks: Array, size: float, parallel: bool = True) -> tuple[Estimates, Estimates]:
+    def both_ways(
+        self, crops: Crops, looks: Array, size: float, parallel: bool = True
+    ) -> tuple[Estimates, Estimates]:
         """The same, and the best pose that points the other way; see `hypotheses`."""
         size = size if self.model.method.session_size else 1.0
         best, turned = self._ways((self._sighted(crops, looks, size, parallel),), size, parallel)
@@ -267,30 +314,52 @@ class PoseEstimator:
         picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
         picked = with_expected_error(picked, self.model, images.moments, images.looks, size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        return Estimates(replace(whole, pose=whole.pose.moved(view_of(sight.looks).inverse())), usable, crops)
+        return Estimates(
+            replace(whole, pose=whole.pose.moved(view_of(sight.looks).inverse())), usable, crops
+        )
 
     def pick(
-        self, images: ImageSet, size: float, rotations: Array, positions: Array, scores: Array, parallel: bool = True
+        self,
+        images: ImageSet,
+        size: float,
+        rotations: Array,
+        positions: Array,
+        scores: Array,
+        parallel: bool = True,
     ) -> Chosen:
         """One pose for each of n height maps out of its candidates, after the last correction, and settled.
 
         Where the method takes poses into the picture, it is of the mean and the best ones the one that then fits best.
         """
         method = self.model.method
-        picked = choose(self.skeleton, method, self.model.calibration, size, rotations, positions, scores)
+        picked = choose(
+            self.skeleton, method, self.model.calibration, size, rotations, positions, scores
+        )
         with threads(parallel):
             if method.refine_steps and len(scores):
-                poses = with_best(self.skeleton, picked.pose, method.refined, rotations, positions, scores)
+                poses = with_best(
+                    self.skeleton, picked.pose, method.refined, rotations, positions, scores
+                )
                 pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
                 picked = replace(picked, pose=pose, fit=fit, told_scale=pose.scale)
             picked = corrected(picked, self.model, images, size)
             if self.model.settler is None or not len(scores):
                 return picked
             settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, images, size)
-        return replace(picked, pose=settled.pose, told_scale=size * np.exp(settled.grown), told_trust=settled.clear)
+        return replace(
+            picked,
+            pose=settled.pose,
+            told_scale=size * np.exp(settled.grown),
+            told_trust=settled.clear,
+        )
 
     def _is_animal(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, first: _Sight, second: _Sight
+        self,
+        depths: NDArray[np.float32],
+        scene: Foreground,
+        size: float,
+        first: _Sight,
+        second: _Sight,
     ) -> NDArray[np.bool_]:
         """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
 
@@ -319,7 +388,9 @@ class PoseEstimator:
         for _ in range(_SIZE_PASSES):
             estimates = uncorrected.estimate(sample, scene, guess)
             if not estimates.found.any():
-                raise EstimationError("no animal was found in the sampled frames, so its size could not be measured")
+                raise EstimationError(
+                    "no animal was found in the sampled frames, so its size could not be measured"
+                )
             guess = float(np.median(self.sizes_told(estimates)))
         return guess
 
@@ -327,7 +398,9 @@ class PoseEstimator:
         """What frames tell of the animal's size over the home size, those of them that the model trusts most."""
         scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
         seen = np.flatnonzero(estimates.found)
-        n_trusted = len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+        n_trusted = (
+            len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+        )
         return np.asarray(scale[seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]])
 
     def size_from_area(self, area_mm2: float) -> float:
@@ -346,9 +419,12 @@ def _pack(forests: list[Forest]) -> kernels.Trees:
         n_nodes += len(forest.nodes)
     sizes = np.array([forest.leaves.size for forest in forests])
     return kernels.Trees(
-        np.concatenate(nodes), np.stack(roots), np.concatenate([forest.leaves.ravel() for forest in forests]),
-        np.cumsum(sizes) - sizes, np.array([forest.leaves.shape[1] for forest in forests]),
-    )  # fmt: skip
+        np.concatenate(nodes),
+        np.stack(roots),
+        np.concatenate([forest.leaves.ravel() for forest in forests]),
+        np.cumsum(sizes) - sizes,
+        np.array([forest.leaves.shape[1] for forest in forests]),
+    )
 
 
 def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Chosen:
@@ -366,8 +442,15 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
         rows(picked.pose.scale),
     )
     return Chosen(
-        pose, rows(picked.sd_root, 6), rows(picked.sd_angles, n_joints, 3), rows(picked.sd_mm, n_joints),
-        rows(picked.error_mm), rows(picked.score), rows(picked.spread), rows(picked.doubts, 4),
+        pose,
+        rows(picked.sd_root, 6),
+        rows(picked.sd_angles, n_joints, 3),
+        rows(picked.sd_mm, n_joints),
+        rows(picked.error_mm),
+        rows(picked.score),
+        rows(picked.spread),
+        rows(picked.doubts, 4),
         rows(picked.fit, picked.fit.shape[1]),
-        rows(picked.told_scale), rows(picked.told_trust),
-    )  # fmt: skip
+        rows(picked.told_scale),
+        rows(picked.told_trust),
+    )

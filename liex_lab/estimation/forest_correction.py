@@ -40,7 +40,11 @@ def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Sam
     """
     frames, n = pose.frames(model.skeleton), len(pose.scale)
     candidates = Candidates(
-        np.arange(n, dtype=np.int32), frames.rotation, frames.translation, pose.scale, np.full(n, size)
+        np.arange(n, dtype=np.int32),
+        frames.rotation,
+        frames.translation,
+        pose.scale,
+        np.full(n, size),
     )
     samples = model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
     pixel = mm_per_px(images.looks) / size

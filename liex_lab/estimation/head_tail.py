@@ -42,15 +42,23 @@ class Facing:
         inputs = np.concatenate([_flat(pictures), _flat(pictures[:, :, ::-1])])
         labels = np.concatenate([right, right])
         layers = descend(
-            inputs, labels, _HIDDEN, epochs=_EPOCHS, batch=min(_BATCH, len(inputs)), rate=_RATE,
-            least_rate=1e-2 * _RATE, weight_decay=_WEIGHT_DECAY, seed=seed,
-        )  # fmt: skip
+            inputs,
+            labels,
+            _HIDDEN,
+            epochs=_EPOCHS,
+            batch=min(_BATCH, len(inputs)),
+            rate=_RATE,
+            least_rate=1e-2 * _RATE,
+            weight_decay=_WEIGHT_DECAY,
+            seed=seed,
+        )
         n = inputs.shape[1]
         # rounded to what the model file holds
         return Network(
-            np.zeros(n, np.float32), np.ones(n, np.float32),
+            np.zeros(n, np.float32),
+            np.ones(n, np.float32),
             tuple((_rounded(weights), _rounded(bias)) for weights, bias in layers),
-        )  # fmt: skip
+        )
 
     def logits(self, images: ImageSet, joints: Array, size: float) -> Array:
         """How much speaks for it (n,) that poses with these joints (n, J, 3) mm, view frame, point the right way.
@@ -74,7 +82,10 @@ class Facing:
         doubted = np.flatnonzero(ahead < UNSURE_MM * unit)
         if not len(doubted):
             return scores
-        seen, poses = images[np.tile(doubted, 2)], [positions[doubted, k[doubted]] for k in (best, opposite)]
+        seen, poses = (
+            images[np.tile(doubted, 2)],
+            [positions[doubted, k[doubted]] for k in (best, opposite)],
+        )
         first, second = np.split(self.logits(seen, np.concatenate(poses), size), 2)
         total = ahead[doubted] + _MM_PER_LOGIT * unit * (first - second)
         wrong, behind = doubted[total < 0], (ahead[doubted] - total)[total < 0]
@@ -98,7 +109,9 @@ def both_ways(
         return best, opposite, other[rows, opposite] - scores[rows, best], away
 
 
-def laid_along(skeleton: Skeleton, images: ImageSet, joints: Array, size: Array) -> NDArray[np.float32]:
+def laid_along(
+    skeleton: Skeleton, images: ImageSet, joints: Array, size: Array
+) -> NDArray[np.float32]:
     """Pictures (n, A, B) of animals laid along poses with joints (n, J, 3) mm, view frame; size (n,) over home size.
 
     The way from base to tip goes up the picture's first axis; heights in units of `_HEIGHT_MM` at home size.
@@ -107,8 +120,17 @@ def laid_along(skeleton: Skeleton, images: ImageSet, joints: Array, size: Array)
     along = np.arange(-_ALONG_MM, _ALONG_MM + 1e-6, _STEP_MM) * unit
     across = np.arange(-_ACROSS_MM, _ACROSS_MM + 1e-6, _STEP_MM) * unit
     out = np.empty((len(joints), len(along), len(across)))
-    kernels.lay_along(images.heights, images.looks, joints[:, 0], joints[:, skeleton.tip], joints.mean(axis=1), size,
-                      along, across, out)  # fmt: skip
+    kernels.lay_along(
+        images.heights,
+        images.looks,
+        joints[:, 0],
+        joints[:, skeleton.tip],
+        joints.mean(axis=1),
+        size,
+        along,
+        across,
+        out,
+    )
     return (out / (_HEIGHT_MM * unit * size[:, None, None])).astype(np.float32)
 
 

@@ -13,7 +13,10 @@ Array = NDArray[np.float64]
 _BEHIND = 0.42  # of the body length: the base starts this far from the centroid, towards the end it belongs to
 _HIGH = 0.2  # of the body length: the base starts this high above the floor
 _LOW = 0.05  # of the body length: the base of an animal in the camera view starts this far below its mean height
-_JITTER = (0.12, 0.7)  # rad: spread of the headings of a long thin animal, and what a round one adds
+_JITTER = (
+    0.12,
+    0.7,
+)  # rad: spread of the headings of a long thin animal, and what a round one adds
 _JITTER_RISE = 0.03  # rad, at most
 _JITTER_MM = 2.0  # of the places, for an animal of the reference length
 
@@ -26,9 +29,15 @@ def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> A
 
 
 def start_poses(
-    moments: Array, starts: Array, size: Array, home_length: float, base_at_front: bool, axis_start: bool,
-    camera_view: bool = False, home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    moments: Array,
+    starts: Array,
+    size: Array,
+    home_length: float,
+    base_at_front: bool,
+    axis_start: bool,
+    camera_view: bool = False,
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> tuple[Array, Array, Array]:
     """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n animals.
 
     moments (n, 9) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of the animal over home.
@@ -47,11 +56,15 @@ def start_poses(
         jitter = _JITTER_MM * round(home_length / REFERENCE_MM, 6)
         roundness = moments[:, 7] / np.maximum(moments[:, 6], 1e-6)
         spread = _JITTER[0] + _JITTER[1] * roundness**2
-        heading = moments[:, None, 5] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
+        heading = (
+            moments[:, None, 5] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
+        )
         scale = size.copy()
         behind = _BEHIND * home_length * scale * (-1.0 if base_at_front else 1.0)
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        position[..., :2] = centre - behind[..., None] * direction + jitter * scale[..., None] * starts[..., 1:3]
+        position[..., :2] = (
+            centre - behind[..., None] * direction + jitter * scale[..., None] * starts[..., 1:3]
+        )
         high = _HIGH * home_length * scale
         position[..., 2] = mean_height - _LOW * home_length * scale if camera_view else high
     else:
@@ -64,7 +77,10 @@ def start_poses(
     rotation[..., 1, 0], rotation[..., 1, 1] = np.sin(heading), np.cos(heading)
     rotation[..., 2, 2] = 1.0
     if axis_start and camera_view:
-        rise = np.arctan(moments[:, None, 8]) * (1.0 - 2.0 * (np.arange(k) % 2)) + _JITTER_RISE * starts[..., 3]
+        rise = (
+            np.arctan(moments[:, None, 8]) * (1.0 - 2.0 * (np.arange(k) % 2))
+            + _JITTER_RISE * starts[..., 3]
+        )
         rotation = rotation @ _lifted(rise)
         # the base lies ahead of or behind the middle of the animal
         position[..., 2] -= behind * np.sin(rise)

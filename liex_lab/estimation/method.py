@@ -36,7 +36,9 @@ class Method:
     keep_bent: float  # other joints: train on corrections smaller than this [1]
     keep_off_mm: float  # other joints: train on samples no farther off than this [1]
     out_of_bag: bool  # move a training sample only with trees that have not seen its image [6]
-    metric_on_own: bool  # train the metric on the cascade's own candidates [6]; else on perturbed truth
+    metric_on_own: (
+        bool  # train the metric on the cascade's own candidates [6]; else on perturbed truth
+    )
     metric_shrinkage: float  # of each boosting stage of the metric; 0 grows a plain forest
     mean_shift_mm: float  # bandwidth of the mode over tree votes; 0 averages them
     top_k: int  # candidates that are averaged [3]; 1 takes the best one
@@ -46,18 +48,38 @@ class Method:
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
     survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
-    pruner: GrowthPlan | None = None  # of the small metric that chooses them; None: no such metric is trained
-    settle: bool = False  # the chosen pose of an animal that is one chain settles under its back, see `settle`
-    base_reach_mm: float = 0.0  # offsets reach this far from the base joint; 0: as far as from the others
-    corrector: GrowthPlan | None = None  # of the last correction, of the chosen pose; None: it stays as chosen
-    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotation vector by which starts are turned out of the home pose
-    proposals: GrowthPlan | None = None  # trees that say where a start may be, for an animal of any orientation
-    proposal_reach_mm: float = 0.0  # offsets of their features reach this far from the animal's centre
-    base_rounds: int = 0  # rounds of the base joint where they are not as many as the others'; 0: as many
+    pruner: GrowthPlan | None = (
+        None  # of the small metric that chooses them; None: no such metric is trained
+    )
+    settle: bool = (
+        False  # the chosen pose of an animal that is one chain settles under its back, see `settle`
+    )
+    base_reach_mm: float = (
+        0.0  # offsets reach this far from the base joint; 0: as far as from the others
+    )
+    corrector: GrowthPlan | None = (
+        None  # of the last correction, of the chosen pose; None: it stays as chosen
+    )
+    home_turn: tuple[float, ...] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # rotation vector by which starts are turned out of the home pose
+    proposals: GrowthPlan | None = (
+        None  # trees that say where a start may be, for an animal of any orientation
+    )
+    proposal_reach_mm: float = (
+        0.0  # offsets of their features reach this far from the animal's centre
+    )
+    base_rounds: int = (
+        0  # rounds of the base joint where they are not as many as the others'; 0: as many
+    )
     refine_steps: int = 0  # of taking a pose into the picture
     refined: int = 0  # candidates that are taken there beside the mean of the best; the one that fits is chosen
     explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
-    tells_facing: bool = False  # a network tells head from tail where the metric is unsure, see `facing`
+    tells_facing: bool = (
+        False  # a network tells head from tail where the metric is unsure, see `facing`
+    )
 
     def rounds_of(self, joint: int) -> int:
         """Rounds of a joint."""
@@ -71,7 +93,11 @@ class Method:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card; what only some animals have is left out where it is unset."""
-        return {name: value for name, value in asdict(self).items() if name not in _UNSET or value != _UNSET[name]}
+        return {
+            name: value
+            for name, value in asdict(self).items()
+            if name not in _UNSET or value != _UNSET[name]
+        }
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Method:
@@ -87,69 +113,145 @@ class Method:
 
 
 _UNSET: dict[str, Any] = {
-    "home_turn": (0.0, 0.0, 0.0), "proposals": None, "proposal_reach_mm": 0.0, "base_rounds": 0, "refine_steps": 0,
-    "refined": 0, "explains": False, "settle": False, "tells_facing": False,
-}  # fmt: skip
+    "home_turn": (0.0, 0.0, 0.0),
+    "proposals": None,
+    "proposal_reach_mm": 0.0,
+    "base_rounds": 0,
+    "refine_steps": 0,
+    "refined": 0,
+    "explains": False,
+    "settle": False,
+    "tells_facing": False,
+}
 _FULL_TURN = 10.0  # rad: no filter
 
 METHODS = {
     "default": Method(
-        variant="default", rounds=4, n_candidates=16, training_candidates=8,
+        variant="default",
+        rounds=4,
+        n_candidates=16,
+        training_candidates=8,
         regressors=GrowthPlan(16, 18, 22, 120, 0.3, 0.15, 0.3, 0.63),
         metric=GrowthPlan(120, 10, 50, 120, 0.45, 0.1, 0.3, 0.5),
-        reach_mm=22.0, axis_start=True, camera_view=False, session_size=True, regress_scale=True, point_at=True,
-        keep_turned=1.75, keep_bent=1.22, keep_off_mm=20.0, out_of_bag=True, metric_on_own=True,
-        metric_shrinkage=0.15, mean_shift_mm=0.0,
-        top_k=10, top_tau=1.0, top_radius_mm=15.0,
-        survivors=6, pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
+        reach_mm=22.0,
+        axis_start=True,
+        camera_view=False,
+        session_size=True,
+        regress_scale=True,
+        point_at=True,
+        keep_turned=1.75,
+        keep_bent=1.22,
+        keep_off_mm=20.0,
+        out_of_bag=True,
+        metric_on_own=True,
+        metric_shrinkage=0.15,
+        mean_shift_mm=0.0,
+        top_k=10,
+        top_tau=1.0,
+        top_radius_mm=15.0,
+        survivors=6,
+        pruner=GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
         corrector=GrowthPlan(160, 6, 40, 200, 0.4, 0.15, 0.3, 0.5),
     ),
     "paper": Method(
-        variant="paper", rounds=3, n_candidates=40, training_candidates=6,
+        variant="paper",
+        rounds=3,
+        n_candidates=40,
+        training_candidates=6,
         regressors=GrowthPlan(10, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
         metric=GrowthPlan(20, 15, 5, 100, 0.0, 0.0, 0.3, 0.63),
-        reach_mm=50.0, axis_start=False, camera_view=True, session_size=False, regress_scale=False, point_at=False,
-        keep_turned=_FULL_TURN, keep_bent=_FULL_TURN, keep_off_mm=1e9, out_of_bag=False, metric_on_own=False,
-        metric_shrinkage=0.0, mean_shift_mm=10.0, top_k=1, top_tau=1.0, top_radius_mm=15.0,
+        reach_mm=50.0,
+        axis_start=False,
+        camera_view=True,
+        session_size=False,
+        regress_scale=False,
+        point_at=False,
+        keep_turned=_FULL_TURN,
+        keep_bent=_FULL_TURN,
+        keep_off_mm=1e9,
+        out_of_bag=False,
+        metric_on_own=False,
+        metric_shrinkage=0.0,
+        mean_shift_mm=10.0,
+        top_k=1,
+        top_tau=1.0,
+        top_radius_mm=15.0,
     ),
-}  # fmt: skip
+}
 
 
 # a hand may turn any side to the camera, and its fingers' bones are short beside their distance from the base
 _HAND: dict[str, Any] = {
-    "camera_view": False, "rounds": 3, "base_rounds": 6, "n_candidates": 24, "training_candidates": 6,
+    "camera_view": False,
+    "rounds": 3,
+    "base_rounds": 6,
+    "n_candidates": 24,
+    "training_candidates": 6,
     "regressors": GrowthPlan(10, 16, 12, 60, 0.3, 0.15, 0.4, 0.63),
     "metric": GrowthPlan(60, 9, 40, 100, 0.35, 0.3, 0.4, 0.5),
-    "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63), "proposal_reach_mm": 100.0,
-    "explains": True, "refine_steps": 4, "refined": 4, "corrector": None,
-    "reach_mm": 60.0, "base_lever_mm": 65.0, "joint_lever_mm": 40.0, "scale_lever_mm": 60.0, "keep_turned": 1.3,
-    "keep_bent": 1.6, "keep_off_mm": 50.0, "top_tau": 2.0, "top_radius_mm": 25.0,
-    "survivors": 8, "pruner": GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
-}  # fmt: skip
+    "proposals": GrowthPlan(12, 18, 5, 100, 0.2, 0.15, 0.3, 0.63),
+    "proposal_reach_mm": 100.0,
+    "explains": True,
+    "refine_steps": 4,
+    "refined": 4,
+    "corrector": None,
+    "reach_mm": 60.0,
+    "base_lever_mm": 65.0,
+    "joint_lever_mm": 40.0,
+    "scale_lever_mm": 60.0,
+    "keep_turned": 1.3,
+    "keep_bent": 1.6,
+    "keep_off_mm": 50.0,
+    "top_tau": 2.0,
+    "top_radius_mm": 25.0,
+    "survivors": 8,
+    "pruner": GrowthPlan(20, 8, 50, 100, 0.45, 0.2, 0.3, 0.5),
+}
 
 
 # what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("mouse", "default"): {"tells_facing": True},
     ("fish", "default"): {
-        "rounds": 2, "training_candidates": 6, "n_candidates": 12, "survivors": 6,
+        "rounds": 2,
+        "training_candidates": 6,
+        "n_candidates": 12,
+        "survivors": 6,
         "regressors": GrowthPlan(8, 16, 20, 80, 0.3, 0.15, 0.3, 0.63),
-        "reach_mm": 12.5, "base_reach_mm": 30.0, "keep_off_mm": 4.0, "top_tau": 0.8, "top_radius_mm": 4.5,
-        "base_lever_mm": 10.0, "regress_scale": False, "corrector": None, "settle": True,
+        "reach_mm": 12.5,
+        "base_reach_mm": 30.0,
+        "keep_off_mm": 4.0,
+        "top_tau": 0.8,
+        "top_radius_mm": 4.5,
+        "base_lever_mm": 10.0,
+        "regress_scale": False,
+        "corrector": None,
+        "settle": True,
     },
     ("fish", "paper"): {
-        "rounds": 7, "reach_mm": 12.5, "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        "rounds": 7,
+        "reach_mm": 12.5,
+        "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
     },
     ("hand", "default"): _HAND,
     ("hand", "paper"): {
-        "n_candidates": 20, "reach_mm": 50.0, "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        "n_candidates": 20,
+        "reach_mm": 50.0,
+        "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
         "home_turn": (3.1416, 0.0, 0.0),  # the palm is shown
     },
-}  # fmt: skip
+}
 _LENGTHS = (
-    "reach_mm", "base_reach_mm", "keep_off_mm", "mean_shift_mm", "top_tau", "top_radius_mm", "base_lever_mm",
-    "joint_lever_mm", "scale_lever_mm",
-)  # fmt: skip
+    "reach_mm",
+    "base_reach_mm",
+    "keep_off_mm",
+    "mean_shift_mm",
+    "top_tau",
+    "top_radius_mm",
+    "base_lever_mm",
+    "joint_lever_mm",
+    "scale_lever_mm",
+)
 
 
 def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:

@@ -26,10 +26,24 @@ SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that doe
 # that follow the regressors, as far as a model has them
 _FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
 _DAMAGE = (
-    OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, NotImplementedError, zipfile.BadZipFile,
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    NotImplementedError,
+    zipfile.BadZipFile,
     lzma.LZMAError,
-)  # fmt: skip
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # every file in the archive bears this date, so equal models are equal bytes
+)
+_EPOCH = (
+    1980,
+    1,
+    1,
+    0,
+    0,
+    0,
+)  # every file in the archive bears this date, so equal models are equal bytes
 
 
 @dataclass(frozen=True)
@@ -98,7 +112,9 @@ class Model:
             "card": self.card,
             "forests": extra,
         }
-        arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)}
+        arrays: dict[str, NDArray[Any]] = {
+            "head": np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)
+        }
         forests = [forest for rounds in self.cascade.forests for forest in rounds]
         forests += [getattr(self, name) for name in extra]
         for k, forest in enumerate(forests):
@@ -125,9 +141,13 @@ class Model:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 head = json.loads(archive["head"].tobytes())
                 if head.get("schema", 0) > SCHEMA:
-                    raise ModelError(f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab")
+                    raise ModelError(
+                        f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab"
+                    )
                 names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
-                forests = [_join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names]
+                forests = [
+                    _join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names
+                ]
                 settler = archive["settler"] if "settler" in archive.files else None
                 facing = _network(archive) if f"{_LAYER}0_bias" in archive.files else None
             method = Method.from_dict(head["method"])
@@ -137,15 +157,21 @@ class Model:
             calibration = Calibration(**values)
             table, card = head["skeleton"], head["card"]
         except FileNotFoundError:
-            raise ModelError(f"there is no model file {path}; name a bundled model or the path of an .npz") from None
+            raise ModelError(
+                f"there is no model file {path}; name a bundled model or the path of an .npz"
+            ) from None
         except _DAMAGE as error:
-            raise ModelError(f"{path} is not a whole model file ({error}); train it again or copy it anew") from None
+            raise ModelError(
+                f"{path} is not a whole model file ({error}); train it again or copy it anew"
+            ) from None
         skeleton = Skeleton.from_table(table, str(path))
         rounds = [method.rounds_of(joint) for joint in skeleton.solved]
         n_regressors = sum(rounds)
         extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
-            raise ModelError(f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again")
+            raise ModelError(
+                f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again"
+            )
         named = dict(zip(extra, forests[n_regressors:], strict=True))
         stops = np.cumsum(rounds).tolist()
         each = [forests[stop - n : stop] for n, stop in zip(rounds, stops, strict=True)]
@@ -153,7 +179,18 @@ class Model:
         assert metric is not None
         expectation, pruner, corrector, proposals = others
         cascade = Cascade(skeleton, method, each, proposals)
-        return Model(cascade, metric, expectation, table, calibration, card, pruner, corrector, settler, facing)
+        return Model(
+            cascade,
+            metric,
+            expectation,
+            table,
+            calibration,
+            card,
+            pruner,
+            corrector,
+            settler,
+            facing,
+        )
 
     def digest(self) -> str:
         """SHA-256 of the model file."""
@@ -176,7 +213,10 @@ def _network(archive: Any) -> Network:
     """The inverse of `_layers`."""
     n_layers = sum(name.startswith(_LAYER) for name in archive.files) // 2
     layers = tuple(
-        (archive[f"{_LAYER}{k}_weights"].astype(np.float32), archive[f"{_LAYER}{k}_bias"].astype(np.float32))
+        (
+            archive[f"{_LAYER}{k}_weights"].astype(np.float32),
+            archive[f"{_LAYER}{k}_bias"].astype(np.float32),
+        )
         for k in range(n_layers)
     )
     n = len(layers[0][0])

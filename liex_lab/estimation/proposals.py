@@ -23,7 +23,9 @@ N_WAYS = 2  # both ways along the animal's long axis
 _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 
 
-def views_along_axis(images: ImageSet, size: Array, reach_mm: float) -> tuple[Samples, Array, Array]:
+def views_along_axis(
+    images: ImageSet, size: Array, reach_mm: float
+) -> tuple[Samples, Array, Array]:
     """Each of m animals as seen from its centre, x along its long axis, one way and the other.
 
     size (m,) over home size. Samples (2 m), an image's two in a row, and the frames: (2 m, 3, 3) and (2 m, 3) mm.
@@ -42,17 +44,35 @@ def views_along_axis(images: ImageSet, size: Array, reach_mm: float) -> tuple[Sa
     # which way is which: some foregrounds know where an animal's long axis points
     ways = (1000.0 - 2000.0 * (np.arange(N_WAYS * m) % N_WAYS)).astype(np.float32)
     kernels.look_all(
-        np.zeros(1, np.int64), images.looks, images.moments, image, each, np.array([reach_mm]), rotation[:, None],
-        position[:, None], each, views, scalars,
-    )  # fmt: skip
+        np.zeros(1, np.int64),
+        images.looks,
+        images.moments,
+        image,
+        each,
+        np.array([reach_mm]),
+        rotation[:, None],
+        position[:, None],
+        each,
+        views,
+        scalars,
+    )
     told = np.column_stack([scalars, ways])
-    return Samples(images.heights, image, (1.0 / each).astype(np.float32), views, told), rotation, position
+    return (
+        Samples(images.heights, image, (1.0 / each).astype(np.float32), views, told),
+        rotation,
+        position,
+    )
 
 
 def train_proposals(
-    images: ImageSet, rotations: Array, positions: Array, size: Array, keep: NDArray[np.bool_], method: Method,
+    images: ImageSet,
+    rotations: Array,
+    positions: Array,
+    size: Array,
+    keep: NDArray[np.bool_],
+    method: Method,
     rng: np.random.Generator,
-) -> tuple[Forest, NDArray[np.bool_]]:  # fmt: skip
+) -> tuple[Forest, NDArray[np.bool_]]:
     """A forest from the true bases of m images, (m, 3, 3) and (m, 3) mm, and which images each tree saw (T, m).
 
     keep (m,): the images to learn from.
@@ -63,9 +83,13 @@ def train_proposals(
     i = samples.image
     turned = np.swapaxes(frame, 1, 2) @ rotations[i]
     off = np.einsum("nji,nj->ni", frame, positions[i] - centre) / guess[i][:, None]
-    labels = np.concatenate([method.base_lever_mm * turned.reshape(-1, 9), off], axis=1).astype(np.float32)
+    labels = np.concatenate([method.base_lever_mm * turned.reshape(-1, 9), off], axis=1).astype(
+        np.float32
+    )
     forest, in_bag = grow_forest(samples, labels, keep[i], method.proposals, rng)
-    return Forest(forest.nodes, forest.roots, forest.leaves.astype(np.float16).astype(np.float32)), in_bag
+    return Forest(
+        forest.nodes, forest.roots, forest.leaves.astype(np.float16).astype(np.float32)
+    ), in_bag
 
 
 def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tuple[Array, Array]:
@@ -82,6 +106,8 @@ def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tu
 
     def in_order(values: Array) -> Array:
         by_way = values.reshape(len(size), N_WAYS, forest.n_trees, *values.shape[2:])
-        return np.swapaxes(by_way, 1, 2).reshape(len(size), N_WAYS * forest.n_trees, *values.shape[2:])
+        return np.swapaxes(by_way, 1, 2).reshape(
+            len(size), N_WAYS * forest.n_trees, *values.shape[2:]
+        )
 
     return in_order(rotation), in_order(position)

@@ -19,7 +19,10 @@ Array = NDArray[np.float64]
 
 _ROBUST_MM = 10.0  # in tenths of the balls' usual radius: a reading this far off counts a quarter
 _BESIDE = 0.3  # what a ball beside the animal weighs against a reading
-_FIRST_STEPS, _GO_ON = 1, 2  # that all poses take, and how many of them take the others: those that then lie best
+_FIRST_STEPS, _GO_ON = (
+    1,
+    2,
+)  # that all poses take, and how many of them take the others: those that then lie best
 _BESIDE_MM = 4.0  # in that unit: what it weighs in the choice, if all balls were beside it
 # what it costs to leave the pose that the regressors found, in squares of that unit: a radian of the base, a unit of
 # place, of log scale, and a radian of a joint
@@ -38,7 +41,9 @@ class Refiner:
     def of(skeleton: Skeleton, balls: Balls) -> Refiner:
         """For a skeleton of any shape."""
         s = skeleton
-        free = np.array([(j, k) for j in range(1, s.n_joints) for k in range(3) if s.axes[j, k]], np.int64)
+        free = np.array(
+            [(j, k) for j in range(1, s.n_joints) for k in range(3) if s.axes[j, k]], np.int64
+        )
         free = free.reshape(-1, 2)
         above = np.eye(s.n_joints, dtype=bool)  # [j, a]: a is j or one of its ancestors
         for parent, child in s.edges:
@@ -49,25 +54,45 @@ class Refiner:
         turns = np.full((len(movers), max(map(len, movers), default=0)), -1, np.int64)
         for row, some in zip(turns, movers, strict=True):
             row[: len(some)] = some
-        return Refiner(s, kernels.Tree(s.parents, s.offsets, s.rest, free, limits, moves, turns), body_of(balls))
+        return Refiner(
+            s,
+            kernels.Tree(s.parents, s.offsets, s.rest, free, limits, moves, turns),
+            body_of(balls),
+        )
 
-    def refine(self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float, n_steps: int) -> Pose:
+    def refine(
+        self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float, n_steps: int
+    ) -> Pose:
         """Poses (n, K) in their view frames, each moved into its height map (n, S, S) cut as looks (n, 17) say."""
         unit = self.body.unit_mm * size
         rotation, position = pose.root.rotation.copy(), pose.root.translation.copy()
         angles, scale = pose.angles.copy(), pose.scale.copy()
-        wishes = kernels.Wishes(_ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
-        kernels.refine_all(heights, looks, self.tree, self.body, wishes, n_steps, rotation, position, angles, scale)
+        wishes = kernels.Wishes(
+            _ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2])
+        )
+        kernels.refine_all(
+            heights, looks, self.tree, self.body, wishes, n_steps, rotation, position, angles, scale
+        )
         return Pose(SE3(rotation, position), angles, scale)
 
-    def fit(self, pose: Pose, heights: NDArray[np.int16], looks: Array, moments: Array, size: float) -> Array:
+    def fit(
+        self, pose: Pose, heights: NDArray[np.int16], looks: Array, moments: Array, size: float
+    ) -> Array:
         """How well poses (n, K) explain the picture (n, K, N_FIT); see `_explain.explain`."""
         frames, (n, k), j = pose.frames(self.skeleton), pose.scale.shape, self.skeleton.n_joints
         out = np.empty((n * k, explaining.N_FIT), np.float32)
         explaining.explain_all(
-            heights, looks, moments, np.repeat(np.arange(n, dtype=np.int32), k), frames.rotation.reshape(-1, j, 3, 3),
-            frames.translation.reshape(-1, j, 3), pose.scale.ravel(), np.full(n * k, size), self.body, out,
-        )  # fmt: skip
+            heights,
+            looks,
+            moments,
+            np.repeat(np.arange(n, dtype=np.int32), k),
+            frames.rotation.reshape(-1, j, 3, 3),
+            frames.translation.reshape(-1, j, 3),
+            pose.scale.ravel(),
+            np.full(n * k, size),
+            self.body,
+            out,
+        )
         return out.reshape(n, k, -1).astype(float)
 
     def best(self, poses: Pose, images: ImageSet, size: float, n_steps: int) -> tuple[Pose, Array]:

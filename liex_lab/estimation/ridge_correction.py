@@ -26,7 +26,10 @@ _RIDGE = 1e-2  # of the features' variance
 _LEAST_SPREAD = 1e-6
 _TAIL = 0.01  # of what a clue was seen to be: beyond it is taken for the last that was seen
 _DECIMALS = 12  # a product's last bits depend on how many frames are asked about at once, and a frame's pose must not
-_SLID_SHARE, _SIZE_LOG = 0.1, 0.25  # of the length, and in logarithms: poses farther off are not learned from
+_SLID_SHARE, _SIZE_LOG = (
+    0.1,
+    0.25,
+)  # of the length, and in logarithms: poses farther off are not learned from
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,12 @@ class Settler:
 
     @staticmethod
     def fit(
-        skeleton: Skeleton, pose: Pose, images: ImageSet, size: Array, true_joints: Array, true_size: Array
+        skeleton: Skeleton,
+        pose: Pose,
+        images: ImageSet,
+        size: Array,
+        true_joints: Array,
+        true_size: Array,
     ) -> Settler:
         """From chosen poses (n) with their assumed sizes (n,) and the truth, all in the view frame."""
         joints = pose.joints(skeleton)
@@ -56,7 +64,9 @@ class Settler:
         slide = np.sum(off * tangents(joints), axis=-1).mean(axis=1)
         grown = np.log(true_size / size)
         labels = np.column_stack([off[..., 2], slide, grown])
-        good = (np.linalg.norm(off, axis=-1).mean(axis=1) < _SLID_SHARE) & (np.abs(grown) < _SIZE_LOG)
+        good = (np.linalg.norm(off, axis=-1).mean(axis=1) < _SLID_SHARE) & (
+            np.abs(grown) < _SIZE_LOG
+        )
         x, y = features[good], labels[good]
         bounds = np.quantile(x, [_TAIL, 1.0 - _TAIL], axis=0)
         x = np.clip(x, *bounds)
@@ -68,11 +78,17 @@ class Settler:
         skeleton, n = self.skeleton, len(pose.scale)
         joints = pose.joints(skeleton)
         seen = clues(skeleton, pose, joints, images, np.full(n, size))
-        told = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(_DECIMALS)
+        told = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(
+            _DECIMALS
+        )
         length = skeleton.length * size
         moved = joints + length * told[:, -2, None, None] * tangents(joints)
         moved[..., 2] += length * told[:, :-2]
-        return Settled(Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]), told[:, -1], far_end_seen(seen))
+        return Settled(
+            Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]),
+            told[:, -1],
+            far_end_seen(seen),
+        )
 
 
 @dataclass(frozen=True)
@@ -89,10 +105,14 @@ class Settled:
 def _linear(x: Array, y: Array) -> Array:
     """Ridge regression: weights (F, K) from clues (n, F), of which the first is constant, to labels (n, K)."""
     middle, spread = x.mean(axis=0), x.std(axis=0)
-    per = np.where(spread > _LEAST_SPREAD, 1.0 / np.maximum(spread, _LEAST_SPREAD), 0.0)  # a constant tells nothing
+    per = np.where(
+        spread > _LEAST_SPREAD, 1.0 / np.maximum(spread, _LEAST_SPREAD), 0.0
+    )  # a constant tells nothing
     scaled = (x - middle) * per
     ridge = _RIDGE * len(x) * np.eye(x.shape[1])
-    weights = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ (y - y.mean(axis=0))) * per[:, None]
+    weights = (
+        np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ (y - y.mean(axis=0))) * per[:, None]
+    )
     weights[0] = y.mean(axis=0) - middle @ weights
     return np.asarray(weights)
 
@@ -119,7 +139,9 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     n, j = joints.shape[:2]
     length = skeleton.length * size
     seen = np.empty((n, 2 * j + 2))
-    kernels.look_along(images.heights, images.looks, np.ascontiguousarray(joints), length, _MOST_SHARE, seen)
+    kernels.look_along(
+        images.heights, images.looks, np.ascontiguousarray(joints), length, _MOST_SHARE, seen
+    )
     share = np.minimum(seen[:, j : 2 * j] * 2.0, 1.0)
     back = np.clip(seen[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (share > 0)
     ends = seen[:, 2 * j :] / length[:, None]
@@ -127,6 +149,20 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     bent = np.abs(pose.angles[..., 2]).sum(axis=1)
     pixel = mm_per_px(images.looks) / length
     return np.column_stack(
-        [np.ones(n), back, share, ends, ends**2, rise, np.abs(rise), rise**2, np.abs(roll), roll**2, bent, pixel,
-         ends * pixel[:, None], np.log(pose.scale / size)]
-    )  # fmt: skip
+        [
+            np.ones(n),
+            back,
+            share,
+            ends,
+            ends**2,
+            rise,
+            np.abs(rise),
+            rise**2,
+            np.abs(roll),
+            roll**2,
+            bent,
+            pixel,
+            ends * pixel[:, None],
+            np.log(pose.scale / size),
+        ]
+    )

@@ -54,9 +54,14 @@ class Chosen:
 
 
 def choose(
-    skeleton: Skeleton, method: Method, calibration: Calibration, size: float,
-    rotations: Array, positions: Array, scores: Array,
-) -> Chosen:  # fmt: skip
+    skeleton: Skeleton,
+    method: Method,
+    calibration: Calibration,
+    size: float,
+    rotations: Array,
+    positions: Array,
+    scores: Array,
+) -> Chosen:
     """The weighted mean of the best candidates, on the manifold.
 
     rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k` candidates with the
@@ -73,7 +78,9 @@ def choose(
     weight = weight / weight.sum(axis=1, keepdims=True)
     mean = np.einsum("nk,nkjd->njd", weight, joints)
     if skeleton.is_chain:
-        pose = Pose.from_joints(skeleton, mean, np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2]))
+        pose = Pose.from_joints(
+            skeleton, mean, np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2])
+        )
     else:
         pose = mean_pose(skeleton, turned, joints, weight)
         mean = pose.joints(skeleton)
@@ -81,14 +88,30 @@ def choose(
     variance = np.einsum("nk,nkj->nj", weight, off**2)
     mean_score = np.sum(weight * score, axis=1)
     spread = np.sqrt(variance.mean(axis=1)) / size
-    expected = calibration.offset + calibration.slope * mean_score + calibration.spread_slope * spread
+    expected = (
+        calibration.offset + calibration.slope * mean_score + calibration.spread_slope * spread
+    )
     expected = np.maximum(expected, LEAST_MM * skeleton.relative_size) * size
     share = np.array(calibration.joint_share or (1.0,) * skeleton.n_joints)
-    sd_mm = expected[:, None] * share / np.sqrt(3.0)  # an error of three equal components, see columns.json
+    sd_mm = (
+        expected[:, None] * share / np.sqrt(3.0)
+    )  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
     fit = np.zeros((len(score), 0))
-    return Chosen(pose, sd_root, sd_angles, sd_mm, expected, mean_score, spread, doubts, fit, pose.scale, -mean_score)
+    return Chosen(
+        pose,
+        sd_root,
+        sd_angles,
+        sd_mm,
+        expected,
+        mean_score,
+        spread,
+        doubts,
+        fit,
+        pose.scale,
+        -mean_score,
+    )
 
 
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
@@ -104,30 +127,45 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
     )
     moving = np.array(skeleton.solved[1:])
     parents = skeleton.parents[moving]
-    local = np.swapaxes(turned[:, :, parents] @ skeleton.rest[moving], -1, -2) @ turned[:, :, moving]
+    local = (
+        np.swapaxes(turned[:, :, parents] @ skeleton.rest[moving], -1, -2) @ turned[:, :, moving]
+    )
     angles = np.zeros((len(turned), skeleton.n_joints, 3))
     angles[:, moving] = np.einsum("nk,nkjd->njd", weight, so3.log(local)) * skeleton.axes[moving]
-    bones = np.linalg.norm(joints[:, :, 1:] - joints[:, :, skeleton.parents[1:]], axis=-1).sum(axis=2)
-    scale = np.einsum("nk,nk->n", weight, bones) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
+    bones = np.linalg.norm(joints[:, :, 1:] - joints[:, :, skeleton.parents[1:]], axis=-1).sum(
+        axis=2
+    )
+    scale = (
+        np.einsum("nk,nk->n", weight, bones) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
+    )
     return Pose(root, angles, scale)
 
 
-def with_best(skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array) -> Pose:
+def with_best(
+    skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array
+) -> Pose:
     """Poses (n, 1 + k): the given ones (n), and the k candidates with the lowest scores (n, K) of each frame."""
     order = np.argsort(scores, axis=1, kind="stable")[:, :k]
     n, k, j = *order.shape, skeleton.n_joints
-    turned = np.take_along_axis(rotations, order[..., None, None, None], axis=1).reshape(n * k, 1, j, 3, 3)
+    turned = np.take_along_axis(rotations, order[..., None, None, None], axis=1).reshape(
+        n * k, 1, j, 3, 3
+    )
     joints = np.take_along_axis(positions, order[..., None, None], axis=1).reshape(n * k, 1, j, 3)
     best = mean_pose(skeleton, turned, joints, np.ones((n * k, 1)))
 
     def beside(first: Array, others: Array) -> Array:
         return np.concatenate([first[:, None], others.reshape(n, k, *first.shape[1:])], axis=1)
 
-    root = SE3(beside(pose.root.rotation, best.root.rotation), beside(pose.root.translation, best.root.translation))
+    root = SE3(
+        beside(pose.root.rotation, best.root.rotation),
+        beside(pose.root.translation, best.root.translation),
+    )
     return Pose(root, beside(pose.angles, best.angles), beside(pose.scale, best.scale))
 
 
-def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float) -> Array:
+def _doubts(
+    positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float
+) -> Array:
     """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good scores (n, k)."""
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
@@ -136,7 +174,9 @@ def _doubts(positions: Array, scores: Array, mean: Array, good: Array, size: flo
     return np.stack([scores.min(axis=1), opposite, good.std(axis=1), off], axis=1)
 
 
-def with_expected_error(chosen: Chosen, model: Model, moments: Array, looks: Array, size: float) -> Chosen:
+def with_expected_error(
+    chosen: Chosen, model: Model, moments: Array, looks: Array, size: float
+) -> Chosen:
     """The same poses with the error that the model's expectation forest predicts for them, from its clues."""
     if model.expectation is None or not len(chosen.score):
         return chosen
@@ -144,12 +184,16 @@ def with_expected_error(chosen: Chosen, model: Model, moments: Array, looks: Arr
     samples = clue_samples(chosen, model.skeleton, moments, looks, size)
     least = LEAST_MM * model.skeleton.relative_size
     said = predict(model.expectation, samples)[:n, 0].astype(float)
-    error = np.maximum(np.exp(said / LOG_UNIT) if model.calibration.logarithmic else said, least) * size
+    error = (
+        np.maximum(np.exp(said / LOG_UNIT) if model.calibration.logarithmic else said, least) * size
+    )
     scale = error / chosen.error_mm
     return replace(chosen, error_mm=error, sd_mm=chosen.sd_mm * scale[:, None])
 
 
-def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Array, size: float) -> Samples:
+def clue_samples(
+    chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Array, size: float
+) -> Samples:
     """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
 
     Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high
@@ -159,14 +203,25 @@ def clue_samples(chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Arra
     unit, whole = skeleton.relative_size, size * skeleton.relative_size
     clues = np.stack(
         [
-            chosen.score / unit, chosen.spread / unit, *chosen.doubts.T / unit, 10 * pose.root.rotation[:, 2, 0],
-            10 * pose.root.rotation[:, 2, 1], 10 * np.abs(pose.angles).sum(axis=(1, 2)), 10 * pose.scale / size,
-            5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2), 5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
-            moments[:, 6] / whole, moments[:, 7] / whole, 10 * (mm_per_px(looks) / whole), *chosen.sd_root.T[:3] * 10,
-            *chosen.sd_root.T[3:] / whole, 10 * chosen.sd_angles.sum(axis=(1, 2)), *chosen.fit.T / 50,
+            chosen.score / unit,
+            chosen.spread / unit,
+            *chosen.doubts.T / unit,
+            10 * pose.root.rotation[:, 2, 0],
+            10 * pose.root.rotation[:, 2, 1],
+            10 * np.abs(pose.angles).sum(axis=(1, 2)),
+            10 * pose.scale / size,
+            5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2),
+            5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
+            moments[:, 6] / whole,
+            moments[:, 7] / whole,
+            10 * (mm_per_px(looks) / whole),
+            *chosen.sd_root.T[:3] * 10,
+            *chosen.sd_root.T[3:] / whole,
+            10 * chosen.sd_angles.sum(axis=(1, 2)),
+            *chosen.fit.T / 50,
         ],
         axis=1,
-    )  # fmt: skip
+    )
     n = len(clues)
     blank = np.zeros((1, 2, 2), np.int16), np.zeros(n, np.int32), np.ones(n, np.float32)
     return Samples(*blank, np.zeros((n, 1, VIEW), np.float32), (100.0 * clues).astype(np.float32))
@@ -186,5 +241,7 @@ def _spread_of_coordinates(
     mean_local = np.swapaxes(mean[:, parents], -1, -2) @ mean[:, moving]
     turn = so3.log(np.swapaxes(mean_local, -1, -2)[:, None] @ local)
     sd_angles = np.zeros((*mean.shape[:2], 3))
-    sd_angles[:, moving] = np.sqrt(np.einsum("nk,nkjd->njd", weight, turn**2)) * skeleton.axes[moving]
+    sd_angles[:, moving] = (
+        np.sqrt(np.einsum("nk,nkjd->njd", weight, turn**2)) * skeleton.axes[moving]
+    )
     return sd_root, sd_angles

@@ -45,8 +45,18 @@ class TrainingSet:
         """The images of several sets, one after the other."""
         images, truths = [p.images for p in parts], [p.truth for p in parts]
         return TrainingSet(
-            ImageSet(*(np.concatenate([getattr(i, name) for i in images]) for name in ImageSet.__annotations__)),
-            Truth(*(np.concatenate([getattr(t, name) for t in truths]) for name in Truth.__annotations__)),
+            ImageSet(
+                *(
+                    np.concatenate([getattr(i, name) for i in images])
+                    for name in ImageSet.__annotations__
+                )
+            ),
+            Truth(
+                *(
+                    np.concatenate([getattr(t, name) for t in truths])
+                    for name in Truth.__annotations__
+                )
+            ),
             np.concatenate([p.size for p in parts]),
             np.concatenate([p.animal for p in parts]),
         )
@@ -68,8 +78,17 @@ class Proposals:
     def train(data: TrainingSet, method: Method, rng: np.random.Generator) -> Proposals:
         """Learned from the bases of the images that show the animal."""
         truth = data.truth
-        return Proposals(*train_proposals(data.images, truth.rotations[:, 0], truth.positions[:, 0], data.size,
-                                          data.animal, method, rng))  # fmt: skip
+        return Proposals(
+            *train_proposals(
+                data.images,
+                truth.rotations[:, 0],
+                truth.positions[:, 0],
+                data.size,
+                data.animal,
+                method,
+                rng,
+            )
+        )
 
     def draw(self, rng: np.random.Generator, m: int, k: int) -> NDArray[np.int64]:
         """K different candidates (m, k) for every image, of trees that have not seen it as far as these go."""
@@ -79,7 +98,11 @@ class Proposals:
 
 
 def start_candidates(
-    data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator, seen: Proposals | None = None
+    data: TrainingSet,
+    skeleton: Skeleton,
+    method: Method,
+    rng: np.random.Generator,
+    seen: Proposals | None = None,
 ) -> Candidates:
     """K starts for every training image, each with its own guess of the animal's size.
 
@@ -92,9 +115,15 @@ def start_candidates(
     else:
         size = np.ones((m, k))
     rotation, position, scale = start_poses(
-        data.images.moments, starts, size, skeleton.length, base_at_front(skeleton), method.axis_start,
-        method.camera_view, method.home_turn,
-    )  # fmt: skip
+        data.images.moments,
+        starts,
+        size,
+        skeleton.length,
+        base_at_front(skeleton),
+        method.axis_start,
+        method.camera_view,
+        method.home_turn,
+    )
     if seen is not None:
         bases, places = propose(seen.forest, data.images, data.size, method)
         chosen = seen.draw(rng, m, k)
@@ -102,7 +131,12 @@ def start_candidates(
         position = np.take_along_axis(places, chosen[..., None], axis=1)
     image = np.repeat(np.arange(m, dtype=np.int32), k)
     return Candidates.start(
-        skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), size.ravel()
+        skeleton,
+        image,
+        rotation.reshape(-1, 3, 3),
+        position.reshape(-1, 3),
+        scale.ravel(),
+        size.ravel(),
     )
 
 
@@ -127,7 +161,9 @@ def train_cascade(
             rows = np.ascontiguousarray(labels, np.float32)
             forest, in_bag = grow_forest(samples, rows, keep, method.regressors, rng)
             forest = quantised(forest)
-            cascade.apply(candidates, joint, predict(forest, samples, in_bag if method.out_of_bag else None))
+            cascade.apply(
+                candidates, joint, predict(forest, samples, in_bag if method.out_of_bag else None)
+            )
             rounds.append(forest)
         cascade.forests.append(rounds)
         n_done += len(rounds)
@@ -146,7 +182,9 @@ def joint_error(candidates: Candidates, truth: Truth) -> Array:
     return off.mean(axis=1) / candidates.size
 
 
-def perturbed_truth(data: TrainingSet, cascade: Cascade, rng: np.random.Generator, n_each: int = 8) -> Candidates:
+def perturbed_truth(
+    data: TrainingSet, cascade: Cascade, rng: np.random.Generator, n_each: int = 8
+) -> Candidates:
     """Randomly perturbed true poses, the paper's metric examples: a twist of the base and a turn of every joint."""
     skeleton = cascade.skeleton
     j = skeleton.n_joints
@@ -154,33 +192,46 @@ def perturbed_truth(data: TrainingSet, cascade: Cascade, rng: np.random.Generato
     size = np.ones(len(image)) if not cascade.method.session_size else data.size[image]
     strength = rng.uniform(0.0, 1.0, len(image))[:, None]
     off = 8.0 * skeleton.relative_size
-    twist = rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, off, off, off]) * strength
+    twist = (
+        rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, off, off, off]) * strength
+    )
     base = SE3(data.truth.rotations[image, 0], data.truth.positions[image, 0]) @ SE3.exp(twist)
-    candidates = Candidates.start(skeleton, image, base.rotation, base.translation, data.truth.scale[image], size)
+    candidates = Candidates.start(
+        skeleton, image, base.rotation, base.translation, data.truth.scale[image], size
+    )
     # a long chain bends no more as a whole than a short one
     bent = 0.35 * np.sqrt(min(1.0, _FEW_JOINTS / max(1, len(skeleton.solved) - 1)))
     for joint in range(1, j):
         cascade.place(candidates, joint)
         parent = skeleton.parents[joint]
-        true = np.swapaxes(data.truth.rotations[image, parent], 1, 2) @ data.truth.rotations[image, joint]
+        true = (
+            np.swapaxes(data.truth.rotations[image, parent], 1, 2)
+            @ data.truth.rotations[image, joint]
+        )
         turn = bent * strength * rng.standard_normal((len(image), 3)) * skeleton.axes[joint]
         candidates.rotations[:, joint] = candidates.rotations[:, parent] @ true @ so3.exp(turn)
     return candidates
 
 
-def train_metric(data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator) -> Forest:
+def train_metric(
+    data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
+) -> Forest:
     """The learned metric: a forest that predicts the mean joint error (mm at home size) of a pose without the truth.
 
     Trained on the cascade's own final candidates, or on perturbed truth as the paper has it.
     """
     if not cascade.method.metric_on_own:
         candidates = perturbed_truth(data, cascade, rng)
-    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
+    error = np.minimum(
+        joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size
+    )
     samples = cascade.metric_samples(data.images, candidates)
     labels, method = error[:, None].astype(np.float32), cascade.method
     if method.metric_shrinkage > 0:
         return quantised(boost_forest(samples, labels, method.metric, method.metric_shrinkage, rng))
-    return quantised(grow_forest(samples, labels, np.ones(len(candidates), np.bool_), method.metric, rng)[0])
+    return quantised(
+        grow_forest(samples, labels, np.ones(len(candidates), np.bool_), method.metric, rng)[0]
+    )
 
 
 def train_pruner(
@@ -193,6 +244,10 @@ def train_pruner(
     plan = cascade.method.pruner
     if plan is None:
         return None
-    error = np.minimum(joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size)
+    error = np.minimum(
+        joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size
+    )
     samples = cascade.samples(data.images, candidates, [0])
-    return quantised(boost_forest(samples, error[:, None].astype(np.float32), plan, _PRUNER_SHRINKAGE, rng))
+    return quantised(
+        boost_forest(samples, error[:, None].astype(np.float32), plan, _PRUNER_SHRINKAGE, rng)
+    )

@@ -41,7 +41,9 @@ def nyu_errors(answer: Array, truth: Array) -> dict[str, Any]:
         "median_mm_14": float(np.median(estimated)),
         "per_point_mm": dict(zip(POINTS, estimated.mean(axis=0).tolist(), strict=True)),
         "share_max_error_below_mm": {str(mm): float((worst < mm).mean()) for mm in _MAX_BELOW_MM},
-        "share_mean_error_below_mm": {str(mm): float((frame_mean < mm).mean()) for mm in _MEAN_BELOW_MM},
+        "share_mean_error_below_mm": {
+            str(mm): float((frame_mean < mm).mean()) for mm in _MEAN_BELOW_MM
+        },
     }
 
 

@@ -19,9 +19,14 @@ POSE_PROTOCOL = (
     "frames whose true error lies in the 90 % interval predicted for it."
 )
 _FIGURES = (
-    "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm", "flip_rate", "lost_rate",
-    "spearman_predicted_error", "interval90_coverage",
-)  # fmt: skip
+    "mean_joint_error_mm",
+    "median_joint_error_mm",
+    "p95_joint_error_mm",
+    "flip_rate",
+    "lost_rate",
+    "spearman_predicted_error",
+    "interval90_coverage",
+)
 
 
 @dataclass(frozen=True)
@@ -39,20 +44,31 @@ class PoseErrors:
     high_mm: Array
 
     @staticmethod
-    def compare(joints: Array, true_joints: Array, tip: int, predicted_mm: Array, quantiles: Array) -> PoseErrors:
+    def compare(
+        joints: Array, true_joints: Array, tip: int, predicted_mm: Array, quantiles: Array
+    ) -> PoseErrors:
         """Errors of joints (n, J, 3) mm, NaN where lost; `tip` is the joint that the base's heading points at."""
         joint_mm = np.linalg.norm(joints - true_joints, axis=-1)
         measured, true = joints[:, tip] - joints[:, 0], true_joints[:, tip] - true_joints[:, 0]
         flipped = np.sum(measured * true, axis=-1) < 0
         return PoseErrors(
-            joint_mm.mean(axis=1), joint_mm, flipped, predicted_mm, predicted_mm * quantiles[0],
+            joint_mm.mean(axis=1),
+            joint_mm,
+            flipped,
+            predicted_mm,
+            predicted_mm * quantiles[0],
             predicted_mm * quantiles[1],
-        )  # fmt: skip
+        )
 
     @staticmethod
     def join(parts: list[PoseErrors]) -> PoseErrors:
         """The errors of several recordings as one."""
-        return PoseErrors(*(np.concatenate([getattr(p, name) for p in parts]) for name in PoseErrors.__annotations__))
+        return PoseErrors(
+            *(
+                np.concatenate([getattr(p, name) for p in parts])
+                for name in PoseErrors.__annotations__
+            )
+        )
 
     def summary(self) -> dict[str, Any]:
         """The figures of `liex evaluate pose`; None for those of a prediction that was not made."""

@@ -84,7 +84,10 @@ class Followed:
 
 
 def figures(
-    rows: Sequence[Followed], single: Sequence[Followed], events: Sequence[Sequence[Event]], length_mm: float
+    rows: Sequence[Followed],
+    single: Sequence[Followed],
+    events: Sequence[Sequence[Event]],
+    length_mm: float,
 ) -> dict[str, Any]:
     """The figures of one row over some sequences; single: the same sequences frame by frame."""
     error, alone = (np.concatenate([row.error_mm for row in some]) for some in (rows, single))
@@ -92,15 +95,23 @@ def figures(
     if not both.any():
         return {"lost_rate": 1.0}
     own, others = (
-        np.concatenate([row.in_view(happened, length_mm) for row, happened in zip(some, events, strict=True)])
+        np.concatenate(
+            [row.in_view(happened, length_mm) for row, happened in zip(some, events, strict=True)]
+        )
         for some in (rows, single)
     )
-    recovery = [n for row, happened in zip(rows, events, strict=True) for n in row.recovery(happened, length_mm)]
+    recovery = [
+        n
+        for row, happened in zip(rows, events, strict=True)
+        for n in row.recovery(happened, length_mm)
+    ]
     return {
         "mean_joint_error_mm": float(error[seen].mean()),
         "p95_joint_error_mm": float(np.quantile(error[seen], 0.95)),
         "ratio_to_single": float(error[both].mean() / alone[both].mean()),
-        "p95_ratio_to_single": float(np.quantile(error[both], 0.95) / np.quantile(alone[both], 0.95)),
+        "p95_ratio_to_single": float(
+            np.quantile(error[both], 0.95) / np.quantile(alone[both], 0.95)
+        ),
         "in_view_ratio": float(own.mean() / others.mean()),
         "in_view_p95_ratio": float(np.quantile(own, 0.95) / np.quantile(others, 0.95)),
         "lost_rate": float(1.0 - seen.mean()),

@@ -29,9 +29,13 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
         raw = source.read_bytes()
         document = json.loads(_unpacked(raw) if raw[:2] == b"\x1f\x8b" else raw)
     except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
-        raise LiexError(f"{source} should be a BORIS project (JSON), but: {one_line(error)}") from None
+        raise LiexError(
+            f"{source} should be a BORIS project (JSON), but: {one_line(error)}"
+        ) from None
     if not isinstance(document, dict) or not isinstance(document.get("observations"), dict):
-        raise LiexError(f"{source} should be a BORIS project, but holds no observations; save it from BORIS again")
+        raise LiexError(
+            f"{source} should be a BORIS project, but holds no observations; save it from BORIS again"
+        )
     return document
 
 
@@ -42,14 +46,21 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
     have no length and are left out.
     """
     document = read_boris_project(path)
-    points = {str(b.get("code")) for b in _values(document.get("behaviors_conf"))
-              if str(b.get("type", _STATE)).lower().startswith("point")}  # fmt: skip
+    points = {
+        str(b.get("code"))
+        for b in _values(document.get("behaviors_conf"))
+        if str(b.get("type", _STATE)).lower().startswith("point")
+    }
     rows: list[dict[str, Any]] = []
     for name, observation in document["observations"].items():
         name = " ".join(str(name).split())
         if not isinstance(observation, dict):
-            raise LiexError(f"{path}: the observation {name} is none; save the project from BORIS again")
-        rows += _pairs(observation.get("events", []), points, name, _offset(observation, name, path), path)
+            raise LiexError(
+                f"{path}: the observation {name} is none; save the project from BORIS again"
+            )
+        rows += _pairs(
+            observation.get("events", []), points, name, _offset(observation, name, path), path
+        )
     columns = ["session_id", "individual", "action", "start_s", "stop_s", "source"]
     return checked(pd.DataFrame(rows, columns=columns), str(path))
 
@@ -61,11 +72,18 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
         table = pd.read_csv(source, sep="\t" if source.suffix == ".tsv" else ",")
     except (OSError, ValueError) as error:
         raise LiexError(f"{source} should be an export of BORIS, but: {one_line(error)}") from None
-    wanted = {"Observation id": "session_id", "Subject": "individual", "Behavior": "action", "Start (s)": "start_s",
-              "Stop (s)": "stop_s"}  # fmt: skip
+    wanted = {
+        "Observation id": "session_id",
+        "Subject": "individual",
+        "Behavior": "action",
+        "Start (s)": "start_s",
+        "Stop (s)": "stop_s",
+    }
     lacking = [name for name in wanted if name not in table]
     if lacking:
-        raise LiexError(f"{source} should be BORIS's export of aggregated events; it lacks the column {lacking[0]}")
+        raise LiexError(
+            f"{source} should be BORIS's export of aggregated events; it lacks the column {lacking[0]}"
+        )
     if "Behavior type" in table:
         table = table[table["Behavior type"] == "STATE"]
     return checked(table[list(wanted)].rename(columns=wanted).assign(source=HUMAN), str(source))
@@ -91,7 +109,9 @@ def _offset(observation: dict[str, Any], name: str, path: str | Path) -> float:
     try:
         return float(observation.get("time offset") or 0.0)
     except (TypeError, ValueError, OverflowError):
-        raise LiexError(f"{path}: the observation {name} has a time offset that is no number; correct it") from None
+        raise LiexError(
+            f"{path}: the observation {name} has a time offset that is no number; correct it"
+        ) from None
 
 
 def _pairs(
@@ -110,10 +130,20 @@ def _pairs(
                 begun[key] = float(time)
                 continue
             start = begun.pop(key)
-            rows.append({"session_id": name, "individual": key[0], "action": key[1], "start_s": start - offset,
-                         "stop_s": float(time) - offset, "source": HUMAN})  # fmt: skip
+            rows.append(
+                {
+                    "session_id": name,
+                    "individual": key[0],
+                    "action": key[1],
+                    "start_s": start - offset,
+                    "stop_s": float(time) - offset,
+                    "source": HUMAN,
+                }
+            )
     except (TypeError, ValueError, IndexError, OverflowError, KeyError):
-        raise LiexError(f"{path}: the observation {name} has an event that cannot be read; check it in BORIS") from None
+        raise LiexError(
+            f"{path}: the observation {name} has an event that cannot be read; check it in BORIS"
+        ) from None
     if begun:
         (_, code, _), start = next(iter(begun.items()))
         raise LiexError(
@@ -124,4 +154,8 @@ def _pairs(
 
 
 def _values(conf: Any) -> list[dict[str, Any]]:
-    return [entry for entry in conf.values() if isinstance(entry, dict)] if isinstance(conf, dict) else []
+    return (
+        [entry for entry in conf.values() if isinstance(entry, dict)]
+        if isinstance(conf, dict)
+        else []
+    )

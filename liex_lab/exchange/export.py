@@ -14,17 +14,35 @@ from liex_lab.sessions import Session
 
 # target -> (module, ending of what it writes, what it is)
 TARGETS: dict[str, tuple[str, str, str]] = {
-    "nwb": ("liex_lab.exchange.nwb", ".nwb", "Neurodata Without Borders: poses (ndx-pose), rotations, actions"),
+    "nwb": (
+        "liex_lab.exchange.nwb",
+        ".nwb",
+        "Neurodata Without Borders: poses (ndx-pose), rotations, actions",
+    ),
     "boris": ("liex_lab.exchange.boris", ".boris", "a BORIS project with the ethogram"),
-    "dlc": ("liex_lab.exchange.dlc", "_dlc", "a folder with DeepLabCut's CSV tables, in millimetres and in pixels"),
+    "dlc": (
+        "liex_lab.exchange.dlc",
+        "_dlc",
+        "a folder with DeepLabCut's CSV tables, in millimetres and in pixels",
+    ),
     "movement": ("liex_lab.exchange.movement", ".nc", "netCDF as movement keeps poses, true times"),
-    "sleap": ("liex_lab.exchange.sleap", ".analysis.h5", "SLEAP's analysis file, in pixels of the depth picture"),
-    "csv": ("liex_lab.exchange.tables_csv", "_csv", "a folder with every table as CSV, and columns.json"),
-}  # fmt: skip
+    "sleap": (
+        "liex_lab.exchange.sleap",
+        ".analysis.h5",
+        "SLEAP's analysis file, in pixels of the depth picture",
+    ),
+    "csv": (
+        "liex_lab.exchange.tables_csv",
+        "_csv",
+        "a folder with every table as CSV, and columns.json",
+    ),
+}
 _EXTRA = "this needs further packages; install them with `pip install 'liex_lab[exchange]'`"
 
 
-def export(session: Session, to: str, out: str | Path | None = None, *, overwrite: bool = False) -> Path:
+def export(
+    session: Session, to: str, out: str | Path | None = None, *, overwrite: bool = False
+) -> Path:
     """Write a session in another program's format; returns the file or folder.
 
     to: a word of `TARGETS`; out: the folder it goes into, by default the session's own. Nothing half-written stays.
@@ -33,15 +51,21 @@ def export(session: Session, to: str, out: str | Path | None = None, *, overwrit
     if to not in TARGETS:
         near = difflib.get_close_matches(to, TARGETS, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
-        raise SessionError(f"there is no format '{to}' to export to: {hint}known are {', '.join(TARGETS)}")
+        raise SessionError(
+            f"there is no format '{to}' to export to: {hint}known are {', '.join(TARGETS)}"
+        )
     home, ending, _ = TARGETS[to]
     folder = session.path if out is None else Path(out)
     if folder.exists() and not folder.is_dir():
-        raise SessionError(f"{folder} is a file, and exports go into a folder; name another one with --out")
+        raise SessionError(
+            f"{folder} is a file, and exports go into a folder; name another one with --out"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{session.name}{ending}"
     if path.exists() and not overwrite:
-        raise SessionError(f"{path} exists already; name another place with --out, or say --overwrite")
+        raise SessionError(
+            f"{path} exists already; name another place with --out, or say --overwrite"
+        )
     part = folder / f".{os.getpid()}.part-{path.name}"
     try:
         writer: Callable[[Session, Path], None] = import_module(home).write

@@ -25,10 +25,14 @@ def to_movement(session: Session) -> xarray.Dataset:
     dims = ("time", "space", "keypoints", "individuals")
     rate = session.metadata["frames"]["fps_median"]
     attrs: dict[str, Any] = {
-        "source_software": "liex_lab", "ds_type": "poses", "time_unit": "seconds", "source_file": session.path.name,
-        "space_unit": "mm", "axes": "arena: z up from the floor",
+        "source_software": "liex_lab",
+        "ds_type": "poses",
+        "time_unit": "seconds",
+        "source_file": session.path.name,
+        "space_unit": "mm",
+        "axes": "arena: z up from the floor",
         **({"fps": float(rate)} if rate else {}),
-    }  # fmt: skip
+    }
     return xarray.Dataset(
         data_vars={
             "position": (dims, np.moveaxis(poses.xyz_mm, 1, 2)[..., None]),
@@ -37,11 +41,13 @@ def to_movement(session: Session) -> xarray.Dataset:
             "action": (("time", "individuals"), _actions(session, poses)[:, None]),
         },
         coords={
-            "time": poses.time_s, "space": ["x", "y", "z"], "keypoints": list(poses.joints),
+            "time": poses.time_s,
+            "space": ["x", "y", "z"],
+            "keypoints": list(poses.joints),
             "individuals": [poses.individual],
         },
         attrs=attrs,
-    )  # fmt: skip
+    )
 
 
 def _actions(session: Session, poses: Poses) -> np.ndarray[Any, Any]:

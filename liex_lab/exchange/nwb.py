@@ -32,7 +32,9 @@ def write(session: Session, path: Path) -> None:
     """The file at `path`. Raises a SessionError where the session does not say when it began."""
     from pynwb import NWBHDF5IO
 
-    made = build(session)  # before the file is opened: it takes the types that are known by then, and not ndx-pose's
+    made = build(
+        session
+    )  # before the file is opened: it takes the types that are known by then, and not ndx-pose's
     with NWBHDF5IO(path, "w") as file:
         file.write(made)
 
@@ -46,11 +48,16 @@ def build(session: Session) -> NWBFile:
     made = NWBFile(
         session_description=f"3D skeleton and actions of one {about['animal']['name']}, from a depth recording",
         identifier=str(uuid5(NAMESPACE_URL, f"{session.name}-{about['input']['sha256']}")),
-        session_start_time=_start(session), session_id=session.name, subject=_subject(session),
-        source_script="liex export --to nwb", source_script_file_name=f"liex_lab {version}",
+        session_start_time=_start(session),
+        session_id=session.name,
+        subject=_subject(session),
+        source_script="liex export --to nwb",
+        source_script_file_name=f"liex_lab {version}",
         keywords=["depth camera", "pose", "behavior"],
-    )  # fmt: skip
-    module = made.create_processing_module("behavior", "pose estimates, rotations and actions by liex_lab")
+    )
+    module = made.create_processing_module(
+        "behavior", "pose estimates, rotations and actions by liex_lab"
+    )
     poses = Poses.of(session)
     _add_poses(made, module, session, poses, version)
     _add_rotations(module, session, poses)
@@ -78,32 +85,54 @@ def _subject(session: Session) -> Any:
     about, kind = session.metadata["subject"], session.metadata["animal"]["name"]
     sex = str(about.get("sex", ""))[:1].upper()
     return Subject(
-        subject_id=about.get("subject_id") or session.metadata["individual"], species=_SPECIES.get(kind, kind),
-        sex=sex if sex in ("M", "F", "O") else "U", description=f"{kind}, group {about.get('group') or 'not stated'}",
-    )  # fmt: skip
+        subject_id=about.get("subject_id") or session.metadata["individual"],
+        species=_SPECIES.get(kind, kind),
+        sex=sex if sex in ("M", "F", "O") else "U",
+        description=f"{kind}, group {about.get('group') or 'not stated'}",
+    )
 
 
 def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, version: str) -> None:
     """Skeleton and one series per joint; the first one's times are the others' too."""
     from ndx_pose import PoseEstimation, PoseEstimationSeries, Skeleton, Skeletons
 
-    skeleton = Skeleton(name=session.metadata["animal"]["name"], nodes=list(poses.joints),
-                        edges=np.array(poses.bones, np.uint8).reshape(-1, 2), subject=made.subject)  # fmt: skip
+    skeleton = Skeleton(
+        name=session.metadata["animal"]["name"],
+        nodes=list(poses.joints),
+        edges=np.array(poses.bones, np.uint8).reshape(-1, 2),
+        subject=made.subject,
+    )
     module.add(Skeletons(skeletons=[skeleton]))
     camera = session.metadata["camera"]
-    device = made.create_device(name="depth camera", description=str(camera.get("source", "depth camera")))
+    device = made.create_device(
+        name="depth camera", description=str(camera.get("source", "depth camera"))
+    )
     series: list[Any] = []
     for k, joint in enumerate(poses.joints):
-        series.append(PoseEstimationSeries(
-            name=joint, description=f"position of the {joint}", data=poses.xyz_mm[:, k].astype(np.float32),
-            unit="millimeters", reference_frame=_FRAME, timestamps=series[0] if series else poses.time_s,
-            confidence=poses.score[:, k].astype(np.float32), confidence_definition=_CONFIDENCE,
-        ))  # fmt: skip
-    module.add(PoseEstimation(
-        name="PoseEstimation", pose_estimation_series=series, description="joints in millimetres, one row per frame",
-        device=device, scorer="liex_lab", source_software="liex_lab", source_software_version=version,
-        skeleton=skeleton,
-    ))  # fmt: skip
+        series.append(
+            PoseEstimationSeries(
+                name=joint,
+                description=f"position of the {joint}",
+                data=poses.xyz_mm[:, k].astype(np.float32),
+                unit="millimeters",
+                reference_frame=_FRAME,
+                timestamps=series[0] if series else poses.time_s,
+                confidence=poses.score[:, k].astype(np.float32),
+                confidence_definition=_CONFIDENCE,
+            )
+        )
+    module.add(
+        PoseEstimation(
+            name="PoseEstimation",
+            pose_estimation_series=series,
+            description="joints in millimetres, one row per frame",
+            device=device,
+            scorer="liex_lab",
+            source_software="liex_lab",
+            source_software_version=version,
+            skeleton=skeleton,
+        )
+    )
 
 
 def _add_rotations(module: Any, session: Session, poses: Poses) -> None:
@@ -114,9 +143,20 @@ def _add_rotations(module: Any, session: Session, poses: Poses) -> None:
     names = [str(name) for name in table["joint"].iloc[: len(poses.joints) + 1]]
     turns = table[["wx_rad", "wy_rad", "wz_rad"]].to_numpy(np.float32).reshape(-1, len(names), 3)
     for k, name in enumerate(names):
-        what = "of the body's base relative to the arena" if name == "root" else "relative to the joint's parent"
-        module.add(TimeSeries(name=f"rotation_{name}", data=turns[:, k], unit="rad", timestamps=poses.time_s,
-                              description=f"rotation vector {what}"))  # fmt: skip
+        what = (
+            "of the body's base relative to the arena"
+            if name == "root"
+            else "relative to the joint's parent"
+        )
+        module.add(
+            TimeSeries(
+                name=f"rotation_{name}",
+                data=turns[:, k],
+                unit="rad",
+                timestamps=poses.time_s,
+                description=f"rotation vector {what}",
+            )
+        )
 
 
 def _add_intervals(made: NWBFile, session: Session) -> None:
@@ -127,13 +167,19 @@ def _add_intervals(made: NWBFile, session: Session) -> None:
     actions.add_column("label", "the action's name")
     actions.add_column("score", "how well the bout fits its action, 0 to 1")
     bouts, missing = session.bouts, session.gaps
-    spans, scores = bouts[["start_s", "stop_s"]].to_numpy(float).tolist(), bouts["score"].to_numpy(float).tolist()
+    spans, scores = (
+        bouts[["start_s", "stop_s"]].to_numpy(float).tolist(),
+        bouts["score"].to_numpy(float).tolist(),
+    )
     for (start, stop), action, score in zip(spans, bouts["action"], scores, strict=True):
-        actions.add_row(start_time=start, stop_time=stop, label=str(action), score=score, check_ragged=False)
+        actions.add_row(
+            start_time=start, stop_time=stop, label=str(action), score=score, check_ragged=False
+        )
     gaps = TimeIntervals(name="gaps", description="frames that are missing or without a pose")
     gaps.add_column("reason", "why")
-    for (start, stop), reason in zip(missing[["start_s", "stop_s"]].to_numpy(float).tolist(), missing["reason"],
-                                     strict=True):  # fmt: skip
+    for (start, stop), reason in zip(
+        missing[["start_s", "stop_s"]].to_numpy(float).tolist(), missing["reason"], strict=True
+    ):
         gaps.add_row(start_time=start, stop_time=stop, reason=str(reason), check_ragged=False)
     for table in (actions, gaps):
         if len(table):

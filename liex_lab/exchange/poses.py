@@ -11,7 +11,18 @@ from numpy.typing import NDArray
 from liex_lab.sessions import Session
 
 Array = NDArray[np.float64]
-_COLUMNS = ["frame_index", "time_s", "joint", "x_mm", "y_mm", "z_mm", "u_px", "v_px", "score", "sd_mm"]
+_COLUMNS = [
+    "frame_index",
+    "time_s",
+    "joint",
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "u_px",
+    "v_px",
+    "score",
+    "sd_mm",
+]
 
 
 @dataclass(frozen=True)
@@ -44,13 +55,21 @@ class Poses:
             return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
 
         return Poses(
-            about["individual"], joints, tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),
-            table["frame_index"].to_numpy()[::n], table["time_s"].to_numpy(float)[::n], array("x_mm", "y_mm", "z_mm"),
-            array("u_px", "v_px"), array("score"), array("sd_mm"),
-        )  # fmt: skip
+            about["individual"],
+            joints,
+            tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),
+            table["frame_index"].to_numpy()[::n],
+            table["time_s"].to_numpy(float)[::n],
+            array("x_mm", "y_mm", "z_mm"),
+            array("u_px", "v_px"),
+            array("score"),
+            array("sd_mm"),
+        )
 
 
 def write_times(path: Path, poses: Poses) -> None:
     """A CSV with the true time of each row, for formats that have no room for it."""
-    lines = [f"{index},{time:.9f}" for index, time in zip(poses.frame_index, poses.time_s, strict=True)]
+    lines = [
+        f"{index},{time:.9f}" for index, time in zip(poses.frame_index, poses.time_s, strict=True)
+    ]
     path.write_text("\n".join(["frame_index,time_s", *lines]) + "\n", encoding="utf-8")

@@ -21,10 +21,16 @@ def write(session: Session, path: Path) -> None:
 
     poses = Poses.of(session)
     seen = np.isfinite(poses.uv_px[:, :, 0])
-    order = {"tracks": ("track", "xy", "node", "frame"), "point_scores": ("track", "node", "frame"),
-             "track_occupancy": ("frame", "track"), "instance_scores": ("track", "frame"),
-             "tracking_scores": ("track", "frame")}  # fmt: skip
-    mean_score = np.where(seen.any(axis=1), np.nanmean(np.where(seen, poses.score, 0.0), axis=1), np.nan)
+    order = {
+        "tracks": ("track", "xy", "node", "frame"),
+        "point_scores": ("track", "node", "frame"),
+        "track_occupancy": ("frame", "track"),
+        "instance_scores": ("track", "frame"),
+        "tracking_scores": ("track", "frame"),
+    }
+    mean_score = np.where(
+        seen.any(axis=1), np.nanmean(np.where(seen, poses.score, 0.0), axis=1), np.nan
+    )
     arrays = {
         "tracks": poses.uv_px.transpose(2, 1, 0)[None],
         "point_scores": poses.score.T[None],
@@ -32,7 +38,7 @@ def write(session: Session, path: Path) -> None:
         "instance_scores": mean_score[None],
         "tracking_scores": np.where(seen.any(axis=1), 1.0, np.nan)[None],
         "time_s": poses.time_s,
-    }  # fmt: skip
+    }
     edges = [(poses.joints[a], poses.joints[b]) for a, b in poses.bones]
     texts = {"node_names": poses.joints, "track_names": (poses.individual,), "edge_names": edges}
     with h5py.File(path, "w") as file:
@@ -46,5 +52,7 @@ def write(session: Session, path: Path) -> None:
         for name, value in (("labels_path", ""), ("video_path", session.metadata["input"]["name"])):
             file.create_dataset(name, data=value, dtype=h5py.string_dtype())
         file.create_dataset("video_ind", data=0)
-        file.create_dataset("provenance", data=json.dumps({"software": "liex_lab"}), dtype=h5py.string_dtype())
+        file.create_dataset(
+            "provenance", data=json.dumps({"software": "liex_lab"}), dtype=h5py.string_dtype()
+        )
         file.attrs["preset"], file.attrs["format"] = "matlab", "analysis"

@@ -11,7 +11,9 @@ from liex_lab.sessions import Session
 def write(session: Session, path: Path) -> None:
     """The folder `path` with one file per table, numbers in full precision, and columns.json."""
     path.mkdir()
-    for name in sorted({file.name for file in session.path.glob("*.parquet")} | set(session.log.files)):
+    for name in sorted(
+        {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
+    ):
         if name.endswith(".parquet"):
             table = name.removesuffix(".parquet")
             session.table(table).to_csv(path / f"{table}.csv", index=False, lineterminator="\n")

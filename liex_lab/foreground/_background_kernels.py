@@ -31,7 +31,9 @@ def far_mode(values, window):
                 low -= 1
             count = top - low + 1
             middle = values[low + count // 2]
-            spread = 0.5 * (values[low + int(0.84 * (count - 1))] - values[low + int(0.16 * (count - 1))])
+            spread = 0.5 * (
+                values[low + int(0.84 * (count - 1))] - values[low + int(0.16 * (count - 1))]
+            )
             return middle, spread
         top -= 1
     return 0.0, 0.0

@@ -170,7 +170,9 @@ def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
             value = np.float32(-1.0)
             if 0 < r < size - 1 and 0 < c < size - 1 and 0 <= v < height and 0 <= u < width:
                 z = depth[v, u]
-                if (z == 0 or z < limit[v, u]) and is_animal_block(labels, v // BLOCK, u // BLOCK, slot):
+                if (z == 0 or z < limit[v, u]) and is_animal_block(
+                    labels, v // BLOCK, u // BLOCK, slot
+                ):
                     above = max(0.0, distance * (1.0 - z * (a * u + b * v + c0)))
                     value = np.float32(-2.0) if z == 0 else np.float32(above)
             raw[r, c] = value
@@ -267,7 +269,10 @@ def smooth_heights(raw, radius, out):
                 break
     out[:] = 0
     total = np.zeros((size + 1, size + 1))
-    animal, background = np.zeros((size + 1, size + 1), np.int32), np.zeros((size + 1, size + 1), np.int32)
+    animal, background = (
+        np.zeros((size + 1, size + 1), np.int32),
+        np.zeros((size + 1, size + 1), np.int32),
+    )
     for r in range(max(top - radius - 1, 0), min(bottom + radius + 2, size)):
         row_total, row_animal, row_background = 0.0, 0, 0
         for c in range(size):
@@ -332,7 +337,14 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     vxx, vxy, vyy = sxx / area - mx * mx, sxy / area - mx * my, syy / area - my * my
     angle = 0.5 * np.arctan2(2.0 * vxy, vxx - vyy)
     half, root = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
-    moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = n, area, volume, mx, my, angle
+    moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = (
+        n,
+        area,
+        volume,
+        mx,
+        my,
+        angle,
+    )
     moments[6], moments[7] = np.sqrt(max(half + root, 0.0)), np.sqrt(max(half - root, 0.0))
 
 
@@ -352,7 +364,10 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
                 z = distance - heights[r, k] / 16.0
                 x = (origin[0] + step * k - intrinsics[2]) / intrinsics[0] * z
                 y = -(origin[1] + step * r - intrinsics[3]) / intrinsics[1] * z
-                along[n], height[n] = c * (x - moments[3]) + s * (y - moments[4]), heights[r, k] / 16.0
+                along[n], height[n] = (
+                    c * (x - moments[3]) + s * (y - moments[4]),
+                    heights[r, k] / 16.0,
+                )
                 n += 1
     level, slope, scale = 0.0, 0.0, np.inf
     for _ in range(_SLOPE_PASSES):

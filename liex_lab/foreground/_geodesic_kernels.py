@@ -18,8 +18,13 @@ AROUND_MM = 190.0  # of a home-sized hand: how far its points and the beginning 
 _MIN_IN_BLOCK = 5
 _THICK_MM = 25.0  # readings of one block this far behind its nearest belong to something else
 _JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
-_STICKS_OUT_MM = 90.0  # of a home-sized hand: an end of a surface stands out by this, which an elbow does not
-_WORTH_MM, _MOST_OUT = 60.0, 3.0  # sticking out once more as far is worth being nearer by this, up to so often
+_STICKS_OUT_MM = (
+    90.0  # of a home-sized hand: an end of a surface stands out by this, which an elbow does not
+)
+_WORTH_MM, _MOST_OUT = (
+    60.0,
+    3.0,
+)  # sticking out once more as far is worth being nearer by this, up to so often
 _APART = 0.6  # of that radius: ends that lie nearer to each other show the same hand
 _MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
 
@@ -35,7 +40,9 @@ def block_depths(depth, near, far, blocks):
                 for c in range(j * BLOCK, j * BLOCK + BLOCK):
                     z = np.float32(depth[r, c])
                     z = z if near < z < far else nothing
-                    second = min(second, max(first, z))  # no branches: what comes next cannot be foretold
+                    second = min(
+                        second, max(first, z)
+                    )  # no branches: what comes next cannot be foretold
                     first = min(first, z)
             total, n = 0.0, 0
             if second < 1e8:
@@ -175,7 +182,13 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
                 if out_mm >= least_mm:
                     n_tips = _note(tips, n_tips, z, out_mm / least_mm, order[low])
     i, j = order[n - 1, 0], order[n - 1, 1]
-    return _note(tips, n_tips, blocks[i, j], hops[n - 1] * BLOCK * blocks[i, j] / focal / least_mm, order[n - 1])
+    return _note(
+        tips,
+        n_tips,
+        blocks[i, j],
+        hops[n - 1] * BLOCK * blocks[i, j] / focal / least_mm,
+        order[n - 1],
+    )
 
 
 @njit(cache=True)

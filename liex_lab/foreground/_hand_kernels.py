@@ -22,10 +22,17 @@ from liex_lab.foreground._geodesic_kernels import (
 )
 from liex_lab.foreground._hand_score_kernels import unlikeness
 
-_TIP_MM = 60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
+_TIP_MM = (
+    60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
+)
 _MOST_ENDS = 8  # that are looked at
-_PER_MM_BEHIND, _MOST_BEHIND_MM = 0.012, 800.0  # what it counts to be farther away than another end, in `unlikeness`
-_AS_LIKE = 1.0  # a second end is worth a look while it is not more unlike a hand than the first by this
+_PER_MM_BEHIND, _MOST_BEHIND_MM = (
+    0.012,
+    800.0,
+)  # what it counts to be farther away than another end, in `unlikeness`
+_AS_LIKE = (
+    1.0  # a second end is worth a look while it is not more unlike a hand than the first by this
+)
 _LEAST_MM2 = 2500.0  # no hand is smaller
 _LENGTH_MM = 185.0  # of a home-sized hand
 _SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
@@ -133,7 +140,11 @@ def _beyond(points, middle, fingers, cut, labels, mark):
 @njit(cache=True)
 def _along(p, middle, fingers):
     """How far p (3,) lies from `middle` along `fingers`."""
-    return (p[0] - middle[0]) * fingers[0] + (p[1] - middle[1]) * fingers[1] + (p[2] - middle[2]) * fingers[2]
+    return (
+        (p[0] - middle[0]) * fingers[0]
+        + (p[1] - middle[1]) * fingers[1]
+        + (p[2] - middle[2]) * fingers[2]
+    )
 
 
 @njit(cache=True)
@@ -162,7 +173,9 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
     for k in range(len(unlike)):
         slot = labels[int(ends[k, 1]), int(ends[k, 2])]
         locate(blocks, labels, ends[k], size, intrinsics, found)
-        depth[k], unlike[k] = unlikeness(blocks, labels, slot, MAX_SURFACES, found, size, intrinsics)
+        depth[k], unlike[k] = unlikeness(
+            blocks, labels, slot, MAX_SURFACES, found, size, intrinsics
+        )
         nearest = min(nearest, depth[k])
     for k in range(len(unlike)):
         unlike[k] += _PER_MM_BEHIND * min(depth[k] - nearest, _MOST_BEHIND_MM)
@@ -184,7 +197,11 @@ def sight_rotation(x, y, rotation):
     """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as the camera's."""
     length = np.sqrt(x * x + y * y + 1.0)
     up = np.array([-x / length, -y / length, -1.0 / length])
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
+        1.0 - up[0] * up[0],
+        -up[0] * up[1],
+        -up[0] * up[2],
+    )
     norm = np.sqrt(rotation[0, 0] ** 2 + rotation[0, 1] ** 2 + rotation[0, 2] ** 2)
     for k in range(3):
         rotation[0, k] /= norm
@@ -195,7 +212,9 @@ def sight_rotation(x, y, rotation):
 
 
 @njit(cache=True)
-def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw):
+def cut_heights(
+    depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw
+):
     """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 not read."""
     size = raw.shape[0]
     reaches = np.full((labels.shape[0] + 1, labels.shape[1] + 1), -1.0, np.float32)
@@ -204,7 +223,12 @@ def cut_heights(depth, blocks, labels, found, plane, distance, intrinsics, origi
         for c in range(size):
             u = origin[0] + step * c
             raw[r, c] = -1.0
-            if not (0 < r < size - 1 and 0 < c < size - 1 and 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]):
+            if not (
+                0 < r < size - 1
+                and 0 < c < size - 1
+                and 0 <= v < depth.shape[0]
+                and 0 <= u < depth.shape[1]
+            ):
                 continue
             row, column = v // BLOCK, u // BLOCK
             if reaches[row, column] < 0.0:
@@ -237,9 +261,24 @@ def _reach(blocks, labels, row, column):
 
 @njit(cache=True)
 def extract_one(
-    depth, near, far, n_things, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
-    distance, n_blobs, k,
-):  # fmt: skip
+    depth,
+    near,
+    far,
+    n_things,
+    size,
+    behind,
+    smooth,
+    intrinsics,
+    along_axis,
+    heights,
+    origin,
+    n_steps,
+    n_px,
+    moments,
+    distance,
+    n_blobs,
+    k,
+):
     """Find the hand in frame k (H, W) mm and fill row k of the batch; see `NearestScene.extract`. Where n_things is 2,
     the batch has twice as many rows as there are frames, and the second half gets what may be a hand as well.
     """
@@ -260,15 +299,49 @@ def extract_one(
         row = k + rank * (len(n_px) // n_things)
         n_blobs[row] = n_alike
         if rank < n_alike:
-            cut_end(depth, near, far, blocks, labels, ends[ranked[rank]], size, behind, smooth, intrinsics, along_axis,
-                    heights, origin, n_steps, n_px, moments, distance, row)  # fmt: skip
+            cut_end(
+                depth,
+                near,
+                far,
+                blocks,
+                labels,
+                ends[ranked[rank]],
+                size,
+                behind,
+                smooth,
+                intrinsics,
+                along_axis,
+                heights,
+                origin,
+                n_steps,
+                n_px,
+                moments,
+                distance,
+                row,
+            )
 
 
 @njit(cache=True)
 def cut_end(
-    depth, near, far, blocks, labels, end, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps,
-    n_px, moments, distance, k,
-):  # fmt: skip
+    depth,
+    near,
+    far,
+    blocks,
+    labels,
+    end,
+    size,
+    behind,
+    smooth,
+    intrinsics,
+    along_axis,
+    heights,
+    origin,
+    n_steps,
+    n_px,
+    moments,
+    distance,
+    k,
+):
     """The height map of the hand at an end of a surface, and its moments, into row k; labels stay as they are."""
     found, box = np.empty(FIELDS), np.empty(4, np.int64)
     slot = labels[int(end[1]), int(end[2])]
@@ -285,16 +358,33 @@ def cut_end(
     rotation = np.empty((3, 3))
     x, y = view_axis(origin[k], step, crop, intrinsics, along_axis)
     sight_rotation(x, y, rotation)
-    distance[k] = behind - (rotation[2, 0] * found[0] + rotation[2, 1] * found[1] + rotation[2, 2] * found[2])
+    distance[k] = behind - (
+        rotation[2, 0] * found[0] + rotation[2, 1] * found[1] + rotation[2, 2] * found[2]
+    )
     plane = view_plane(rotation, distance[k], intrinsics)
     raw = np.empty((crop, crop), np.float32)
-    cut_heights(depth, blocks, labels, found, plane, distance[k], intrinsics, origin[k], step, near, far, raw)
+    cut_heights(
+        depth,
+        blocks,
+        labels,
+        found,
+        plane,
+        distance[k],
+        intrinsics,
+        origin[k],
+        step,
+        near,
+        far,
+        raw,
+    )
     relabel(labels, box, MAX_SURFACES, slot)
     segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * found[2] / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])
-    segment.blob_moments(heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k])
+    segment.blob_moments(
+        heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k]
+    )
     # the arm tells which way along the long axis the fingers point
     along = rotation @ found[3:6]
     if along[0] * np.cos(moments[k, 5]) + along[1] * np.sin(moments[k, 5]) < 0.0:
@@ -323,13 +413,44 @@ def view_plane(rotation, distance, intrinsics):
 
 @njit(cache=True, parallel=True)
 def extract_all(
-    depths, near, far, n_things, size, behind, smooth, intrinsics, along_axis, heights, origin, n_steps, n_px, moments,
-    distance, n_blobs,
-):  # fmt: skip
+    depths,
+    near,
+    far,
+    n_things,
+    size,
+    behind,
+    smooth,
+    intrinsics,
+    along_axis,
+    heights,
+    origin,
+    n_steps,
+    n_px,
+    moments,
+    distance,
+    n_blobs,
+):
     """`extract_one` for a batch; size, behind, smooth (n,) and intrinsics (n, 4) differ."""
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], near, far, n_things, size[k], behind[k], smooth[k], intrinsics[k], along_axis, heights,
-                    origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+        extract_one(
+            depths[k],
+            near,
+            far,
+            n_things,
+            size[k],
+            behind[k],
+            smooth[k],
+            intrinsics[k],
+            along_axis,
+            heights,
+            origin,
+            n_steps,
+            n_px,
+            moments,
+            distance,
+            n_blobs,
+            k,
+        )
 
 
 @njit(cache=True)
@@ -341,7 +462,12 @@ def fill_looks(intrinsics, origin, step, distance, crop, along_axis, looks):
         sight_rotation(x, y, rotation)
         looks[k, :4] = intrinsics[k]
         looks[k, 4:13] = rotation.ravel()
-        looks[k, 13], looks[k, 14], looks[k, 15], looks[k, 16] = distance[k], origin[k, 0], origin[k, 1], step[k]
+        looks[k, 13], looks[k, 14], looks[k, 15], looks[k, 16] = (
+            distance[k],
+            origin[k, 0],
+            origin[k, 1],
+            step[k],
+        )
 
 
 @njit(cache=True)

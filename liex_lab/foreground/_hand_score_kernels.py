@@ -13,9 +13,17 @@ from liex_lab.foreground._geodesic_kernels import AROUND_MM, box_around, point_o
 
 # what tells rendered hands from elbows, chests and heads by logistic regression, in units of the first: the logarithm
 # of circumference^2 over area, which fingers make large
-_AREA_LOG_MM2, _PER_AREA = 9.55, 0.55  # of a home-sized hand; what the square of the difference counts
+_AREA_LOG_MM2, _PER_AREA = (
+    9.55,
+    0.55,
+)  # of a home-sized hand; what the square of the difference counts
 _PER_BORDER = 0.6  # the share that lies along the border of the picture
-_WRIST_MM, _WIDE_MM, _PER_WIDTH, _MOST_WIDTHS = 50.0, 100.0, 0.25, 4.0  # how wide it goes on behind the cut
+_WRIST_MM, _WIDE_MM, _PER_WIDTH, _MOST_WIDTHS = (
+    50.0,
+    100.0,
+    0.25,
+    4.0,
+)  # how wide it goes on behind the cut
 _MARGIN = 2  # blocks
 _WITHIN = 2.0  # of `AROUND_MM`, from the hand's middle: all blocks that are marked, and what lies close behind the cut
 _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -54,7 +62,9 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
     area, n = max(area, 1.0), max(n, 1)
     width = min(behind / (_WRIST_MM * _WIDE_MM * size * size), _MOST_WIDTHS)
     unlike = _PER_AREA * (np.log(area / (size * size)) - _AREA_LOG_MM2) ** 2
-    return depth / n, unlike + _PER_BORDER * on_border / n + _PER_WIDTH * width - np.log(max(around, 1.0) ** 2 / area)
+    return depth / n, unlike + _PER_BORDER * on_border / n + _PER_WIDTH * width - np.log(
+        max(around, 1.0) ** 2 / area
+    )
 
 
 @njit(cache=True)

@@ -20,7 +20,9 @@ _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor 
 def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
     """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
     for k in prange(depths.shape[0]):
-        labels = np.empty((depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32)
+        labels = np.empty(
+            (depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32
+        )
         blobs = np.empty((segment.MAX_BLOBS, 7))
         for slot in range(segment.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)):
             if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
@@ -63,9 +65,13 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     """
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
-            cut, near, far = segment.layers(depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area))
+            cut, near, far = segment.layers(
+                depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area)
+            )
             if cut > 0.0:
-                behind = abs(np.log(far * mm2_per_px / area)) < abs(np.log(near * mm2_per_px / area))
+                behind = abs(np.log(far * mm2_per_px / area)) < abs(
+                    np.log(near * mm2_per_px / area)
+                )
                 out = depth.copy()
                 if behind:
                     for v in range(depth.shape[0]):
@@ -92,9 +98,26 @@ def _push_back(depth, labels, slot, cut):
 
 @njit(cache=True)
 def extract_one(
-    depth, limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
-    n_steps, n_px, moments, distance, n_blobs, k,
-):  # fmt: skip
+    depth,
+    limit,
+    on_floor,
+    area,
+    n_things,
+    parts,
+    smooth_mm,
+    intrinsics,
+    plane,
+    rotation,
+    behind_mm,
+    heights,
+    origin,
+    n_steps,
+    n_px,
+    moments,
+    distance,
+    n_blobs,
+    k,
+):
     """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's. Where n_things is 2,
     the batch has twice as many rows as there are frames, and the second half gets what comes next near.
 
@@ -118,16 +141,48 @@ def extract_one(
         if rank < n_near:
             slot = order[rank]
             blob = blobs[slot]
-            cut_crop(depth, limit, labels, slot, blob, blob[5] / blob[0], smooth_mm, intrinsics, plane, rotation,
-                     behind_mm, heights, origin, n_steps, moments, distance, row)  # fmt: skip
+            cut_crop(
+                depth,
+                limit,
+                labels,
+                slot,
+                blob,
+                blob[5] / blob[0],
+                smooth_mm,
+                intrinsics,
+                plane,
+                rotation,
+                behind_mm,
+                heights,
+                origin,
+                n_steps,
+                moments,
+                distance,
+                row,
+            )
             n_px[row] = int(blob[0])
 
 
 @njit(cache=True)
 def cut_crop(
-    depth, limit, labels, slot, blob, mean_depth, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
-    n_steps, moments, distance, k,
-):  # fmt: skip
+    depth,
+    limit,
+    labels,
+    slot,
+    blob,
+    mean_depth,
+    smooth_mm,
+    intrinsics,
+    plane,
+    rotation,
+    behind_mm,
+    heights,
+    origin,
+    n_steps,
+    moments,
+    distance,
+    k,
+):
     """The blob's height map, smoothed over about smooth_mm, and its moments, into row k; distance[k] moves to behind
     the animal where heights are measured along the optical axis.
     """
@@ -141,7 +196,9 @@ def cut_crop(
     n_steps[k] = step
     raw = np.empty((crop, crop), np.float32)
     view_plane = plane
-    if behind_mm > 0.0:  # first from far behind, for the blob's mean depth is that of all that hangs together
+    if (
+        behind_mm > 0.0
+    ):  # first from far behind, for the blob's mean depth is that of all that hangs together
         distance[k] = mean_depth + 8.0 * behind_mm
         view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
     segment.cut_heights(depth, limit, labels, slot, view_plane, distance[k], origin[k], step, raw)
@@ -152,28 +209,85 @@ def cut_crop(
     mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
     segment.smooth_heights(raw, radius, heights[k])
-    segment.blob_moments(heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k])
+    segment.blob_moments(
+        heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k]
+    )
     if behind_mm > 0.0:
-        moments[k, 8] = segment.back_slope(heights[k], origin[k], step, intrinsics, distance[k], moments[k])
+        moments[k, 8] = segment.back_slope(
+            heights[k], origin[k], step, intrinsics, distance[k], moments[k]
+        )
 
 
 @njit(cache=True, parallel=True, nogil=True)
 def extract_all(
-    depths, limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
-    n_steps, n_px, moments, distance, n_blobs,
-):  # fmt: skip
+    depths,
+    limit,
+    on_floor,
+    area,
+    n_things,
+    parts,
+    smooth_mm,
+    intrinsics,
+    plane,
+    rotation,
+    behind_mm,
+    heights,
+    origin,
+    n_steps,
+    n_px,
+    moments,
+    distance,
+    n_blobs,
+):
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], limit, on_floor, area, n_things, parts, smooth_mm, intrinsics, plane, rotation,
-                    behind_mm, heights, origin, n_steps, n_px, moments, distance, n_blobs, k)  # fmt: skip
+        extract_one(
+            depths[k],
+            limit,
+            on_floor,
+            area,
+            n_things,
+            parts,
+            smooth_mm,
+            intrinsics,
+            plane,
+            rotation,
+            behind_mm,
+            heights,
+            origin,
+            n_steps,
+            n_px,
+            moments,
+            distance,
+            n_blobs,
+            k,
+        )
 
 
 @njit(cache=True, parallel=True, nogil=True)
 def extract_windows(
-    depths, background, margin, area, n_things, smooth_mm, intrinsics, plane, rotation, behind_mm, heights, origin,
-    n_steps, n_px, moments, distance, n_blobs,
-):  # fmt: skip
+    depths,
+    background,
+    margin,
+    area,
+    n_things,
+    smooth_mm,
+    intrinsics,
+    plane,
+    rotation,
+    behind_mm,
+    heights,
+    origin,
+    n_steps,
+    n_px,
+    moments,
+    distance,
+    n_blobs,
+):
     for k in prange(depths.shape[0]):
-        limit, everywhere = np.empty(depths.shape[1:], np.float32), np.ones(depths.shape[1:], np.bool_)
+        limit, everywhere = (
+            np.empty(depths.shape[1:], np.float32),
+            np.ones(depths.shape[1:], np.bool_),
+        )
         for v in range(limit.shape[0]):
             for u in range(limit.shape[1]):
                 behind = float(background[k, v, u])
@@ -181,6 +295,24 @@ def extract_windows(
                     inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
                     behind = 1.0 / inverse if inverse > 1e-6 else 0.0
                 limit[v, u] = max(behind - margin[k], 0.0)
-        extract_one(depths[k], limit, everywhere, area[k], n_things, False, smooth_mm[k], intrinsics[k], plane[k],
-                    rotation[k], behind_mm[k], heights, origin, n_steps, n_px, moments, distance, n_blobs,
-                    k)  # fmt: skip
+        extract_one(
+            depths[k],
+            limit,
+            everywhere,
+            area[k],
+            n_things,
+            False,
+            smooth_mm[k],
+            intrinsics[k],
+            plane[k],
+            rotation[k],
+            behind_mm[k],
+            heights,
+            origin,
+            n_steps,
+            n_px,
+            moments,
+            distance,
+            n_blobs,
+            k,
+        )

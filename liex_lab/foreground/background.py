@@ -8,15 +8,22 @@ from numpy.typing import NDArray
 from liex_lab.foreground import _background_kernels as kernels
 from liex_lab.recordings.recording import Recording
 
-_MODE_SHARE, _MODE_MM = 0.012, 6.0  # readings this near to one another, of the depth or in mm, are one surface
+_MODE_SHARE, _MODE_MM = (
+    0.012,
+    6.0,
+)  # readings this near to one another, of the depth or in mm, are one surface
 _NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual depth
 _LENGTH_PX, _MAX_STRIDE = 64.0, 4  # an animal of this many pixels is looked at finely enough
 
 
 def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArray[np.float32]:
     """Every `stride`-th pixel of up to `n_frames` frames (n, H, W) mm spread evenly over the recording."""
-    chosen = np.unique(np.linspace(0, len(recording) - 1, min(n_frames, len(recording))).astype(int))
-    sample = np.empty((len(chosen), -(-recording.height // stride), -(-recording.width // stride)), np.float32)
+    chosen = np.unique(
+        np.linspace(0, len(recording) - 1, min(n_frames, len(recording))).astype(int)
+    )
+    sample = np.empty(
+        (len(chosen), -(-recording.height // stride), -(-recording.width // stride)), np.float32
+    )
     if len(chosen) == len(recording):  # in order, which every format reads fastest
         for frames in recording.chunks(32):
             for frame in frames:

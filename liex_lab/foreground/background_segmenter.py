@@ -25,7 +25,9 @@ Array = NDArray[np.float64]
 
 SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
 _AREA_SD, _VOLUME_SD = 0.25, 0.2  # of the logarithms, from posture to posture of one animal
-_TOUCH_SHARE = 0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
+_TOUCH_SHARE = (
+    0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
+)
 
 
 @dataclass(frozen=True)
@@ -70,9 +72,12 @@ class Scene(Cutter):
 
     @staticmethod
     def learn(
-        recording: Recording, spine_mm: tuple[float, float], n_frames: int = 96, min_height_mm: float = 7.0,
+        recording: Recording,
+        spine_mm: tuple[float, float],
+        n_frames: int = 96,
+        min_height_mm: float = 7.0,
         view: View = MOUSE_VIEW,
-    ) -> tuple[Scene, NDArray[np.float32]]:  # fmt: skip
+    ) -> tuple[Scene, NDArray[np.float32]]:
         """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was learned.
 
         The background of a pixel is the farthest depth that keeps coming back, which survives an animal that covers it
@@ -85,7 +90,11 @@ class Scene(Cutter):
         _check_background(sample, background)
         grid = recording.camera.every(stride)
         seen = find_floor(background, grid)
-        floor = seen if stride == 1 else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
+        floor = (
+            seen
+            if stride == 1
+            else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
+        )
         bare = seen.depth(grid.width, grid.height)
         on_floor = floor_region(background, bare)
         background = np.where((background == 0) & on_floor, bare, background)
@@ -98,8 +107,12 @@ class Scene(Cutter):
         scene = Scene(recording.camera, floor, background, limit, over, view=view, stride=stride)
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
-            bare_limit = np.where(on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit).astype(np.float32)
-            still = replace(scene, limit=bare_limit, background=np.where(on_floor, bare, background))
+            bare_limit = np.where(
+                on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit
+            ).astype(np.float32)
+            still = replace(
+                scene, limit=bare_limit, background=np.where(on_floor, bare, background)
+            )
             still_area, still_share = still.usual_area(sample, spine_mm)
             if still_share > share:
                 scene, area, share = still, still_area, still_share
@@ -115,7 +128,11 @@ class Scene(Cutter):
         return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
 
     def with_its_still_part(
-        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float, area: float
+        self,
+        sample: NDArray[np.float32],
+        spine_mm: tuple[float, float],
+        min_height_mm: float,
+        area: float,
     ) -> tuple[Scene, float]:
         """The scene with the floor put under an animal that has left a part of itself in the background.
 
@@ -142,37 +159,50 @@ class Scene(Cutter):
             if moving[:, near].any(axis=1).mean() < _TOUCH_SHARE:
                 continue
             floor = np.where(near & self.on_floor, bare, self.background)
-            limit = np.where(near & self.on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit)
+            limit = np.where(
+                near & self.on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit
+            )
             whole = replace(self, background=floor, limit=limit.astype(np.float32))
             whole_area, share = whole.usual_area(sample, spine_mm)
             if share >= 0.5 and whole_area > best_area:
                 best, best_area = whole, whole_area
         return best, best_area
 
-    def usual_area(self, depths: NDArray[np.float32], spine_mm: tuple[float, float]) -> tuple[float, float]:
+    def usual_area(
+        self, depths: NDArray[np.float32], spine_mm: tuple[float, float]
+    ) -> tuple[float, float]:
         """The area mm^2 that the most frames have a blob of, and the share of frames that do.
 
         One object of constant size is in (nearly) every frame, the animal; other things come and go or differ.
         """
         areas = np.zeros((len(depths), MAX_BLOBS))
         bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
-        kernels.blob_areas(depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas)
+        kernels.blob_areas(
+            depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas
+        )
         low, high = self.view.area[0] * spine_mm[0] ** 2, self.view.area[1] * spine_mm[1] ** 2
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
             return 0.0, 0.0
-        tried = candidates[np.linspace(0, len(candidates) - 1, min(200, len(candidates))).astype(int)]
+        tried = candidates[
+            np.linspace(0, len(candidates) - 1, min(200, len(candidates))).astype(int)
+        ]
         distance = np.abs(np.log(np.maximum(areas, 1e-9)[None] / tried[:, None, None])).min(axis=2)
         support = np.exp(-0.5 * (distance / 0.35) ** 2).sum(axis=1)
         best = tried[np.argmax(support)]
-        return float(best), float((distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean())
+        return float(best), float(
+            (distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean()
+        )
 
     def usual_volume(self, depths: NDArray[np.float32]) -> float:
         """The median volume mm^3 of the animal in the frames (n, H, W) mm in which nothing else has about its area."""
         volume, n_blobs = np.zeros(len(depths)), np.zeros(len(depths), np.int64)
         for start in range(0, len(depths), 16):
             crops = self.extract(depths[start : start + 16], 1.0)
-            volume[start : start + 16], n_blobs[start : start + 16] = crops.moments[:, 2], crops.n_blobs
+            volume[start : start + 16], n_blobs[start : start + 16] = (
+                crops.moments[:, 2],
+                crops.n_blobs,
+            )
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
 
@@ -181,16 +211,24 @@ class Scene(Cutter):
         camera, cut = self.camera.every(step), (slice(None, None, step), slice(None, None, step))
         floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
         return replace(
-            self, camera=camera, floor=floor, background=np.ascontiguousarray(self.background[cut]),
-            limit=np.ascontiguousarray(self.limit[cut]), on_floor=np.ascontiguousarray(self.on_floor[cut]),
-        )  # fmt: skip
+            self,
+            camera=camera,
+            floor=floor,
+            background=np.ascontiguousarray(self.background[cut]),
+            limit=np.ascontiguousarray(self.limit[cut]),
+            on_floor=np.ascontiguousarray(self.on_floor[cut]),
+        )
 
     def misfit(self, crops: Crops) -> Array:
         """How unlike the animal each crop (n) is in area and volume: the square of a number of standard deviations."""
         area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)
-        if self.view.frame != VIEWS[0]:  # what is below an animal that swims or is held up is not its own
+        if (
+            self.view.frame != VIEWS[0]
+        ):  # what is below an animal that swims or is held up is not its own
             return (np.log(area / self.area_mm2) / _AREA_SD) ** 2
-        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (np.log(volume / self.volume_mm3) / _VOLUME_SD) ** 2
+        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
+            np.log(volume / self.volume_mm3) / _VOLUME_SD
+        ) ** 2
 
     def view_rotation(self, camera_view: bool) -> Array:
         """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame."""
@@ -223,7 +261,12 @@ class Scene(Cutter):
         return looks
 
     def _extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool,
+        camera_view: bool,
+        n_things: int,
     ) -> Crops:
         """See `Cutter`: the blobs whose areas are nearest to the animal's own. depths: whole pictures, or a sample of
         them with the scene's own stride. camera_view: heights are measured from the view's behind_mm behind the
@@ -235,11 +278,25 @@ class Scene(Cutter):
         grid = self.grid
         with threads(parallel):
             kernels.extract_all(
-                depths, self.limit, self.on_floor, self.area_mm2, n_things, camera_view, self.view.smooth_mm * size,
-                np.array([grid.fx, grid.fy, grid.cx, grid.cy]), self._grid_floor.inverse_depth,
-                self.view_rotation(camera_view), self.view.behind_mm if camera_view else 0.0,
-                crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
-            )  # fmt: skip
+                depths,
+                self.limit,
+                self.on_floor,
+                self.area_mm2,
+                n_things,
+                camera_view,
+                self.view.smooth_mm * size,
+                np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
+                self._grid_floor.inverse_depth,
+                self.view_rotation(camera_view),
+                self.view.behind_mm if camera_view else 0.0,
+                crops.heights,
+                crops.origin,
+                crops.step,
+                crops.n_px,
+                crops.moments,
+                crops.distance,
+                crops.n_blobs,
+            )
         if self.stride > 1:  # told in pixels of the picture
             for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
                 values *= self.stride * factor

@@ -42,7 +42,10 @@ class NearestScene(Cutter):
 
     @staticmethod
     def learn(
-        recording: Recording, view: View, n_frames: int = 96, range_mm: tuple[float, float] = RANGE_MM
+        recording: Recording,
+        view: View,
+        n_frames: int = 96,
+        range_mm: tuple[float, float] = RANGE_MM,
     ) -> tuple[NearestScene, NDArray[np.float32]]:
         """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was learned."""
         sample = sample_frames(recording, n_frames)
@@ -56,13 +59,19 @@ class NearestScene(Cutter):
             )
         seen = crops.moments[crops.found]
         floor = Floor.from_plane(_FLAT, float(np.median(crops.distance[crops.found])), camera)
-        return replace(scene, floor=floor, area_mm2=float(np.median(seen[:, 1])),
-                       volume_mm3=float(np.median(seen[:, 2]))), sample  # fmt: skip
+        return replace(
+            scene,
+            floor=floor,
+            area_mm2=float(np.median(seen[:, 1])),
+            volume_mm3=float(np.median(seen[:, 2])),
+        ), sample
 
     def misfit(self, crops: Crops) -> Array:
         """How unlike the hand each crop (n) is in area and volume: the square of a number of standard deviations."""
         area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)
-        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (np.log(volume / self.volume_mm3) / _VOLUME_SD) ** 2
+        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
+            np.log(volume / self.volume_mm3) / _VOLUME_SD
+        ) ** 2
 
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""
@@ -78,24 +87,41 @@ class NearestScene(Cutter):
     def middles(self, crops: Crops, camera_view: bool = False) -> Array:
         """The middle (n, 3) mm of what each crop shows, in the arena frame."""
         T_camera_view = view_of(self.looks(crops, camera_view)).inverse()
-        middle = np.einsum("nij,nj->ni", T_camera_view.rotation, crops.centroid) + T_camera_view.translation
+        middle = (
+            np.einsum("nij,nj->ni", T_camera_view.rotation, crops.centroid)
+            + T_camera_view.translation
+        )
         return self.floor.T_arena_camera @ middle
 
     def _extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool,
+        camera_view: bool,
+        n_things: int,
     ) -> Crops:
         """See `Cutter`: the nearest things of a hand's size. Heights are measured along the line of sight through the
         middle of the crop, from behind_mm (at home size) behind the hand's middle; camera_view: along the optical axis.
         """
         n = len(depths)
         with threads(parallel):
-            return cut_nearest(depths, self._intrinsics(n), np.full(n, size), self.view, (self.near_mm, self.far_mm),
-                               camera_view, n_things)  # fmt: skip
+            return cut_nearest(
+                depths,
+                self._intrinsics(n),
+                np.full(n, size),
+                self.view,
+                (self.near_mm, self.far_mm),
+                camera_view,
+                n_things,
+            )
 
     def every(self, step: int) -> NearestScene:
         """The same with every `step`-th pixel along rows and columns."""
         camera = self.camera.every(step)
-        return replace(self, camera=camera, floor=Floor.from_plane(_FLAT, self.floor.distance_mm, camera))
+        return replace(
+            self, camera=camera, floor=Floor.from_plane(_FLAT, self.floor.distance_mm, camera)
+        )
 
     def _intrinsics(self, n: int) -> Array:
         c = self.camera
@@ -115,20 +141,31 @@ class NearestWindows:
     origin: Array
     view: View
 
-    def extract(self, size: Array, camera_view: bool = False, n_things: int = 1) -> tuple[Crops, Array]:
+    def extract(
+        self, size: Array, camera_view: bool = False, n_things: int = 1
+    ) -> tuple[Crops, Array]:
         """The hands and their looks (n, 17) in pixels of the windows; see `NearestScene`. n_things: 2 gives as many
         rows again, of what may be a hand as well.
         """
         intrinsics = self.intrinsics.copy()
-        intrinsics[:, 2:] -= self.origin  # a window is the picture of a camera whose centre is shifted
-        crops = cut_nearest(self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, n_things)
+        intrinsics[:, 2:] -= (
+            self.origin
+        )  # a window is the picture of a camera whose centre is shifted
+        crops = cut_nearest(
+            self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, n_things
+        )
         return crops, looks_of(crops, np.tile(intrinsics, (n_things, 1)), camera_view)
 
 
 def cut_nearest(
-    depths: NDArray[np.float32] | NDArray[np.uint16], intrinsics: Array, size: Array, view: View,
-    range_mm: tuple[float, float], camera_view: bool, n_things: int,
-) -> Crops:  # fmt: skip
+    depths: NDArray[np.float32] | NDArray[np.uint16],
+    intrinsics: Array,
+    size: Array,
+    view: View,
+    range_mm: tuple[float, float],
+    camera_view: bool,
+    n_things: int,
+) -> Crops:
     """Height maps of the hands in pictures (n, H, W) mm; intrinsics (n, 4), size (n,). n_things: 2 gives as many rows
     again, of what may be a hand as well.
 
@@ -136,16 +173,31 @@ def cut_nearest(
     """
     crops = Crops.blank(n_things * len(depths), 1000.0)
     kernels.extract_all(
-        depths, *range_mm, n_things, size, size * view.behind_mm, size * view.smooth_mm, intrinsics, camera_view,
-        crops.heights, crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
-    )  # fmt: skip
+        depths,
+        *range_mm,
+        n_things,
+        size,
+        size * view.behind_mm,
+        size * view.smooth_mm,
+        intrinsics,
+        camera_view,
+        crops.heights,
+        crops.origin,
+        crops.step,
+        crops.n_px,
+        crops.moments,
+        crops.distance,
+        crops.n_blobs,
+    )
     return crops
 
 
 def looks_of(crops: Crops, intrinsics: Array, camera_view: bool) -> Array:
     """How each height map was cut (n, 17), for intrinsics (n, 4)."""
     looks = np.empty((len(crops.step), 17))
-    kernels.fill_looks(intrinsics, crops.origin, crops.step, crops.distance, CROP, camera_view, looks)
+    kernels.fill_looks(
+        intrinsics, crops.origin, crops.step, crops.distance, CROP, camera_view, looks
+    )
     return looks
 
 

@@ -47,14 +47,24 @@ class Crops:
     def blank(n: int, distance_mm: Array | float) -> Crops:
         """A batch in which nothing is found yet."""
         return Crops(
-            np.zeros((n, CROP, CROP), np.int16), np.zeros((n, 2), np.int32), np.ones(n, np.int32),
-            np.zeros(n, np.int64), np.zeros((n, N_MOMENTS)), np.full(n, distance_mm), np.zeros(n, np.int64),
-        )  # fmt: skip
+            np.zeros((n, CROP, CROP), np.int16),
+            np.zeros((n, 2), np.int32),
+            np.ones(n, np.int32),
+            np.zeros(n, np.int64),
+            np.zeros((n, N_MOMENTS)),
+            np.full(n, distance_mm),
+            np.zeros(n, np.int64),
+        )
 
     @staticmethod
     def join(parts: Sequence[Crops]) -> Crops:
         """Several batches as one."""
-        return Crops(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Crops)))
+        return Crops(
+            *(
+                np.concatenate([getattr(part, field.name) for part in parts])
+                for field in fields(Crops)
+            )
+        )
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Crops:
         """Some crops out of a batch."""
@@ -93,12 +103,20 @@ class Foreground(Protocol):
         """The animal's usual area seen by the camera."""
 
     def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool = True,
+        camera_view: bool = False,
     ) -> Crops:
         """The animal of each frame (n, H, W) mm."""
 
     def extract_both(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool = True,
+        camera_view: bool = False,
     ) -> tuple[Crops, Crops]:
         """The animal of each frame (n, H, W) mm, and what else may be it, found where n_blobs is more than one."""
 
@@ -122,7 +140,11 @@ class Cutter(ABC):
     """What cuts the animal out of pictures, and what else may be it in the same pass; the part that scenes share."""
 
     def extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool = True,
+        camera_view: bool = False,
     ) -> Crops:
         """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home length. camera_view:
         heights are measured along the optical axis.
@@ -130,7 +152,11 @@ class Cutter(ABC):
         return self._extract(depths, size, parallel, camera_view, 1)
 
     def extract_both(
-        self, depths: NDArray[np.float32], size: float, parallel: bool = True, camera_view: bool = False
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool = True,
+        camera_view: bool = False,
     ) -> tuple[Crops, Crops]:
         """`extract`, and the next thing that may be the animal after all."""
         crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
@@ -138,7 +164,12 @@ class Cutter(ABC):
 
     @abstractmethod
     def _extract(
-        self, depths: NDArray[np.float32], size: float, parallel: bool, camera_view: bool, n_things: int
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool,
+        camera_view: bool,
+        n_things: int,
     ) -> Crops:
         """The rows (n) of the most likely things, and then (n_things 2) those of the next."""
 
@@ -192,16 +223,36 @@ class Windows:
         margin = np.broadcast_to(np.asarray(min_height_mm, np.float32), (n,)).copy()
         rotation, of_whom = np.empty((n, 3, 3)), np.hstack([self.inverse_depth, self.intrinsics])
         for k in range(n):
-            if not k or (of_whom[k] != of_whom[k - 1]).any():  # many in a row are often before one camera
+            if (
+                not k or (of_whom[k] != of_whom[k - 1]).any()
+            ):  # many in a row are often before one camera
                 floor = self.floor(k)
             distance[k] = floor.distance_mm
-            rotation[k] = np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
+            rotation[k] = (
+                np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
+            )
         crops = Crops.blank(n_things * n, np.tile(distance, n_things))
         kernels.extract_windows(
-            self.depth, self.background, margin, area_mm2, n_things, self.view.smooth_mm * size,
-            intrinsics, plane, rotation, np.full(n, self.view.behind_mm if camera_view else 0.0), crops.heights,
-            crops.origin, crops.step, crops.n_px, crops.moments, crops.distance, crops.n_blobs,
-        )  # fmt: skip
+            self.depth,
+            self.background,
+            margin,
+            area_mm2,
+            n_things,
+            self.view.smooth_mm * size,
+            intrinsics,
+            plane,
+            rotation,
+            np.full(n, self.view.behind_mm if camera_view else 0.0),
+            crops.heights,
+            crops.origin,
+            crops.step,
+            crops.n_px,
+            crops.moments,
+            crops.distance,
+            crops.n_blobs,
+        )
         cut = np.tile(np.concatenate([intrinsics, rotation.reshape(n, 9)], axis=1), (n_things, 1))
-        looks = np.concatenate([cut, crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1)
+        looks = np.concatenate(
+            [cut, crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1
+        )
         return crops, looks

@@ -59,7 +59,9 @@ def response(heights, inverse_size, views, scalars, word0, word1, word3):
     first = probe(heights, view, byte(word0, 0), byte(word0, 1), byte(word0, 2)) * inverse_size
     if kind == ONE_PROBE:
         return first - view[8]
-    return first - probe(heights, view, byte(word0, 3), byte(word1, 0), byte(word1, 1)) * inverse_size
+    return (
+        first - probe(heights, view, byte(word0, 3), byte(word1, 0), byte(word1, 1)) * inverse_size
+    )
 
 
 @njit(cache=True, inline="always")
@@ -68,7 +70,9 @@ def descend(nodes, root, heights, inverse_size, views, scalars):
     at = root
     child = nodes[at, 2]
     while child >= 0:
-        value = response(heights, inverse_size, views, scalars, nodes[at, 0], nodes[at, 1], nodes[at, 3])
+        value = response(
+            heights, inverse_size, views, scalars, nodes[at, 0], nodes[at, 1], nodes[at, 3]
+        )
         at = child + (value >= (nodes[at, 1] >> 16))
         child = nodes[at, 2]
     return -child - 1
@@ -83,7 +87,11 @@ def pack_offsets(u, v, threshold):
         | ((np.int32(u[2]) & 0xFF) << 16)
         | ((np.int32(v[0]) & 0xFF) << 24)
     )
-    word1 = (np.int32(v[1]) & 0xFF) | ((np.int32(v[2]) & 0xFF) << 8) | ((np.int32(threshold) & 0xFFFF) << 16)
+    word1 = (
+        (np.int32(v[1]) & 0xFF)
+        | ((np.int32(v[2]) & 0xFF) << 8)
+        | ((np.int32(threshold) & 0xFFFF) << 16)
+    )
     return np.int32(word0), np.int32(word1)
 
 

@@ -49,7 +49,9 @@ class _Text:
         """A scalar in all lanes of %name."""
         vector = _INTS if type_ == "i32" else _FLOATS
         self(f"%{name}.one = insertelement {vector} undef, {type_} {value}, i32 0")
-        self(f"%{name} = shufflevector {vector} %{name}.one, {vector} undef, <{LANES} x i32> zeroinitializer")
+        self(
+            f"%{name} = shufflevector {vector} %{name}.one, {vector} undef, <{LANES} x i32> zeroinitializer"
+        )
 
     def joined(self, names: list[str], type_: str, width: int) -> list[str]:
         """The rows %names of `width` elements each, joined two by two until rows are LANES or more long."""
@@ -57,8 +59,10 @@ class _Text:
             pairs = [f"{names[i]}.{width}" for i in range(0, len(names), 2)]
             for i, pair in enumerate(pairs):
                 first, second = names[2 * i], names[2 * i + 1]
-                self(f"%{pair} = shufflevector <{width} x {type_}> %{first}, <{width} x {type_}> %{second}, "
-                     f"{_mask(list(range(2 * width)))}")  # fmt: skip
+                self(
+                    f"%{pair} = shufflevector <{width} x {type_}> %{first}, <{width} x {type_}> %{second}, "
+                    f"{_mask(list(range(2 * width)))}"
+                )
             names, width = pairs, 2 * width
         return names
 
@@ -69,8 +73,10 @@ class _Text:
         for i in range(0, len(rows), 2):
             part = f"{name}.p{i}"
             picked = [width * r + index for r in range(each)]
-            self(f"%{part} = shufflevector <{LANES} x {type_}> %{rows[i]}, <{LANES} x {type_}> %{rows[i + 1]}, "
-                 f"{_mask(picked + [LANES + p for p in picked])}")  # fmt: skip
+            self(
+                f"%{part} = shufflevector <{LANES} x {type_}> %{rows[i]}, <{LANES} x {type_}> %{rows[i + 1]}, "
+                f"{_mask(picked + [LANES + p for p in picked])}"
+            )
             parts.append(part)
         last = self.joined(parts, type_, 2 * each)[0]
         self(f"%{name} = bitcast <{LANES} x {type_}> %{last} to <{LANES} x {type_}>")
@@ -92,9 +98,13 @@ class _Text:
                 self(f"%{name}.{axis}.s{i} = fadd {_FLOATS} %{total}, %{name}.{axis}.m{i}")
                 total = f"{name}.{axis}.s{i}"
             self(f"%{name}.{axis}.int = fptosi {_FLOATS} %{total} to {_INTS}")
-            self(f"%{name}.{axis}.low = call {_INTS} @llvm.smax.v{LANES}i32({_INTS} %{name}.{axis}.int, "
-                 f"{_INTS} zeroinitializer)")  # fmt: skip
-            self(f"%{name}.{axis} = call {_INTS} @llvm.smin.v{LANES}i32({_INTS} %{name}.{axis}.low, {_INTS} %limit)")
+            self(
+                f"%{name}.{axis}.low = call {_INTS} @llvm.smax.v{LANES}i32({_INTS} %{name}.{axis}.int, "
+                f"{_INTS} zeroinitializer)"
+            )
+            self(
+                f"%{name}.{axis} = call {_INTS} @llvm.smin.v{LANES}i32({_INTS} %{name}.{axis}.low, {_INTS} %limit)"
+            )
         self(f"%{name}.line = mul {_INTS} %{name}.row, %sides")
         self(f"%{name}.in = add {_INTS} %{name}.line, %{name}.column")
         self(f"%{name} = add {_INTS} %{name}.in, %map")
@@ -107,7 +117,9 @@ class _Text:
             self(f"%{name}.w{k} = zext i32 %{name}.i{k} to i64")
             self(f"%{name}.a{k} = getelementptr i16, ptr %pixels, i64 %{name}.w{k}")
             self(f"%{name}.v{k} = load i16, ptr %{name}.a{k}, align 2")
-            self(f"%{name}.r{k} = insertelement <{LANES} x i16> {before}, i16 %{name}.v{k}, i32 {k}")
+            self(
+                f"%{name}.r{k} = insertelement <{LANES} x i16> {before}, i16 %{name}.v{k}, i32 {k}"
+            )
             before = f"%{name}.r{k}"
         self(f"%{name}.int = sext <{LANES} x i16> {before} to {_INTS}")
         self(f"%{name} = sitofp {_INTS} %{name}.int to {_FLOATS}")
@@ -169,7 +181,11 @@ def llvm_text(name: str, several: bool) -> str:
     text.spread("sides", "i32", "%side")
     text("%last = sub i32 %side, 1")
     text.spread("limit", "i32", "%last")
-    for vector, pointer, type_ in (("map", "base", _INTS), ("own", "scalar_base", _INTS), ("inv", "inverse", _FLOATS)):
+    for vector, pointer, type_ in (
+        ("map", "base", _INTS),
+        ("own", "scalar_base", _INTS),
+        ("inv", "inverse", _FLOATS),
+    ):
         text(f"%{vector}.p = getelementptr i32, ptr %{pointer}, i64 %first")
         text(f"%{vector} = load {type_}, ptr %{vector}.p, align 4")
     if not several:
@@ -186,7 +202,14 @@ def llvm_text(name: str, several: bool) -> str:
     if several:
         _load_views(text)
         _middle(text)
-    for offset, word, byte in (("u0", 0, 0), ("u1", 0, 1), ("u2", 0, 2), ("v0", 0, 3), ("v1", 1, 0), ("v2", 1, 1)):
+    for offset, word, byte in (
+        ("u0", 0, 0),
+        ("u1", 0, 1),
+        ("u2", 0, 2),
+        ("v0", 0, 3),
+        ("v1", 1, 0),
+        ("v2", 1, 1),
+    ):
         text.signed_byte(offset, f"word{word}", byte)
     text.pixel_of("under_u", ["u0", "u1", "u2"])
     text.pixel_of("under_v", ["v0", "v1", "v2"])
@@ -213,15 +236,21 @@ def llvm_text(name: str, several: bool) -> str:
     text("%out = getelementptr i32, ptr %leaf, i64 %first")
     text(f"store {_INTS} %leaves, ptr %out, align 4")
     text("ret void")
-    pointers = ", ".join(f"ptr noalias %{name}" for name in ("pixels", "base", "scalar_base", "inverse", "views"))
-    return "\n".join([
-        f"declare {_INTS} @llvm.smin.v{LANES}i32({_INTS}, {_INTS})",
-        f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
-        f"declare i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS})",
-        f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 %stride, i32 %side, "
-        "ptr noalias %leaf, i64 %first) noinline {",
-        "entry:", *text.lines, "}",
-    ])  # fmt: skip
+    pointers = ", ".join(
+        f"ptr noalias %{name}" for name in ("pixels", "base", "scalar_base", "inverse", "views")
+    )
+    return "\n".join(
+        [
+            f"declare {_INTS} @llvm.smin.v{LANES}i32({_INTS}, {_INTS})",
+            f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
+            f"declare i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS})",
+            f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 %stride, i32 %side, "
+            "ptr noalias %leaf, i64 %first) noinline {",
+            "entry:",
+            *text.lines,
+            "}",
+        ]
+    )
 
 
 def _emit(name: str, several: bool) -> Any:
@@ -234,13 +263,21 @@ def _emit(name: str, several: bool) -> Any:
         context.active_code_library.add_linking_library(library)
         pointer, i32, i64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
         wanted = [pointer, i32, *[pointer] * 5, i64, i32, pointer, i64]
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(ir.VoidType(), wanted), name)
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), wanted), name
+        )
         values = []
         for value, kind, want in zip(args, signature.args, wanted, strict=True):
             if isinstance(kind, types.Array):
-                value = builder.bitcast(context.make_array(kind)(context, builder, value).data, pointer)
+                value = builder.bitcast(
+                    context.make_array(kind)(context, builder, value).data, pointer
+                )
             elif value.type.width != want.width:
-                value = builder.trunc(value, want) if value.type.width > want.width else builder.sext(value, want)
+                value = (
+                    builder.trunc(value, want)
+                    if value.type.width > want.width
+                    else builder.sext(value, want)
+                )
             values.append(value)
         builder.call(function, values)
         return context.get_dummy_value()
@@ -250,9 +287,19 @@ def _emit(name: str, several: bool) -> Any:
 
 @intrinsic
 def walk_one_view(
-    typing: Any, nodes: Any, root: Any, pixels: Any, base: Any, scalar_base: Any, inverse: Any, views: Any, stride: Any,
-    side: Any, leaf: Any, first: Any,
-) -> Any:  # fmt: skip
+    typing: Any,
+    nodes: Any,
+    root: Any,
+    pixels: Any,
+    base: Any,
+    scalar_base: Any,
+    inverse: Any,
+    views: Any,
+    stride: Any,
+    side: Any,
+    leaf: Any,
+    first: Any,
+) -> Any:
     """Leaves of lanes first .. first + LANES - 1 in the tree at `root`, into leaf (n,) int32.
 
     nodes (N, 4) int32; inverse (n,) float32 home size over the animal's; views (9, n) float32 and stride n; side of the
@@ -264,9 +311,19 @@ def walk_one_view(
 
 @intrinsic
 def walk_views(
-    typing: Any, nodes: Any, root: Any, pixels: Any, base: Any, scalar_base: Any, inverse: Any, views: Any, stride: Any,
-    side: Any, leaf: Any, first: Any,
-) -> Any:  # fmt: skip
+    typing: Any,
+    nodes: Any,
+    root: Any,
+    pixels: Any,
+    base: Any,
+    scalar_base: Any,
+    inverse: Any,
+    views: Any,
+    stride: Any,
+    side: Any,
+    leaf: Any,
+    first: Any,
+) -> Any:
     """`walk_one_view` for nodes that choose among the views (n, V, 9) of a sample; stride is 9 V."""
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_views", True)

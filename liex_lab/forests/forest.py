@@ -29,7 +29,9 @@ class Forest:
     @staticmethod
     def pack(trees: list[tuple[NDArray[np.int32], NDArray[np.float32]]]) -> Forest:
         """One forest from trees given as (nodes, leaves), each with its root at 0."""
-        return Forest.join([Forest(nodes, np.zeros(1, np.int32), leaves) for nodes, leaves in trees])
+        return Forest.join(
+            [Forest(nodes, np.zeros(1, np.int32), leaves) for nodes, leaves in trees]
+        )
 
     @staticmethod
     def join(forests: list[Forest]) -> Forest:
@@ -46,7 +48,9 @@ class Forest:
             roots.append(forest.roots + n_nodes)
             n_nodes += len(forest.nodes)
             n_leaves += len(forest.leaves)
-        return Forest(np.concatenate(nodes), np.concatenate(roots).astype(np.int32), np.concatenate(leaves))
+        return Forest(
+            np.concatenate(nodes), np.concatenate(roots).astype(np.int32), np.concatenate(leaves)
+        )
 
 
 @dataclass(frozen=True)
@@ -69,17 +73,26 @@ class Samples:
     def __getitem__(self, index: NDArray[np.int64]) -> Samples:
         """Some of the samples, on the same maps."""
         return Samples(
-            self.heights, self.image[index], self.inverse_size[index], self.views[index], self.scalars[index]
+            self.heights,
+            self.image[index],
+            self.inverse_size[index],
+            self.views[index],
+            self.scalars[index],
         )
 
     @staticmethod
     def join(parts: list[Samples]) -> Samples:
         """The samples of several sets on the same maps, one after the other."""
         fields = ("image", "inverse_size", "views", "scalars")
-        return Samples(parts[0].heights, *(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
+        return Samples(
+            parts[0].heights,
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in fields),
+        )
 
 
-def predict(forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+def predict(
+    forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
     """Mean leaf value (n, D) of each sample.
 
     in_bag (T, n_images): trees that have seen a sample's image are left out, unless all have (METHOD lesson 6).
@@ -87,9 +100,17 @@ def predict(forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None =
     out = np.zeros((len(samples), forest.leaves.shape[1]), np.float32)
     bag = np.zeros((forest.n_trees, 1), np.bool_) if in_bag is None else in_bag
     _predict(
-        forest.nodes, forest.roots, forest.leaves, samples.heights, samples.image, samples.inverse_size, samples.views,
-        samples.scalars, bag, out,
-    )  # fmt: skip
+        forest.nodes,
+        forest.roots,
+        forest.leaves,
+        samples.heights,
+        samples.image,
+        samples.inverse_size,
+        samples.views,
+        samples.scalars,
+        bag,
+        out,
+    )
     return out
 
 
@@ -97,9 +118,16 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
     """Every tree's own leaf value (n, T, D) of each sample."""
     out = np.empty((len(samples), forest.n_trees, forest.leaves.shape[1]), np.float32)
     _predict_each(
-        forest.nodes, forest.roots, forest.leaves, samples.heights, samples.image, samples.inverse_size, samples.views,
-        samples.scalars, out,
-    )  # fmt: skip
+        forest.nodes,
+        forest.roots,
+        forest.leaves,
+        samples.heights,
+        samples.image,
+        samples.inverse_size,
+        samples.views,
+        samples.scalars,
+        out,
+    )
     return out
 
 
@@ -107,7 +135,9 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
 def _predict_each(nodes, roots, leaves, heights, image, inverse_size, views, scalars, out):
     for s in prange(image.size):
         for t in range(roots.size):
-            leaf = descend(nodes, roots[t], heights[image[s]], inverse_size[s], views[s], scalars[s])
+            leaf = descend(
+                nodes, roots[t], heights[image[s]], inverse_size[s], views[s], scalars[s]
+            )
             out[s, t] = leaves[leaf]
 
 

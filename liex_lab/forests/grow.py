@@ -21,7 +21,11 @@ from liex_lab.forests.forest import Forest, Samples, predict
 
 _N_THRESHOLDS = 20
 _TREES_A_STAGE = 2
-_N_FIRST, _N_SECOND, _N_KEPT = 96, 1500, 12  # samples of the first and second look at a test; tests that get the second
+_N_FIRST, _N_SECOND, _N_KEPT = (
+    96,
+    1500,
+    12,
+)  # samples of the first and second look at a test; tests that get the second
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,11 @@ class GrowthPlan:
 
 
 def grow_forest(
-    samples: Samples, labels: NDArray[np.float32], keep: NDArray[np.bool_], plan: GrowthPlan, rng: np.random.Generator
+    samples: Samples,
+    labels: NDArray[np.float32],
+    keep: NDArray[np.bool_],
+    plan: GrowthPlan,
+    rng: np.random.Generator,
 ) -> tuple[Forest, NDArray[np.bool_]]:
     """A forest for labels (n, D) of the kept samples, and which images each tree saw (T, n_images).
 
@@ -53,7 +61,10 @@ def grow_forest(
     in_bag = np.zeros((plan.n_trees, n_images), np.bool_)
     for t in range(plan.n_trees):
         in_bag[t, rng.permutation(n_images)[: max(1, round(plan.bag_share * n_images))]] = True
-    members = [np.flatnonzero(keep & in_bag[t][samples.image]).astype(np.int32) for t in range(plan.n_trees)]
+    members = [
+        np.flatnonzero(keep & in_bag[t][samples.image]).astype(np.int32)
+        for t in range(plan.n_trees)
+    ]
     starts = np.concatenate([[0], np.cumsum([len(m) for m in members])]).astype(np.int64)
     order = np.concatenate(members)
     capacity = max(1, max(len(m) for m in members) // max(1, plan.min_leaf)) + 1
@@ -62,16 +73,35 @@ def grow_forest(
     counts = np.zeros((plan.n_trees, 2), np.int64)
     seeds = rng.integers(0, 2**63, plan.n_trees, dtype=np.uint64)
     _grow_all(
-        samples.heights, samples.image, samples.inverse_size, samples.views, samples.scalars, labels, order, starts,
-        seeds, plan.max_depth, plan.min_leaf, plan.n_tests, plan.one_probe_share, plan.scalar_share, plan.depth_share,
-        nodes, leaves, counts,
-    )  # fmt: skip
+        samples.heights,
+        samples.image,
+        samples.inverse_size,
+        samples.views,
+        samples.scalars,
+        labels,
+        order,
+        starts,
+        seeds,
+        plan.max_depth,
+        plan.min_leaf,
+        plan.n_tests,
+        plan.one_probe_share,
+        plan.scalar_share,
+        plan.depth_share,
+        nodes,
+        leaves,
+        counts,
+    )
     trees = [(nodes[t, : counts[t, 0]], leaves[t, : counts[t, 1]]) for t in range(plan.n_trees)]
     return Forest.pack(trees), in_bag
 
 
 def boost_forest(
-    samples: Samples, labels: NDArray[np.float32], plan: GrowthPlan, shrinkage: float, rng: np.random.Generator
+    samples: Samples,
+    labels: NDArray[np.float32],
+    plan: GrowthPlan,
+    shrinkage: float,
+    rng: np.random.Generator,
 ) -> Forest:
     """A forest whose trees correct one another: each pair is grown on what the pairs before it left of labels (n, D).
 
@@ -84,22 +114,57 @@ def boost_forest(
     n_stages = max(1, plan.n_trees // _TREES_A_STAGE)
     trees = []
     for _ in range(n_stages):
-        stage, _ = grow_forest(samples, left, everything, replace(plan, n_trees=_TREES_A_STAGE), rng)
+        stage, _ = grow_forest(
+            samples, left, everything, replace(plan, n_trees=_TREES_A_STAGE), rng
+        )
         left -= shrinkage * predict(stage, samples)
-        trees.append(Forest(stage.nodes, stage.roots, stage.leaves * np.float32(shrinkage * n_stages) + mean))
+        trees.append(
+            Forest(stage.nodes, stage.roots, stage.leaves * np.float32(shrinkage * n_stages) + mean)
+        )
     return Forest.join(trees)
 
 
 @njit(cache=True, parallel=True)
 def _grow_all(
-    heights, image, inverse_size, views, scalars, labels, order, starts, seeds, max_depth, min_leaf, n_tests,
-    one_probe_share, scalar_share, depth_share, nodes, leaves, counts,
-):  # fmt: skip
+    heights,
+    image,
+    inverse_size,
+    views,
+    scalars,
+    labels,
+    order,
+    starts,
+    seeds,
+    max_depth,
+    min_leaf,
+    n_tests,
+    one_probe_share,
+    scalar_share,
+    depth_share,
+    nodes,
+    leaves,
+    counts,
+):
     for t in prange(seeds.size):
         _grow_tree(
-            heights, image, inverse_size, views, scalars, labels, order[starts[t] : starts[t + 1]], seeds[t],
-            max_depth, min_leaf, n_tests, one_probe_share, scalar_share, depth_share, nodes[t], leaves[t], counts[t],
-        )  # fmt: skip
+            heights,
+            image,
+            inverse_size,
+            views,
+            scalars,
+            labels,
+            order[starts[t] : starts[t + 1]],
+            seeds[t],
+            max_depth,
+            min_leaf,
+            n_tests,
+            one_probe_share,
+            scalar_share,
+            depth_share,
+            nodes[t],
+            leaves[t],
+            counts[t],
+        )
 
 
 @njit(cache=True)
@@ -166,14 +231,31 @@ def _look(heights, image, inverse_size, views, scalars, chosen, n, test, values)
     """Responses of samples `chosen` (n,) to a test into `values`."""
     for i in range(n):
         s = chosen[i]
-        values[i] = response(heights[image[s]], inverse_size[s], views[s], scalars[s], test[0], test[1], test[2])
+        values[i] = response(
+            heights[image[s]], inverse_size[s], views[s], scalars[s], test[0], test[1], test[2]
+        )
 
 
 @njit(cache=True)
 def _find_split(
-    heights, image, inverse_size, views, scalars, labels, members, state, min_leaf, n_tests, one_probe_share,
-    scalar_share, depth_share, chosen, values, sums, best,
-):  # fmt: skip
+    heights,
+    image,
+    inverse_size,
+    views,
+    scalars,
+    labels,
+    members,
+    state,
+    min_leaf,
+    n_tests,
+    one_probe_share,
+    scalar_share,
+    depth_share,
+    chosen,
+    values,
+    sums,
+    best,
+):
     """The test that a node keeps into best (4,): words 0, 1, 3 and the threshold. False when none separates it."""
     n = members.size
     n_tried = n_tests if n >= 128 else min(n_tests, max(20, n_tests * n // 128))
@@ -184,7 +266,15 @@ def _find_split(
     gains = np.empty(n_tried)
     result = np.empty(2)
     for k in range(n_tried):
-        _draw_test(state, views.shape[1], scalars.shape[1], one_probe_share, scalar_share, depth_share, tests[k])
+        _draw_test(
+            state,
+            views.shape[1],
+            scalars.shape[1],
+            one_probe_share,
+            scalar_share,
+            depth_share,
+            tests[k],
+        )
         _look(heights, image, inverse_size, views, scalars, chosen, n_first, tests[k], values)
         _best_threshold(values, n_first, chosen, labels, min_leaf / n, sums, result)
         gains[k] = -result[0]
@@ -212,7 +302,9 @@ def _part(heights, image, inverse_size, views, scalars, members, best):
     left, right = 0, members.size - 1
     while left <= right:
         s = members[left]
-        value = response(heights[image[s]], inverse_size[s], views[s], scalars[s], best[0], best[1], best[2])
+        value = response(
+            heights[image[s]], inverse_size[s], views[s], scalars[s], best[0], best[1], best[2]
+        )
         if value >= best[3]:
             members[left], members[right] = members[right], members[left]
             right -= 1
@@ -223,9 +315,24 @@ def _part(heights, image, inverse_size, views, scalars, members, best):
 
 @njit(cache=True)
 def _grow_tree(
-    heights, image, inverse_size, views, scalars, labels, members, seed, max_depth, min_leaf, n_tests,
-    one_probe_share, scalar_share, depth_share, nodes, leaves, counts,
-):  # fmt: skip
+    heights,
+    image,
+    inverse_size,
+    views,
+    scalars,
+    labels,
+    members,
+    seed,
+    max_depth,
+    min_leaf,
+    n_tests,
+    one_probe_share,
+    scalar_share,
+    depth_share,
+    nodes,
+    leaves,
+    counts,
+):
     """Grow one tree on `members` into nodes and leaves; counts (2,) gets how many of each there are."""
     state = np.empty(1, np.uint64)
     state[0] = seed
@@ -242,10 +349,29 @@ def _grow_tree(
         node, first, stop, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
         here = members[first:stop]
         middle = 0
-        if here.size >= 2 * min_leaf and depth < max_depth and _find_split(
-            heights, image, inverse_size, views, scalars, labels, here, state, min_leaf, n_tests, one_probe_share,
-            scalar_share, depth_share, chosen, values, sums, best,
-        ):  # fmt: skip
+        if (
+            here.size >= 2 * min_leaf
+            and depth < max_depth
+            and _find_split(
+                heights,
+                image,
+                inverse_size,
+                views,
+                scalars,
+                labels,
+                here,
+                state,
+                min_leaf,
+                n_tests,
+                one_probe_share,
+                scalar_share,
+                depth_share,
+                chosen,
+                values,
+                sums,
+                best,
+            )
+        ):
             middle = _part(heights, image, inverse_size, views, scalars, here, best)
             if middle < min_leaf or here.size - middle < min_leaf:
                 middle = 0

@@ -12,7 +12,9 @@ def brownian_steps(
     rng: np.random.Generator, covariance: ArrayLike, n_steps: int, *batch: int
 ) -> NDArray[np.float64]:
     """Tangent steps z_k ~ N(0, covariance) (*batch, n_steps, 6) for a covariance (6, 6) in rad and mm."""
-    return rng.multivariate_normal(np.zeros(6), np.asarray(covariance, float), size=(*batch, n_steps))
+    return rng.multivariate_normal(
+        np.zeros(6), np.asarray(covariance, float), size=(*batch, n_steps)
+    )
 
 
 def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) -> SE3:
@@ -25,10 +27,15 @@ def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) 
     """
     z, t = np.asarray(steps, float), np.atleast_1d(np.asarray(times, float))
     if not delta > 0 or t.min() < 0 or t.max() > len(z) * delta * (1 + 1e-12):
-        raise ValueError(f"times must lie within the path, 0 to {len(z) * delta} s, got {t.min()} to {t.max()} s")
+        raise ValueError(
+            f"times must lie within the path, 0 to {len(z) * delta} s, got {t.min()} to {t.max()} s"
+        )
     nodes = [start]
     for step in z:
         nodes.append(nodes[-1] @ SE3.exp(np.sqrt(delta) * step))
     before = np.minimum((t / delta).astype(int), len(z) - 1)
-    at_node = SE3(np.stack([nodes[k].rotation for k in before]), np.stack([nodes[k].translation for k in before]))
+    at_node = SE3(
+        np.stack([nodes[k].rotation for k in before]),
+        np.stack([nodes[k].translation for k in before]),
+    )
     return at_node @ SE3.exp(((t - before * delta) / np.sqrt(delta))[:, None] * z[before])

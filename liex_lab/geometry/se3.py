@@ -76,7 +76,10 @@ class SE3:
     def __matmul__(self, other: SE3 | ArrayLike) -> SE3 | Array:
         if isinstance(other, SE3):
             return SE3(self.rotation @ other.rotation, self @ other.translation)
-        return np.einsum("...ij,...j->...i", self.rotation, np.asarray(other, float)) + self.translation
+        return (
+            np.einsum("...ij,...j->...i", self.rotation, np.asarray(other, float))
+            + self.translation
+        )
 
     def geodesic(self, other: SE3, s: ArrayLike) -> SE3:
         """The curve from self (s = 0) to other (s = 1): rotation and translation each go straight (Lie-X section 3).

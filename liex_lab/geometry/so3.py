@@ -56,7 +56,9 @@ def quaternion(rotation: ArrayLike) -> Array:
     """
     r = np.asarray(rotation, float)
     d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
+    squares = np.stack(
+        [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1
+    )
     # row k: the quaternion times four times its component k
     rows = np.empty((*squares.shape, 4))
     for k in range(4):
@@ -104,7 +106,11 @@ def left_jacobian_inverse(omega: ArrayLike) -> Array:
     th2 = np.sum(w * w, axis=-1)[..., None, None]
     small = th2 < _SMALL_A
     half = 0.5 * np.sqrt(np.where(small, 1.0, th2))
-    c = np.where(small, 1.0 / 12.0 + th2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / np.where(small, 1, th2))
+    c = np.where(
+        small,
+        1.0 / 12.0 + th2 / 720.0,
+        (1.0 - half * np.cos(half) / np.sin(half)) / np.where(small, 1, th2),
+    )
     w_hat = hat(w)
     return np.eye(3) - 0.5 * w_hat + c * (w_hat @ w_hat)
 

@@ -17,7 +17,9 @@ Array = NDArray[np.float64]
 BROWN_CONRADY, KANNALA_BRANDT = "brown_conrady", "kannala_brandt"
 _N_COEFFICIENTS = {BROWN_CONRADY: 8, KANNALA_BRANDT: 4}
 _MODELS = {  # as OpenCV, ROS and Foxglove call them; an empty name is ROS's usual model
-    **dict.fromkeys(("", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv", "radtan"), BROWN_CONRADY),
+    **dict.fromkeys(
+        ("", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv", "radtan"), BROWN_CONRADY
+    ),
     **dict.fromkeys(("kannala_brandt", "equidistant", "fisheye", "opencv_fisheye"), KANNALA_BRANDT),
 }
 _WIDEST = 8.0  # tangent of the largest angle from the optical axis that is considered, 83 degrees
@@ -83,7 +85,9 @@ class Distortion:
             return np.asarray(angle * (1.0 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))))
         s = r * r
         below = 1.0 + s * (k[5] + s * (k[6] + s * k[7]))
-        return np.asarray(r * (1.0 + s * (k[0] + s * (k[1] + s * k[4]))) / np.where(below > 0, below, np.nan))
+        return np.asarray(
+            r * (1.0 + s * (k[0] + s * (k[1] + s * k[4]))) / np.where(below > 0, below, np.nan)
+        )
 
     def distort(self, xy: ArrayLike) -> Array:
         """Ideal rays (..., 2), z = 1 -> where the lens sends them (..., 2); NaN beyond `limit`."""
@@ -97,7 +101,10 @@ class Distortion:
         p1, p2 = self.coefficients[2:4]
         across = 2.0 * x * y
         return np.stack(
-            [x * ratio + p1 * across + p2 * (s + 2.0 * x * x), y * ratio + p1 * (s + 2.0 * y * y) + p2 * across],
+            [
+                x * ratio + p1 * across + p2 * (s + 2.0 * x * x),
+                y * ratio + p1 * (s + 2.0 * y * y) + p2 * across,
+            ],
             axis=-1,
         )
 
@@ -119,7 +126,10 @@ class Distortion:
         for _ in range(8):
             bent = self.distort(ideal)
             off = bent - seen
-            along_x, along_y = (self.distort(ideal + right) - bent) / 1e-6, (self.distort(ideal + down) - bent) / 1e-6
+            along_x, along_y = (
+                (self.distort(ideal + right) - bent) / 1e-6,
+                (self.distort(ideal + down) - bent) / 1e-6,
+            )
             determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
             move_x = (off[..., 0] * along_y[..., 1] - off[..., 1] * along_y[..., 0]) / determinant
             move_y = (along_x[..., 0] * off[..., 1] - along_x[..., 1] * off[..., 0]) / determinant
@@ -146,7 +156,9 @@ class Lens:
     distortion: Distortion | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+        if not (
+            self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
+        ):
             raise LiexError(
                 f"focal lengths are positive pixels, got fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}; "
                 "correct them in camera.toml or with --set camera.fx=... --set camera.fy=..."
@@ -180,7 +192,10 @@ class Camera(Lens):
         z = np.where(z > 0, z, np.nan)
         if self.distortion is None:
             return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
-        return self.distortion.distort(np.stack([x / z, y / z], axis=-1)) * [self.fx, self.fy] + [self.cx, self.cy]
+        return self.distortion.distort(np.stack([x / z, y / z], axis=-1)) * [self.fx, self.fy] + [
+            self.cx,
+            self.cy,
+        ]
 
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Array:
         """Pixels (..., 2) and their depth (...) mm -> points (..., 3) mm in the camera frame."""
@@ -206,13 +221,22 @@ class Camera(Lens):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json and camera.toml."""
-        numbers = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
-        return numbers if self.distortion is None else {**numbers, "distortion": self.distortion.to_dict()}
+        numbers = {
+            name: getattr(self, name)
+            for name in ("fx", "fy", "cx", "cy", "width", "height", "source")
+        }
+        return (
+            numbers
+            if self.distortion is None
+            else {**numbers, "distortion": self.distortion.to_dict()}
+        )
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Camera:
         """The camera that `to_dict` wrote; other keys are passed over."""
-        known = {name: numbers[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")}
+        known = {
+            name: numbers[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")
+        }
         bent = numbers.get("distortion")
         return Camera(**known, distortion=Distortion.of(**bent) if bent else None)
 
@@ -220,4 +244,6 @@ class Camera(Lens):
 KINECT_V2 = Camera(365.0, 365.0, 255.5, 211.5, 512, 424, source="typical Kinect v2")
 PRIMESENSE = Camera(575.8, 575.8, 319.5, 239.5, 640, 480, source="typical PrimeSense")
 RAYTRIX_R5 = Camera(2363.0, 2363.0, 511.5, 511.5, 1024, 1024, source="typical Raytrix R5")
-PRIMESENSE_QVGA = Camera(287.9, 287.9, 159.5, 119.5, 320, 240, source="typical PrimeSense at 320 x 240")
+PRIMESENSE_QVGA = Camera(
+    287.9, 287.9, 159.5, 119.5, 320, 240, source="typical PrimeSense at 320 x 240"
+)

@@ -50,7 +50,9 @@ class Water:
 
     def __post_init__(self) -> None:
         numbers = (self.height_mm, self.refractive_index, self.tilt_x_rad, self.tilt_y_rad)
-        possible = self.height_mm > 0 and self.refractive_index >= 1 and np.abs(numbers[2:]).max() < 1.2
+        possible = (
+            self.height_mm > 0 and self.refractive_index >= 1 and np.abs(numbers[2:]).max() < 1.2
+        )
         if not (possible and np.isfinite(numbers).all() and self.ranging in RANGINGS):
             raise LiexError(
                 f"a water surface lies a positive height_mm below the lens, with a refractive_index of at least 1, "
@@ -79,9 +81,12 @@ class Water:
         n = self.refractive_index
         way = self.law(np.zeros(2))[7:]
         return replace(
-            camera, fx=n * camera.fx, fy=n * camera.fy, cx=camera.cx - n * camera.fx * float(way[0] / way[2]),
+            camera,
+            fx=n * camera.fx,
+            fy=n * camera.fy,
+            cx=camera.cx - n * camera.fx * float(way[0] / way[2]),
             cy=camera.cy - n * camera.fy * float(way[1] / way[2]),
-        )  # fmt: skip
+        )
 
     def law(self, rays: ArrayLike) -> Array:
         """What refraction does to rays (..., 2), the x and y of (x, y, 1): `N_LAW` numbers for each (..., N_LAW).
@@ -102,7 +107,7 @@ class Water:
         way = ray / n + (cos_water - cos_air / n)[..., None] * down
         law = np.concatenate(
             [self._depth_law(ray, cos_air, cos_water), surface, way / cos_water[..., None]], axis=-1
-        )  # fmt: skip
+        )
         law[..., 3] = np.where(reaches, cos_air / (ray[..., 2] * h), 0.0)
         return law
 
@@ -113,13 +118,20 @@ class Water:
             return np.stack([zero, zero + 1.0 / (n * h), zero, zero], axis=-1)
         if self.ranging == "time_of_flight":
             return np.stack([zero, n * cos_air / (h * cos_water), zero, zero], axis=-1)
-        within = cos_air**3 / (n * cos_water**3)  # apparent over true depth, views displaced in the plane of incidence
+        within = cos_air**3 / (
+            n * cos_water**3
+        )  # apparent over true depth, views displaced in the plane of incidence
         across = cos_air / (n * cos_water)  # tan r / tan i
         weight_within, weight_across = self._weights(ray, cos_air)
-        return np.stack([
-            within * across / h**2, (within + across) / h, (weight_within * across + weight_across * within) / h**2,
-            zero,
-        ], axis=-1)  # fmt: skip
+        return np.stack(
+            [
+                within * across / h**2,
+                (within + across) / h,
+                (weight_within * across + weight_across * within) / h**2,
+                zero,
+            ],
+            axis=-1,
+        )
 
     def _weights(self, ray: Array, cos_air: Array) -> tuple[Array, Array]:
         """The parts (...) of the views' displacement within and across the plane of incidence of unit rays (..., 3).
@@ -127,13 +139,17 @@ class Water:
         They weigh the disparities: cos i / z' summed over both foci, z' being how far below the lens each lies.
         """
         side = np.cross(self.normal, ray)
-        straight_down = np.linalg.norm(side, axis=-1, keepdims=True) < 1e-9  # where both foci are one
+        straight_down = (
+            np.linalg.norm(side, axis=-1, keepdims=True) < 1e-9
+        )  # where both foci are one
         side = np.where(straight_down, np.cross([0.0, 1.0, 0.0], ray), side)
         side = side / np.linalg.norm(side, axis=-1, keepdims=True)
         along = np.cross(side, ray)
         axes = (0, 1) if self.ranging == "light_field" else (0,)
         within, across = np.zeros_like(cos_air), np.zeros_like(cos_air)
-        for k in axes:  # the disparity of a displacement along one picture axis is measured along that axis
+        for k in (
+            axes
+        ):  # the disparity of a displacement along one picture axis is measured along that axis
             slope = ray[..., k] / ray[..., 2]
             within += (along[..., k] - slope * along[..., 2]) * along[..., k]
             across += (side[..., k] - slope * side[..., 2]) * side[..., k]
@@ -148,8 +164,12 @@ class Water:
         wet = np.maximum(excess, 0.0)
         b = law[..., 1] - law[..., 2] * z
         below = 2.0 * wet / (b + np.sqrt(b * b + 4.0 * law[..., 0] * wet))
-        seeming = np.concatenate([xy * z[..., None], (z * np.ones(xy.shape[:-1]))[..., None]], axis=-1)
-        return np.where((excess > 0)[..., None], law[..., 4:7] + below[..., None] * law[..., 7:10], seeming)
+        seeming = np.concatenate(
+            [xy * z[..., None], (z * np.ones(xy.shape[:-1]))[..., None]], axis=-1
+        )
+        return np.where(
+            (excess > 0)[..., None], law[..., 4:7] + below[..., None] * law[..., 7:10], seeming
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json."""

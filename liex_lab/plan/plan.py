@@ -100,7 +100,9 @@ class Plan(Table):
         for setting in chosen:
             dotted, equals, text = (part.strip() for part in setting.partition("="))
             if not equals or not dotted:
-                raise PlanError(f"--set takes key=value, as in --set animal.spine_mm=65, got '{setting}'")
+                raise PlanError(
+                    f"--set takes key=value, as in --set animal.spine_mm=65, got '{setting}'"
+                )
             *sections, key = dotted.split(".")
             inner = table
             for section in sections:
@@ -110,7 +112,11 @@ class Plan(Table):
             inner.pop(key, None)
             if text or dotted not in _settings():
                 inner[key] = _value(dotted, text)
-        return Plan.from_table(table, " ".join(f"--set {setting}" for setting in chosen)) if chosen else self
+        return (
+            Plan.from_table(table, " ".join(f"--set {setting}" for setting in chosen))
+            if chosen
+            else self
+        )
 
     def to_toml(self) -> str:
         """The plan as TOML with a comment for every setting; loading it gives an equal plan."""
@@ -135,14 +141,18 @@ def plans_folder() -> Path:
 
 def known_plans() -> list[str]:
     """The names of the bundled plans."""
-    return sorted(path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS)
+    return sorted(
+        path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS
+    )
 
 
 def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise PlanError(f"the plan {path} should be a TOML text in UTF-8, but it is not a text file") from None
+        raise PlanError(
+            f"the plan {path} should be a TOML text in UTF-8, but it is not a text file"
+        ) from None
 
 
 def _settings() -> dict[str, Any]:
@@ -165,7 +175,9 @@ def _value(dotted: str, text: str) -> Any:
         return text
     annotation = _settings().get(dotted)
     takes_text = str in (get_args(annotation) or (annotation,))
-    return text if takes_text and not isinstance(value, str) else value  # subject_id=0123 is a name, not a number
+    return (
+        text if takes_text and not isinstance(value, str) else value
+    )  # subject_id=0123 is a name, not a number
 
 
 def _unknown(dotted: str) -> str:
@@ -197,8 +209,12 @@ def _sentence(error: ValidationError) -> str:
     if first["type"] == "value_error" and dotted not in _settings():
         return f"[{dotted}]: {first['msg'].removeprefix('Value error, ')}{more}"
     expected = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    got = first["input"].isoformat() if isinstance(first["input"], datetime) else repr(first["input"])
-    return f"{dotted} {expected}, got {got}; correct it in the plan or with --set {dotted}=...{more}"
+    got = (
+        first["input"].isoformat() if isinstance(first["input"], datetime) else repr(first["input"])
+    )
+    return (
+        f"{dotted} {expected}, got {got}; correct it in the plan or with --set {dotted}=...{more}"
+    )
 
 
 def _entry(name: str, value: Any, description: str | None) -> list[str]:

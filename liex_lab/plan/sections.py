@@ -20,57 +20,84 @@ class Table(BaseModel):
 class Animal(Table):
     """[animal]: what is in front of the camera."""
 
-    name: str = Field("mouse", description="the animal's kind, as it is called in tables and reports")
+    name: str = Field(
+        "mouse", description="the animal's kind, as it is called in tables and reports"
+    )
     skeleton: str = Field(
-        "mouse", description="the skeleton: fish, mouse, hand, or the path of a TOML file of your own"
+        "mouse",
+        description="the skeleton: fish, mouse, hand, or the path of a TOML file of your own",
     )
     spine_mm: Positive | None = Field(
-        None, description="length of this animal's skeleton from its first joint to its last; not set: it is measured"
+        None,
+        description="length of this animal's skeleton from its first joint to its last; not set: it is measured",
     )
-    spine_min_mm: Positive = Field(40.0, description="an animal is not shorter than this, where its size is measured")
-    spine_max_mm: Positive = Field(115.0, description="an animal is not longer than this, where its size is measured")
+    spine_min_mm: Positive = Field(
+        40.0, description="an animal is not shorter than this, where its size is measured"
+    )
+    spine_max_mm: Positive = Field(
+        115.0, description="an animal is not longer than this, where its size is measured"
+    )
 
     @model_validator(mode="after")
     def _in_order(self) -> Animal:
         if not self.spine_min_mm < self.spine_max_mm:
-            raise ValueError(f"spine_min_mm={self.spine_min_mm} should be below spine_max_mm={self.spine_max_mm}")
+            raise ValueError(
+                f"spine_min_mm={self.spine_min_mm} should be below spine_max_mm={self.spine_max_mm}"
+            )
         return self
 
 
 class CameraOverride(Table):
     """[camera]: intrinsics that overrule what the recording states or what is typical of the camera."""
 
-    fx: Positive | None = Field(None, description="focal length along a row, pixels; not set: what the recording says")
+    fx: Positive | None = Field(
+        None, description="focal length along a row, pixels; not set: what the recording says"
+    )
     fy: Positive | None = Field(None, description="focal length along a column, pixels")
     cx: float | None = Field(
         None, description="column of the optical axis, pixels; 0 is the centre of the first column"
     )
-    cy: float | None = Field(None, description="row of the optical axis, pixels; 0 is the centre of the first row")
+    cy: float | None = Field(
+        None, description="row of the optical axis, pixels; 0 is the centre of the first row"
+    )
     distortion: list[float] | None = Field(
         None,
         description="coefficients of the lens distortion, in OpenCV's order: [k1, k2, p1, p2, k3, k4, k5, k6], all but "
         "the first may be left out; [] says that there is none; not set: what the recording says",
     )
     distortion_model: str | None = Field(
-        None, description="plumb_bob (not set), rational_polynomial, or equidistant for a fisheye lens [k1, k2, k3, k4]"
+        None,
+        description="plumb_bob (not set), rational_polynomial, or equidistant for a fisheye lens [k1, k2, k3, k4]",
     )
-    source: str | None = Field(None, description="where these numbers come from; it is written into session.json")
+    source: str | None = Field(
+        None, description="where these numbers come from; it is written into session.json"
+    )
 
 
 class WaterSurface(Table):
     """[water]: a flat water surface between the camera and the animal; not needed for a camera behind glass in air."""
 
     height_mm: Positive | None = Field(
-        None, description="height of the lens above the water; set, it makes millimetres under water true"
+        None,
+        description="height of the lens above the water; set, it makes millimetres under water true",
     )
     refractive_index: float = Field(
-        1.333, ge=1, le=2, description="of the water: 1.333 fresh at 20 degrees C in visible light, 1.34 sea water"
+        1.333,
+        ge=1,
+        le=2,
+        description="of the water: 1.333 fresh at 20 degrees C in visible light, 1.34 sea water",
     )
     tilt_x_rad: float = Field(
-        0.0, ge=-1, le=1, description="angle by which the surface recedes from the camera towards the picture's right"
+        0.0,
+        ge=-1,
+        le=1,
+        description="angle by which the surface recedes from the camera towards the picture's right",
     )
     tilt_y_rad: float = Field(
-        0.0, ge=-1, le=1, description="angle by which the surface recedes from the camera towards the picture's bottom"
+        0.0,
+        ge=-1,
+        le=1,
+        description="angle by which the surface recedes from the camera towards the picture's bottom",
     )
     ranging: Literal["light_field", "structured_light", "time_of_flight", "paraxial"] = Field(
         "light_field",
@@ -83,7 +110,8 @@ class ArenaFacts(Table):
     """[arena]: where in the arena the animal is."""
 
     zones: str | None = Field(
-        None, description="path of a TOML file with named zones, circles and polygons; see the README"
+        None,
+        description="path of a TOML file with named zones, circles and polygons; see the README",
     )
 
 
@@ -91,14 +119,19 @@ class RecordingOptions(Table):
     """[recording]: how the file is read."""
 
     fps: Positive | None = Field(
-        None, description="frames per second, only for recordings that carry no time stamps of their own"
+        None,
+        description="frames per second, only for recordings that carry no time stamps of their own",
     )
-    topic: str | None = Field(None, description="the MCAP topic that holds the depth, where there are several")
+    topic: str | None = Field(
+        None, description="the MCAP topic that holds the depth, where there are several"
+    )
     accept_truncated: bool = Field(
-        False, description="true: use the whole frames of a recording that ends in the middle of one"
+        False,
+        description="true: use the whole frames of a recording that ends in the middle of one",
     )
     mirrored: bool = Field(
-        False, description="true: exchange left and right, for pictures that come mirrored, or to measure a left hand"
+        False,
+        description="true: exchange left and right, for pictures that come mirrored, or to measure a left hand",
     )
 
 
@@ -124,12 +157,17 @@ class Foreground(Table):
 class Estimation(Table):
     """[estimation]: one pose per frame."""
 
-    model: str = Field("mouse", description="a bundled model, or the path of an .npz made by `liex train`")
+    model: str = Field(
+        "mouse", description="a bundled model, or the path of an .npz made by `liex train`"
+    )
     n_candidates: int | None = Field(
-        None, ge=1, description="poses a frame starts from; not set: as many as the model was made for"
+        None,
+        ge=1,
+        description="poses a frame starts from; not set: as many as the model was made for",
     )
     doubtful_above_mm: Positive | None = Field(
-        None, description="frames with a larger predicted error are flagged doubtful; not set: the model's own limit"
+        None,
+        description="frames with a larger predicted error are flagged doubtful; not set: the model's own limit",
     )
 
 
@@ -158,7 +196,8 @@ class SessionFacts(Table):
     sex: str | None = Field(None, description="sex of the animal")
     batch: str | None = Field(None, description="batch of the experiment")
     session_start_time: str | None = Field(
-        None, description="ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording says"
+        None,
+        description="ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording says",
     )
 
     @field_validator("session_start_time", mode="before")
@@ -179,24 +218,36 @@ class Behaviour(Table):
     """[behaviour]: where one behaviour ends and the next begins. Starting values: check them on your own animals."""
 
     speed_half_window_s: Positive = Field(
-        0.034, description="speed at time t is measured from t - this to t + this (one frame each side at 30 fps)"
+        0.034,
+        description="speed at time t is measured from t - this to t + this (one frame each side at 30 fps)",
     )
-    pause_below_mm_s: Positive = Field(50.0, description="slower than this is a pause, faster is walking")
+    pause_below_mm_s: Positive = Field(
+        50.0, description="slower than this is a pause, faster is walking"
+    )
     run_above_mm_s: Positive = Field(300.0, description="faster than this is running")
-    impossible_above_mm_s: Positive = Field(3000.0, description="faster than this is an error of measurement")
+    impossible_above_mm_s: Positive = Field(
+        3000.0, description="faster than this is an error of measurement"
+    )
     rear_height_mm: Positive = Field(
-        40.0, description="rearing begins when the nose is this much higher than the tail's base ..."
+        40.0,
+        description="rearing begins when the nose is this much higher than the tail's base ...",
     )
     rear_height_bl: Positive = Field(
         0.6, description="... or, for a smaller animal, by this many of its own body lengths"
     )
     rear_leave: Positive = Field(
-        2.0 / 3.0, le=1, description="rearing reaches to where the nose is below this share of that height"
+        2.0 / 3.0,
+        le=1,
+        description="rearing reaches to where the nose is below this share of that height",
     )
     speed_hysteresis: NotNegative = Field(
-        0.1, lt=1, description="a speed is crossed upwards this share above it, downwards this share below"
+        0.1,
+        lt=1,
+        description="a speed is crossed upwards this share above it, downwards this share below",
     )
-    merge_pauses_s: NotNegative = Field(0.33, description="shorter interruptions of a bout are bridged")
+    merge_pauses_s: NotNegative = Field(
+        0.33, description="shorter interruptions of a bout are bridged"
+    )
     min_bout_s: NotNegative = Field(0.23, description="shorter bouts are dropped, after bridging")
 
     @model_validator(mode="after")
@@ -211,8 +262,12 @@ class Behaviour(Table):
 class Replay(Table):
     """[replay]: what the Rerun replay, session.rrd, holds."""
 
-    depth: bool = Field(True, description="the depth pictures; without them it takes a hundredth of the room")
-    candidates: bool = Field(False, description="every pose that single frames thought possible, too")
+    depth: bool = Field(
+        True, description="the depth pictures; without them it takes a hundredth of the room"
+    )
+    candidates: bool = Field(
+        False, description="every pose that single frames thought possible, too"
+    )
 
 
 class Actions(Table):

@@ -21,16 +21,24 @@ from liex_lab.plan import Plan, known_plans
 
 # as in NeuroBlueprint: letters and digits alone, so that no name is a path, a formula or markup
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,64}$")]
-SessionName = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,32}(_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,6}$")]
+SessionName = Annotated[
+    str, Field(pattern=r"^[A-Za-z0-9]{1,32}(_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,6}$")
+]
 Text = Annotated[str, Field(max_length=500)]
 PathText = Annotated[str, Field(min_length=1, max_length=1000)]
 Settings = dict[str, Any]
 
 STUDY_FILE = "study.toml"
 RAW, DERIVED = "rawdata", "derivatives/liex-lab"
-RESULTS = "behav"  # the session folder of one recording, as NeuroBlueprint calls what shows behaviour
+RESULTS = (
+    "behav"  # the session folder of one recording, as NeuroBlueprint calls what shows behaviour
+)
 VIRTUAL = "synthetic:"
-_PATHS = (("arena", "zones"), ("estimation", "model"), ("animal", "skeleton"))  # settings that may name a file
+_PATHS = (
+    ("arena", "zones"),
+    ("estimation", "model"),
+    ("animal", "skeleton"),
+)  # settings that may name a file
 _SAY = {
     "id": "should be letters and digits only, as in m01",
     "animal": "should be the id of an animal: letters and digits only, as in m01",
@@ -85,10 +93,14 @@ class StudyTable(_Table):
         taken: set[tuple[str, str]] = set()
         for one in self.sessions:
             if one.animal not in {animal.id for animal in self.animals}:
-                raise ValueError(f"the session {one.session} is of {one.animal}, an animal that is not in [[animals]]")
+                raise ValueError(
+                    f"the session {one.session} is of {one.animal}, an animal that is not in [[animals]]"
+                )
             key = one.animal.lower(), one.session.lower()
             if key in taken:
-                raise ValueError(f"the animal {one.animal} has two sessions {one.session}; give each its own name")
+                raise ValueError(
+                    f"the animal {one.animal} has two sessions {one.session}; give each its own name"
+                )
             taken.add(key)
         return self
 
@@ -163,7 +175,9 @@ class Study:
         found = self.inside(self.table.results, "results")
         raw = self.folder / RAW
         if found == raw or raw in found.parents:
-            raise StudyError(f"{self.path}: results = '{self.table.results}' lies in {RAW}, where nothing is written")
+            raise StudyError(
+                f"{self.path}: results = '{self.table.results}' lies in {RAW}, where nothing is written"
+            )
         return found
 
     @property
@@ -180,7 +194,12 @@ class Study:
     def inside(self, text: str, what: str) -> Path:
         """A path of the study file, which may not leave the study's folder."""
         parts = PurePosixPath(text.replace("\\", "/")).parts
-        bad = "\0" in text or text.startswith(("/", "\\", "~")) or ".." in parts or (len(text) > 1 and text[1] == ":")
+        bad = (
+            "\0" in text
+            or text.startswith(("/", "\\", "~"))
+            or ".." in parts
+            or (len(text) > 1 and text[1] == ":")
+        )
         if bad:
             raise StudyError(
                 f"{self.path}: {what} is '{text}', and a study names only what is in its own folder {self.folder}; "
@@ -194,14 +213,20 @@ class Study:
         if not recording.startswith(VIRTUAL):
             recording = str(self.inside(recording, f"the recording of {animal.id} {one.session}"))
         folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / RESULTS
-        return PlannedSession(id, animal, recording, folder, self._plan(animal, one, id), one.exclude)
+        return PlannedSession(
+            id, animal, recording, folder, self._plan(animal, one, id), one.exclude
+        )
 
     def _plan(self, animal: StudyAnimal, one: StudySession, id: str) -> Plan:
         """The plan with the settings of study, animal and session put in, the later before the earlier."""
         named = one.plan or self.table.plan
         plan = Plan.load(named if named in known_plans() else self.inside(named, "plan"))
         facts: Settings = {"name": id, "individual": animal.id, "subject_id": animal.id}
-        facts |= {key: value for key in ("group", "cage", "sex", "batch") if (value := getattr(animal, key))}
+        facts |= {
+            key: value
+            for key in ("group", "cage", "sex", "batch")
+            if (value := getattr(animal, key))
+        }
         facts |= {"session_start_time": one.start_time} if one.start_time else {}
         table = plan.model_dump(exclude_none=True)
         for settings in (self.table.set, animal.set, {"session": facts}, one.set):
@@ -209,7 +234,9 @@ class Study:
         for section, key in _PATHS:
             text = table.get(section, {}).get(key) if isinstance(table.get(section), dict) else None
             if isinstance(text, str) and (self.folder / text).is_file():
-                table[section][key] = str(self.inside(text, f"{section}.{key}"))  # workers run in other folders
+                table[section][key] = str(
+                    self.inside(text, f"{section}.{key}")
+                )  # workers run in other folders
         try:
             return Plan.from_table(table, f"{self.path}, session {id}")
         except PlanError as error:
@@ -221,7 +248,9 @@ def merged(table: Settings, settings: Settings) -> Settings:
     out = dict(table)
     for key, value in settings.items():
         below = out.get(key)
-        out[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        out[key] = (
+            merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        )
     return out
 
 
@@ -229,14 +258,18 @@ def _sentence(error: ValidationError) -> str:
     """The first complaint, as one sentence that says what to do."""
     first, *others = error.errors(include_url=False)
     more = f" (and {len(others)} more)" if others else ""
-    where = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    where = "".join(
+        f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in first["loc"]
+    ).lstrip(".")
     key = str(first["loc"][-1]) if first["loc"] else ""
     if first["type"] == "extra_forbidden":
         return f"{where} is not known here{_nearest(key, first['loc'])}; correct or remove it{more}"
     if first["type"] == "value_error":
         return first["msg"].removeprefix("Value error, ") + more
     said = _SAY.get(key) if first["type"] == "string_pattern_mismatch" else None
-    expected = said or first["msg"].replace("Input should", "should").replace("String should", "should")
+    expected = said or first["msg"].replace("Input should", "should").replace(
+        "String should", "should"
+    )
     return f"{where} {expected}, got {_short(first['input'])}; correct it{more}"
 
 

@@ -36,8 +36,12 @@ def lift_row(depth, law, u, v, deep):
         dry = min(along, _ONE)
         z = law[12, column] + dry * law[6, column] + below * law[9, column]
         deep[column] = z
-        u[column] = int(np.floor((law[10, column] + dry * law[4, column] + below * law[7, column]) / z + _HALF))
-        v[column] = int(np.floor((law[11, column] + dry * law[5, column] + below * law[8, column]) / z + _HALF))
+        u[column] = int(
+            np.floor((law[10, column] + dry * law[4, column] + below * law[7, column]) / z + _HALF)
+        )
+        v[column] = int(
+            np.floor((law[11, column] + dry * law[5, column] + below * law[8, column]) / z + _HALF)
+        )
 
 
 @njit(cache=True, nogil=True)

@@ -25,8 +25,10 @@ _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
 _TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
 _WORDS: dict[str, tuple[str, ...]] = {  # keys that take one of a few words
-    "encoding": ENCODINGS, "byte_order": ("big", "little"), "time_unit": tuple(UNITS),
-}  # fmt: skip
+    "encoding": ENCODINGS,
+    "byte_order": ("big", "little"),
+    "time_unit": tuple(UNITS),
+}
 _KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
 
 
@@ -68,7 +70,9 @@ class CameraFile:
         try:
             document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise RecordingError(f"{path} should be a TOML file, but it does not parse ({error}); correct it") from None
+            raise RecordingError(
+                f"{path} should be a TOML file, but it does not parse ({error}); correct it"
+            ) from None
         table = {key: value for key, value in document.items() if not isinstance(value, dict)}
         for name in ("camera", "recording"):
             if isinstance(document.get(name), dict):
@@ -85,14 +89,21 @@ class CameraFile:
         if stated is not None:
             return fitting(stated, width, height, "the camera that was stated")
         if not self.intrinsics:
-            raise RecordingError(f"the camera is not known, for there is no [camera] in {self.path}; {WHAT_TO_WRITE}")
+            raise RecordingError(
+                f"the camera is not known, for there is no [camera] in {self.path}; {WHAT_TO_WRITE}"
+            )
         missing = [name for name in _INTRINSICS if name not in self.intrinsics]
         if missing:
-            raise RecordingError(f"{self.path} does not state {', '.join(missing)}; {WHAT_TO_WRITE}")
+            raise RecordingError(
+                f"{self.path} does not state {', '.join(missing)}; {WHAT_TO_WRITE}"
+            )
         camera = Camera(
-            **self.intrinsics, width=self.width or width, height=self.height or height, source=self.source,
+            **self.intrinsics,
+            width=self.width or width,
+            height=self.height or height,
+            source=self.source,
             distortion=self.distortion,
-        )  # fmt: skip
+        )
         return fitting(camera, width, height, str(self.path))
 
 
@@ -111,7 +122,9 @@ def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
 def rate(fps: float | None, where: str) -> float | None:
     """A stated frame rate, if it can be one."""
     if fps is not None and not (math.isfinite(fps) and 0 < fps <= 100_000):
-        raise RecordingError(f"{where} states fps = {fps:g}; a frame rate is a positive number of frames per second")
+        raise RecordingError(
+            f"{where} states fps = {fps:g}; a frame rate is a positive number of frames per second"
+        )
     return fps
 
 
@@ -121,24 +134,36 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
     unread = unread if isinstance(unread, list) else [unread]
     for key in ("width", "height"):
         if key in numbers and not (numbers[key] >= 1 and numbers[key] == int(numbers[key])):
-            raise RecordingError(f"{path} states {key} = {numbers[key]:g}; it is a positive whole number of pixels")
+            raise RecordingError(
+                f"{path} states {key} = {numbers[key]:g}; it is a positive whole number of pixels"
+            )
     for key in ("fx", "fy"):
         if key in numbers and not numbers[key] > 0:
             raise RecordingError(
                 f"{path} states {key} = {numbers[key]:g}; a focal length is a positive number of pixels"
             )
     if numbers.get("unit_mm", 1.0) == 0.0:
-        raise RecordingError(f"{path} states unit_mm = 0; it is the number of millimetres in one stored step")
+        raise RecordingError(
+            f"{path} states unit_mm = 0; it is the number of millimetres in one stored step"
+        )
     for key, words in _WORDS.items():
         if table.get(key, words[0]) not in words:
             listed = ", ".join(f'"{word}"' for word in words)
             raise RecordingError(f"{path} states {key} = {table[key]!r}; it is one of {listed}")
     column = table.get("time_column")
-    if column is not None and not (isinstance(column, str) and column) and not (type(column) is int and column >= 0):
-        raise RecordingError(f"{path} states time_column = {column!r}; it is a column's name, or its number from 0")
+    if (
+        column is not None
+        and not (isinstance(column, str) and column)
+        and not (type(column) is int and column >= 0)
+    ):
+        raise RecordingError(
+            f"{path} states time_column = {column!r}; it is a column's name, or its number from 0"
+        )
     for key in ("timestamps", "pattern", "subject_id", "distortion_model"):
         if key in table and not (isinstance(table[key], str) and table[key]):
-            raise RecordingError(f"{path} states {key} = {table[key]!r}; it is a text in quotation marks")
+            raise RecordingError(
+                f"{path} states {key} = {table[key]!r}; it is a text in quotation marks"
+            )
     metadata = {"subject_id": table["subject_id"]} if "subject_id" in table else {}
     if "session_start_time" in table:
         start = start_of_day(table["session_start_time"])
@@ -184,7 +209,9 @@ def _distortion(path: Path, table: dict[str, Any]) -> Distortion | None:
 def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool)
     if not good or (finite and not math.isfinite(value)):
-        raise RecordingError(f"{path} states {key} = {value!r} where a number was expected; correct it")
+        raise RecordingError(
+            f"{path} states {key} = {value!r} where a number was expected; correct it"
+        )
     return float(value)
 
 

@@ -36,7 +36,9 @@ def _green_blue(stored: Stored) -> Stored:
     return stored[..., 1].astype(np.uint16) << 8 | stored[..., 0]
 
 
-_MILLIMETRES: dict[str, tuple[float, Callable[[Stored], Stored]]] = {  # name: mm per step of what the function gives
+_MILLIMETRES: dict[
+    str, tuple[float, Callable[[Stored], Stored]]
+] = {  # name: mm per step of what the function gives
     "linear": (1.0, lambda stored: stored),
     "tum": (0.2, lambda stored: stored),  # 5000 steps per metre
     "sun": (1.0, _rotated),
@@ -51,7 +53,9 @@ def own_unit_mm(encoding: str) -> float:
     return _MILLIMETRES[encoding][0]
 
 
-def decode(stored: Stored, encoding: str, unit_mm: float, unread: Sequence[float] = (0.0,)) -> Depth:
+def decode(
+    stored: Stored, encoding: str, unit_mm: float, unread: Sequence[float] = (0.0,)
+) -> Depth:
     """Stored values (H, W) -> float32 mm (H, W), 0 = unread.
 
     unit_mm: millimetres per step of what `encoding` gives; unread: *stored* values that mean "no reading" (of what the
@@ -73,7 +77,11 @@ def whole_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
     steps = (depth if step_mm == 1.0 else np.rint(depth / np.float32(step_mm))).astype(np.uint16)
     # compared as `depth_mm` will compute it: 0.1 is no number of a float32
     read = steps.astype(np.float32)
-    return steps if np.array_equal(read if step_mm == 1.0 else read * np.float32(step_mm), depth) else None
+    return (
+        steps
+        if np.array_equal(read if step_mm == 1.0 else read * np.float32(step_mm), depth)
+        else None
+    )
 
 
 def nearest_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:

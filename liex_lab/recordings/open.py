@@ -30,7 +30,11 @@ _ALONE = {  # how the name of a file ends that holds a whole recording: its modu
     ".bag": "messages.rosbag.open_bag",
     ".db3": "messages.rosbag.open_bag",
 }
-_FILES = _ALONE | {".dat": "moseq.reader.open_moseq"} | dict.fromkeys(_PICTURES, "images.folder.open_images")
+_FILES = (
+    _ALONE
+    | {".dat": "moseq.reader.open_moseq"}
+    | dict.fromkeys(_PICTURES, "images.folder.open_images")
+)
 _RENDERED = "synthetic:"  # an address of a virtual recording; rendering stands above reading, so it is named only here
 _RENDERER = "liex_lab.simulation.address"
 _WITH_TOPICS = ("messages.mcap.open_mcap", "messages.rosbag.open_bag")
@@ -43,14 +47,14 @@ _CLOUD = (
     "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says what its numbers "
     'mean, with a line such as profile = "raytrix-points-mm", and give the folder'
 )
-_EIGHT_BIT = (
-    "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give the depth itself"
-)
+_EIGHT_BIT = "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give the depth itself"
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".ply", ".xyz"), _CLOUD),
-    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT),
+    **dict.fromkeys(
+        (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT
+    ),
     **dict.fromkeys((".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
 }
 
@@ -99,7 +103,9 @@ def open_recording(
     try:
         recording = _open(path, _How(camera, fps, topic, progress))
     except OSError as error:
-        raise RecordingError(f"{error.filename or path} cannot be read ({error.strerror or error}); check it") from None
+        raise RecordingError(
+            f"{error.filename or path} cannot be read ({error.strerror or error}); check it"
+        ) from None
     except RecordingError:
         raise
     except LiexError as error:  # a camera that cannot be: it came out of this recording
@@ -130,7 +136,9 @@ def _open(path: Path, how: _How) -> Recording:
             raise RecordingError(f"{path} is empty; copy the recording again")
         return how.open(where, path)
     why = _NOT_READ.get(path.suffix.lower())
-    raise RecordingError(f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}")
+    raise RecordingError(
+        f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}"
+    )
 
 
 def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
@@ -139,7 +147,11 @@ def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
 
 def _open_folder(folder: Path, how: _How) -> Recording:
     from liex_lab.recordings.formats.images.nyu import looks_like_nyu
-    from liex_lab.recordings.formats.images.raytrix import PROFILE_FILE, looks_like_raytrix, no_profile_error
+    from liex_lab.recordings.formats.images.raytrix import (
+        PROFILE_FILE,
+        looks_like_raytrix,
+        no_profile_error,
+    )
 
     inside = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     if not inside:

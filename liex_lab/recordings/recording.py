@@ -77,7 +77,9 @@ class Recording:
         if not len(self.times_ns):
             raise RecordingError(f"{name} holds no frame; a recording has at least one")
         if not np.all(np.diff(self.times_ns) > 0):
-            raise RecordingError(f"the time stamps of {name} do not increase strictly; pass them through `settle`")
+            raise RecordingError(
+                f"the time stamps of {name} do not increase strictly; pass them through `settle`"
+            )
         self.times_ns.flags.writeable = False
         # at the latest when nobody holds the recording any more, or the program ends
         self._close = None if close is None else weakref.finalize(self, close)
@@ -146,33 +148,57 @@ class Recording:
     def __getitem__(self, part: slice) -> Recording:
         """Some of the frames as a recording of its own, with rows counted anew; it reads from the same files."""
         if not isinstance(part, slice):
-            raise TypeError("a recording is cut with a slice, as in recording[10:20]; one frame is recording.frame(10)")
+            raise TypeError(
+                "a recording is cut with a slice, as in recording[10:20]; one frame is recording.frame(10)"
+            )
         start, stop, step = part.indices(len(self))
         if step < 1 or start >= stop:
-            raise RecordingError(f"the part {start}:{stop}:{step} of {self.name} holds no frame in order of time")
+            raise RecordingError(
+                f"the part {start}:{stop}:{step} of {self.name} holds no frame in order of time"
+            )
         rows = slice(start, stop, step)
         cut = Recording(
-            name=self.name, format=self.format, camera=self.camera, times_ns=self.times_ns[rows].copy(),
-            read=self._read, sources=self._sources, problems=self.problems, truncated=self.truncated,
-            metadata=self.metadata, step_ns=self._step_ns * step, stored=self._stored[rows],
+            name=self.name,
+            format=self.format,
+            camera=self.camera,
+            times_ns=self.times_ns[rows].copy(),
+            read=self._read,
+            sources=self._sources,
+            problems=self.problems,
+            truncated=self.truncated,
+            metadata=self.metadata,
+            step_ns=self._step_ns * step,
+            stored=self._stored[rows],
             faults=self._faults[rows],
-        )  # fmt: skip
+        )
         cut._whole, cut.optics = self._whole or self, self.optics
         return cut
 
-    def seen_by(self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]) -> Recording:
+    def seen_by(
+        self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]
+    ) -> Recording:
         """The same frames as another camera would have seen them: `change` turns each depth picture when it is read.
 
         The input, and so the digest, stays the same; closing one closes both.
         """
         read = self._read
         other = Recording(
-            name=self.name, format=self.format, camera=camera, times_ns=self.times_ns.copy(),
-            read=lambda number: change(read(number)), sources=self._sources, problems=self.problems,
-            truncated=self.truncated, n_whole=self.n_whole, metadata=self.metadata, step_ns=self._step_ns,
-            stored=self._stored, close=self.close, faults=self._faults,
+            name=self.name,
+            format=self.format,
+            camera=camera,
+            times_ns=self.times_ns.copy(),
+            read=lambda number: change(read(number)),
+            sources=self._sources,
+            problems=self.problems,
+            truncated=self.truncated,
+            n_whole=self.n_whole,
+            metadata=self.metadata,
+            step_ns=self._step_ns,
+            stored=self._stored,
+            close=self.close,
+            faults=self._faults,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
-        )  # fmt: skip
+        )
         other._whole, other.optics = self._whole or self, optics
         return other
 
@@ -196,7 +222,9 @@ class Recording:
         if self._whole is not None:
             return self._whole.digest(progress)
         if self._digest is None:
-            self._digest = file_digest(self._sources, progress) if self._sources else self._content_digest()
+            self._digest = (
+                file_digest(self._sources, progress) if self._sources else self._content_digest()
+            )
         return self._digest
 
     @property
@@ -225,7 +253,12 @@ class Recording:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self.close()
 
 

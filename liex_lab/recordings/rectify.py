@@ -76,18 +76,26 @@ def straight_camera(camera: Camera) -> Camera:
     for axis in (0, 1):
         along = np.linspace(0.0, size[1 - axis] - 1.0, 65)
         before, after = (
-            np.stack([np.full(65, end), along][:: 1 - 2 * axis], axis=-1) for end in (0.0, size[axis] - 1.0)
+            np.stack([np.full(65, end), along][:: 1 - 2 * axis], axis=-1)
+            for end in (0.0, size[axis] - 1.0)
         )
-        low, high = (straight.project(camera.unproject(edge, 1.0))[:, axis] for edge in (before, after))
+        low, high = (
+            straight.project(camera.unproject(edge, 1.0))[:, axis] for edge in (before, after)
+        )
         most = _MAX_GROWTH * size[axis]
-        room = [np.where(np.isfinite(off), off, most).max() for off in (-low, high - size[axis] + 1.0)]
+        room = [
+            np.where(np.isfinite(off), off, most).max() for off in (-low, high - size[axis] + 1.0)
+        ]
         start, stop = (int(np.ceil(min(max(value, 0.0), most))) for value in room)
         grown.append((start, stop + -(size[axis] + start + stop) % 4))
     (left, right), (top, bottom) = grown
     return replace(
-        straight, cx=camera.cx + left, cy=camera.cy + top, width=camera.width + left + right,
+        straight,
+        cx=camera.cx + left,
+        cy=camera.cy + top,
+        width=camera.width + left + right,
         height=camera.height + top + bottom,
-    )  # fmt: skip
+    )
 
 
 def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], Depth]:
@@ -157,4 +165,6 @@ def _inside(uv: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
 
 def _pixels(camera: Camera) -> NDArray[np.float64]:
     """(u, v) of every pixel (H, W, 2)."""
-    return np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
+    return np.stack(
+        np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1
+    )

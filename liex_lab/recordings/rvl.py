@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, inline="always")
-def _put(value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int) -> tuple[np.uint32, int, int]:
+def _put(
+    value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int
+) -> tuple[np.uint32, int, int]:
     """Append a number as nibbles of three bits and one that says more follow; eight nibbles make a word."""
     while True:
         nibble = value & 7
@@ -68,7 +70,9 @@ def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, inline="always")
-def _take(words: NDArray[np.uint32], word: np.uint32, at: int, held: int) -> tuple[int, np.uint32, int, int]:
+def _take(
+    words: NDArray[np.uint32], word: np.uint32, at: int, held: int
+) -> tuple[int, np.uint32, int, int]:
     """The next number, and where it ends; -1 where the words end before it does."""
     value, shift = 0, 0
     while shift < 33:

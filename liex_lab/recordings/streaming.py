@@ -64,11 +64,15 @@ def _when_there(reopen: Callable[[], Recording], patience_s: float) -> Recording
             if time.perf_counter() - began > patience_s:
                 raise
         if time.perf_counter() - began > patience_s:
-            raise RecordingError(f"nothing has come for {patience_s:g} s; begin the recording first, or wait longer")
+            raise RecordingError(
+                f"nothing has come for {patience_s:g} s; begin the recording first, or wait longer"
+            )
         time.sleep(_POLL_S)
 
 
-def _grown(opened: Recording, reopen: Callable[[], Recording], patience_s: float) -> Iterator[Arrival]:
+def _grown(
+    opened: Recording, reopen: Callable[[], Recording], patience_s: float
+) -> Iterator[Arrival]:
     done, last = 0, time.perf_counter()
     while time.perf_counter() - last < patience_s:
         for index in range(done, len(opened)):
@@ -104,7 +108,9 @@ def received(host: str, port: int) -> Arriving:
     try:
         link = socket.create_connection((host, port), timeout=_GREETING_S)
     except OSError as error:
-        raise RecordingError(f"nobody sends frames at {host}:{port} ({error}); start the sender first") from None
+        raise RecordingError(
+            f"nobody sends frames at {host}:{port} ({error}); start the sender first"
+        ) from None
     greeting = _greeting(link, f"{host}:{port}")
     link.settimeout(None)  # the first frame may be long in the making; who is gone closes the link
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -148,10 +154,14 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
     """Greet the one who connects, then send every frame when its time has come."""
     with server, closing(server.accept()[0]) as link:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        greeting = json.dumps({"name": recording.name, "camera": recording.camera.to_dict()}).encode()
+        greeting = json.dumps(
+            {"name": recording.name, "camera": recording.camera.to_dict()}
+        ).encode()
         link.sendall(_HEAD.pack(len(greeting)) + greeting)
         first = int(recording.times_ns[0])
-        began: float | None = None  # when the first frame is read: what that takes is not the recording's pace
+        began: float | None = (
+            None  # when the first frame is read: what that takes is not the recording's pace
+        )
         for frame in recording:
             began = time.perf_counter() if began is None else began
             late = (frame.time_ns - first) * 1e-9 / speed - (time.perf_counter() - began)

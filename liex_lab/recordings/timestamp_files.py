@@ -17,9 +17,15 @@ from liex_lab.recordings.timestamps import LIMIT_NS, Times
 UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}  # nanoseconds in each
 CSV_COLUMNS = {f"time_{unit}": ns for unit, ns in UNITS.items()}  # columns that name their unit
 
-_DATE = re.compile(r"(?<!\d)(20\d\d)-?(\d\d)-?(\d\d)[T_-](\d\d)[-:]?(\d\d)[-:]?(\d\d)[._](\d{3,9})(?!\d)")
-_SECONDS = re.compile(r"(?<!\d)(\d{9,10})\.(\d{3,9})(?!\d)")  # since 1970, as the TUM data sets name their pictures
-_WHOLE = re.compile(r"(?<!\d)(\d{13}|\d{16}|\d{19})(?!\d)")  # ms, us or ns since 1970, told apart by their length
+_DATE = re.compile(
+    r"(?<!\d)(20\d\d)-?(\d\d)-?(\d\d)[T_-](\d\d)[-:]?(\d\d)[-:]?(\d\d)[._](\d{3,9})(?!\d)"
+)
+_SECONDS = re.compile(
+    r"(?<!\d)(\d{9,10})\.(\d{3,9})(?!\d)"
+)  # since 1970, as the TUM data sets name their pictures
+_WHOLE = re.compile(
+    r"(?<!\d)(\d{13}|\d{16}|\d{19})(?!\d)"
+)  # ms, us or ns since 1970, told apart by their length
 _PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 to 2100
 
 
@@ -41,11 +47,17 @@ def read_csv_times(path: Path, column: str | int | None = None, unit: str | None
     lines = _lines(path)
     rows = [(number, row) for number, row in enumerate(_split(lines), start=1) if row]
     if isinstance(column, int):
-        rows = rows[1:] if rows and column < len(rows[0][1]) and not _is_number(rows[0][1][column]) else rows
+        rows = (
+            rows[1:]
+            if rows and column < len(rows[0][1]) and not _is_number(rows[0][1][column])
+            else rows
+        )
         return _parse(path, rows, column, UNITS[unit or "ns"])
     named = [(number, [cell.lstrip("# ") for cell in row if cell != "#"]) for number, row in rows]
     wanted = (column,) if column else tuple(CSV_COLUMNS)
-    at, header = next(((at, row) for at, (_, row) in enumerate(named) if set(wanted) & set(row)), (-1, []))
+    at, header = next(
+        ((at, row) for at, (_, row) in enumerate(named) if set(wanted) & set(row)), (-1, [])
+    )
     if at < 0:
         raise RecordingError(
             f"{path} should begin with a line that names a column {column or 'time_ns or time_s'}, but its first line "
@@ -64,7 +76,10 @@ def read_csv_times(path: Path, column: str | int | None = None, unit: str | None
 
 def read_column_times(path: Path, ns_per_unit: int) -> Times:
     """The stamps in column 0 of a file of numbers parted by blanks or commas; a header line is passed over."""
-    rows = [(number, line.replace(",", " ").split()) for number, line in enumerate(_lines(path), start=1)]
+    rows = [
+        (number, line.replace(",", " ").split())
+        for number, line in enumerate(_lines(path), start=1)
+    ]
     rows = [(number, row) for number, row in rows if row]
     if rows and not _is_number(rows[0][1][0]):
         rows = rows[1:]
@@ -107,7 +122,11 @@ def _split(lines: list[str]) -> list[list[str]]:
     """Cells of every line, none for a line that is a comment without names or blank."""
     first = next((line for line in lines if line.strip()), "")
     delimiter = next((d for d in ",;\t" if d in first), None)
-    rows = [line.split() for line in lines] if delimiter is None else list(csv.reader(lines, delimiter=delimiter))
+    rows = (
+        [line.split() for line in lines]
+        if delimiter is None
+        else list(csv.reader(lines, delimiter=delimiter))
+    )
     return [[cell.strip().strip('"') for cell in row] for row in rows]
 
 
@@ -115,7 +134,9 @@ def _lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        raise RecordingError(f"{path} should be a text file with one time stamp per line, but it is not text") from None
+        raise RecordingError(
+            f"{path} should be a text file with one time stamp per line, but it is not text"
+        ) from None
 
 
 def _is_number(text: str) -> bool:

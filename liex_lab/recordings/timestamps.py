@@ -12,11 +12,17 @@ from numpy.typing import NDArray
 Times = NDArray[np.int64]
 
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
-CLOCK_JUMP_NS = 60 * 10**9  # no camera drops frames for a minute: it was stopped, or its clock was set
-_SURE = 5  # frames on either side that tell a lasting jump of the clock from a few stamps out of order
+CLOCK_JUMP_NS = (
+    60 * 10**9
+)  # no camera drops frames for a minute: it was stopped, or its clock was set
+_SURE = (
+    5  # frames on either side that tell a lasting jump of the clock from a few stamps out of order
+)
 _LONGEST_STEP_NS = 10**9
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
-_PLAUSIBLE_START_NS = 946_684_800 * 10**9  # the year 2000: earlier stamps count from something else than 1970
+_PLAUSIBLE_START_NS = (
+    946_684_800 * 10**9
+)  # the year 2000: earlier stamps count from something else than 1970
 
 
 DROPPED, JUMPED = "camera_dropped", "clock_jumped"
@@ -90,7 +96,8 @@ def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> lis
     """The frames whose stamps were moved, as `Settled.faults` counts them."""
     stops = np.append(times_ns[1:], times_ns[-1:] + max(step_ns, 1))
     return [
-        Gap(int(i), int(i) + 1, int(times_ns[i]), int(stops[i]), 0, FAULTS[faults[i]]) for i in np.flatnonzero(faults)
+        Gap(int(i), int(i) + 1, int(times_ns[i]), int(stops[i]), 0, FAULTS[faults[i]])
+        for i in np.flatnonzero(faults)
     ]
 
 
@@ -112,7 +119,9 @@ def settle(times_ns: Times) -> Settled:
     joined, jumps = _join_clocks(times_ns)
     times = _fewest_moved(joined)
     moved = times != joined
-    faults = np.where(moved, np.where(np.abs(times - joined) > CLOCK_JUMP_NS, _JUMPED, _OUT_OF_ORDER), 0)
+    faults = np.where(
+        moved, np.where(np.abs(times - joined) > CLOCK_JUMP_NS, _JUMPED, _OUT_OF_ORDER), 0
+    )
     repeated = np.zeros(len(times), bool)
     repeated[1:] = times_ns[1:] == times_ns[:-1]
     repeated[:-1] |= repeated[1:]
@@ -211,7 +220,9 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
     return np.array(chain[::-1], np.int64)
 
 
-def match_counts(n_frames: int, times_ns: Times, frames_from: str, times_from: str) -> tuple[int, str | None]:
+def match_counts(
+    n_frames: int, times_ns: Times, frames_from: str, times_from: str
+) -> tuple[int, str | None]:
     """How many frames have both a picture and a stamp, and a sentence with both numbers when they differ."""
     if n_frames == len(times_ns):
         return n_frames, None
@@ -229,7 +240,9 @@ def start_of_day(stated: str | datetime | None) -> str | None:
             stated = datetime.fromisoformat(stated)
         except ValueError:
             return None
-    return stated.isoformat() if isinstance(stated, datetime) and stated.tzinfo is not None else None
+    return (
+        stated.isoformat() if isinstance(stated, datetime) and stated.tzinfo is not None else None
+    )
 
 
 def start_of_clock(first_ns: int) -> str | None:
@@ -237,5 +250,6 @@ def start_of_clock(first_ns: int) -> str | None:
     if first_ns < _PLAUSIBLE_START_NS:
         return None
     return (
-        datetime.fromtimestamp(first_ns // 10**9, UTC) + timedelta(microseconds=first_ns % 10**9 // 1000)
+        datetime.fromtimestamp(first_ns // 10**9, UTC)
+        + timedelta(microseconds=first_ns % 10**9 // 1000)
     ).isoformat()

@@ -47,7 +47,12 @@ class RecordingWriter(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         try:
             if kind is None:
                 self.finish()
@@ -62,9 +67,14 @@ class PictureFolderWriter(RecordingWriter):
     """
 
     def __init__(
-        self, path: Path, camera: Camera, *, step_mm: float = 1.0, exact: bool = True,
+        self,
+        path: Path,
+        camera: Camera,
+        *,
+        step_mm: float = 1.0,
+        exact: bool = True,
         metadata: dict[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(path, camera)
         self._step_mm, self._exact = step_mm, exact
         self._facts = {key: str(value) for key, value in (metadata or {}).items() if key in _FACTS}
@@ -80,14 +90,21 @@ class PictureFolderWriter(RecordingWriter):
     def finish(self) -> None:
         """Write camera.toml and timestamps.csv."""
         camera = self.camera
-        numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+        numbers = {
+            name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")
+        }
         facts: dict[str, Any] = numbers | {"unit_mm": self._step_mm} | self._facts
         if camera.distortion is not None:
-            facts |= {"distortion": camera.distortion.coefficients, "distortion_model": camera.distortion.model}
+            facts |= {
+                "distortion": camera.distortion.coefficients,
+                "distortion_model": camera.distortion.model,
+            }
         lines = [f"# intrinsics: {' '.join(camera.source.split())}", "[camera]"]
         lines += [f"{key} = {json.dumps(value)}" for key, value in facts.items()]
         (self.path / CAMERA_FILE).write_text("\n".join([*lines, ""]), encoding="utf-8")
-        (self.path / STAMPS).write_text("\n".join(["time_ns", *map(str, self._times), ""]), encoding="utf-8")
+        (self.path / STAMPS).write_text(
+            "\n".join(["time_ns", *map(str, self._times), ""]), encoding="utf-8"
+        )
         if not self._exact:
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
 
@@ -128,7 +145,9 @@ class OniRecordingWriter(RecordingWriter):
         if self._rounded:
             self.notes.append("times were rounded to microseconds, which is what .oni holds")
         if self._earlier_ns:
-            self.notes.append(f"times count from {self._earlier_ns} ns, for .oni has none before zero")
+            self.notes.append(
+                f"times count from {self._earlier_ns} ns, for .oni has none before zero"
+            )
         if self.camera.distortion is not None:
             self.notes.append(
                 f"the lens distortion ({self.camera.distortion}) was left out, for .oni has no place for it"

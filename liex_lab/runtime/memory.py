@@ -17,12 +17,16 @@ from numpy.typing import NDArray
 
 _ZEROS = 1 << 20  # bytes written at once
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-Room = Callable[[tuple[int, ...], Any], NDArray[Any]]  # shape and dtype -> an array to be filled, as np.empty
+Room = Callable[
+    [tuple[int, ...], Any], NDArray[Any]
+]  # shape and dtype -> an array to be filled, as np.empty
 
 
 def peak_memory_mb() -> float | None:
     """The most memory this process has held, MB; None where the system does not tell."""
-    status = Path("/proc/self/status")  # getrusage would also count the process that started this one
+    status = Path(
+        "/proc/self/status"
+    )  # getrusage would also count the process that started this one
     if status.is_file():
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
@@ -61,7 +65,9 @@ def on_disk(folder: Path) -> Room:
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if not size:
             return np.empty(shape, dtype)
-        if size > shutil.disk_usage(folder).free:  # asking for the room would take all there is before it fails
+        if (
+            size > shutil.disk_usage(folder).free
+        ):  # asking for the room would take all there is before it fails
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
         try:
             with tempfile.TemporaryFile(dir=folder) as file:

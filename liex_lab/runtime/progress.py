@@ -23,7 +23,13 @@ def silent(done: int, total: int | None, what: str) -> None:
 def progress_bar() -> Iterator[Progress]:
     """A progress bar on standard error, gone when the block ends; nothing at all where that is not a terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        SpinnerColumn,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as Bars
 
     console = Console(stderr=True)
@@ -34,7 +40,9 @@ def progress_bar() -> Iterator[Progress]:
         TaskProgressColumn(),
         TimeRemainingColumn(),
     )
-    with Bars(*columns, console=console, transient=True, disable=not console.is_terminal) as display:
+    with Bars(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as display:
         task = display.add_task("", total=None)
         last: tuple[int, int | None] = (0, None)
 
@@ -85,7 +93,9 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
 class Board:
     """How far many jobs are that run at once: a bar for each that runs, one for all, and a line for each that ended."""
 
-    def __init__(self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
         """say: takes the lines; clock: seconds that only go on, whatever the computer's clock is set to."""
         self._n, self._say, self._clock = n_jobs, say, clock
         self._began = clock()
@@ -146,7 +156,9 @@ def progress_board(n_jobs: int) -> Iterator[Board]:
         grid = Table.grid(padding=(0, 2))
         for name, share in [*board.lines, ("all", board.share)]:
             filled = round(30 * share)
-            grid.add_row(Text(name), Text("█" * filled + "·" * (30 - filled)), Text(f"{100 * share:.0f} %"))
+            grid.add_row(
+                Text(name), Text("█" * filled + "·" * (30 - filled)), Text(f"{100 * share:.0f} %")
+            )
         left = board.left_s
         grid.add_row(Text("" if left is None else f"about {_span(left)} left"))
         return grid

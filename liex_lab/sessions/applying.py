@@ -66,11 +66,13 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
 
 def _turned_round(
     session: Session, track: Track, index: Rows, spans: Sequence[FlipSpan]
-) -> tuple[Track, tuple[Flip, ...], Rows]:  # fmt: skip
+) -> tuple[Track, tuple[Flip, ...], Rows]:
     """The track made again from what the single frames said, with the spans turned round; far from them it stays."""
     seen, subject = read_evidence(session)
     wanted = [Flip(*_rows_of(index, span), 1.0, True, HUMAN) for span in spans]
-    earlier = [flip for flip in read_flips(session) if flip.source == HUMAN]  # of versions that wrote into the table
+    earlier = [
+        flip for flip in read_flips(session) if flip.source == HUMAN
+    ]  # of versions that wrote into the table
     again = track_whole(subject, seen, [*earlier, *wanted])
     near = np.zeros(len(index), bool)
     for flip in wanted:
@@ -83,7 +85,7 @@ def _turned_round(
 
 def place_joints(
     track: Track, index: Rows, moves: Sequence[JointMove], camera: Camera, T_arena_camera: SE3
-) -> Rows:  # fmt: skip
+) -> Rows:
     """Put joints where a person says, in place, and let the others follow; returns the rows that this changed.
 
     A local fit of the chain: bones keep their lengths and joints their limits, and those that nobody placed stay as
@@ -96,18 +98,29 @@ def place_joints(
     weight = np.ones((len(rows), skeleton.n_joints))
     points = track.joints_mm[rows].copy()
     for move in moves:
-        k, j = int(np.searchsorted(rows, np.searchsorted(index, move.frame))), names.index(move.joint)
+        k, j = (
+            int(np.searchsorted(rows, np.searchsorted(index, move.frame))),
+            names.index(move.joint),
+        )
         points[k, j], weight[k, j] = (move.x_mm, move.y_mm, move.z_mm), _HELD
     if not np.isfinite(points).all():
-        raise SessionError("a joint was moved in a frame that has no pose; take that correction back")
+        raise SessionError(
+            "a joint was moved in a frame that has no pose; take that correction back"
+        )
     limits = skeleton.limits
-    start = Pose(SE3(track.root_rotation[rows], track.root_mm[rows]),
-                 np.clip(track.angles_rad[rows], limits[..., 0], limits[..., 1]), track.scale[rows])  # fmt: skip
+    start = Pose(
+        SE3(track.root_rotation[rows], track.root_mm[rows]),
+        np.clip(track.angles_rad[rows], limits[..., 0], limits[..., 1]),
+        track.scale[rows],
+    )
     for k in range(len(rows)):
         pull = np.diag(weight[k])
         fit = fit_poses(skeleton, (pull @ points[k])[None], pull, start[k : k + 1], keep_scale=True)
         row, pose = rows[k], fit.pose
-        track.root_rotation[row], track.root_mm[row] = pose.root.rotation[0], pose.root.translation[0]
+        track.root_rotation[row], track.root_mm[row] = (
+            pose.root.rotation[0],
+            pose.root.translation[0],
+        )
         track.angles_rad[row], track.joints_mm[row] = pose.angles[0], pose.joints(skeleton)[0]
     track.uv_px[rows] = camera.project(T_arena_camera.inverse() @ track.joints_mm[rows])
     track.bridged[rows], track.flag[rows] = False, CORRECTED
@@ -115,10 +128,14 @@ def place_joints(
 
 
 def _rows_of(index: Rows, span: FlipSpan) -> tuple[int, int]:
-    return int(np.searchsorted(index, span.start_frame)), int(np.searchsorted(index, span.stop_frame))
+    return int(np.searchsorted(index, span.start_frame)), int(
+        np.searchsorted(index, span.stop_frame)
+    )
 
 
-def edited_bouts(bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.DataFrame) -> pd.DataFrame:
+def edited_bouts(
+    bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.DataFrame
+) -> pd.DataFrame:
     """The columns of `tables.BOUTS` of an ethogram with a person's edits, one after the other.
 
     Each clears the bout that it edits, then its own span: a bout that reaches into it keeps what lies outside. What a
@@ -126,14 +143,18 @@ def edited_bouts(bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.Data
     """
     rows = _spans(bouts, frames)
     for edit in edits:
-        rows = _cleared(_cleared(rows, edit.was_start_ns, edit.was_stop_ns), edit.start_ns, edit.stop_ns)
+        rows = _cleared(
+            _cleared(rows, edit.was_start_ns, edit.was_stop_ns), edit.start_ns, edit.stop_ns
+        )
         if edit.action:
             said = {"action": edit.action, "score": 1.0, "source": HUMAN, "model_hash": ""}
             rows.append({**said, "start_ns": edit.start_ns, "stop_ns": edit.stop_ns})
     return _table(rows, frames)
 
 
-def spliced_bouts(bouts: pd.DataFrame, other: pd.DataFrame, rows: Rows, frames: pd.DataFrame) -> pd.DataFrame:
+def spliced_bouts(
+    bouts: pd.DataFrame, other: pd.DataFrame, rows: Rows, frames: pd.DataFrame
+) -> pd.DataFrame:
     """The bouts of one ethogram, and in some rows of the recording those of another; one word across a seam is one
     bout.
     """
@@ -158,7 +179,9 @@ def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
     """Bouts as rows with their ends on the recording's clock: the frames' own times where they are one."""
     times = frames["time_ns"].to_numpy(np.int64)
     rows: list[dict[str, Any]] = []
-    for row in bouts[["action", "start_s", "stop_s", "score", "source", "model_hash"]].to_dict("records"):
+    for row in bouts[["action", "start_s", "stop_s", "score", "source", "model_hash"]].to_dict(
+        "records"
+    ):
         ends = [int(times[0]) + round(1e9 * row[name]) for name in ("start_s", "stop_s")]
         nearest = [int(times[min(np.searchsorted(times, end - 1), len(times) - 1)]) for end in ends]
         start, stop = (b if abs(a - b) <= 1 else a for a, b in zip(ends, nearest, strict=True))
@@ -180,18 +203,29 @@ def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[di
 
 def _table(rows: Sequence[dict[str, Any]], frames: pd.DataFrame) -> pd.DataFrame:
     """Rows in order of time as the table; a piece of a bout without a frame is none."""
-    times, count = frames["time_ns"].to_numpy(np.int64), frame_count(frames["frame_index"].to_numpy(np.int64))
+    times, count = (
+        frames["time_ns"].to_numpy(np.int64),
+        frame_count(frames["frame_index"].to_numpy(np.int64)),
+    )
     first, made = int(times[0]), []
     for row in sorted(rows, key=lambda row: row["start_ns"]):
         a, b = np.searchsorted(times, [row["start_ns"], row["stop_ns"]])
         if a == b:
             continue
         start_s, stop_s = ((row[name] - first) * 1e-9 for name in ("start_ns", "stop_ns"))
-        made.append({
-            "session_id": frames["session_id"].iloc[0], "individual": frames["individual"].iloc[0],
-            **{name: row[name] for name in ("action", "score", "source", "model_hash")},
-            "start_s": start_s, "stop_s": stop_s, "duration_s": stop_s - start_s,
-            "start_frame": int(count[a]), "stop_frame": int(count[b]),
-        })  # fmt: skip
+        made.append(
+            {
+                "session_id": frames["session_id"].iloc[0],
+                "individual": frames["individual"].iloc[0],
+                **{name: row[name] for name in ("action", "score", "source", "model_hash")},
+                "start_s": start_s,
+                "stop_s": stop_s,
+                "duration_s": stop_s - start_s,
+                "start_frame": int(count[a]),
+                "stop_frame": int(count[b]),
+            }
+        )
     table = pd.DataFrame(made, columns=[column.name for column in BOUTS])
-    return table.astype({column.name: "str" if column.dtype == "string" else column.dtype for column in BOUTS})
+    return table.astype(
+        {column.name: "str" if column.dtype == "string" else column.dtype for column in BOUTS}
+    )

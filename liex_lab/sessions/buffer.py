@@ -22,7 +22,11 @@ class Columnar(Protocol):
 
 def columns_of(rows: Columnar) -> dict[str, NDArray[Any]]:
     """The arrays of a dataclass by name, in its own order."""
-    return {one.name: value for one in fields(rows) if isinstance(value := getattr(rows, one.name), np.ndarray)}
+    return {
+        one.name: value
+        for one in fields(rows)
+        if isinstance(value := getattr(rows, one.name), np.ndarray)
+    }
 
 
 class TrackBuffer:
@@ -44,7 +48,9 @@ class TrackBuffer:
         needed = self._n + part.n_frames
         if needed > self._room.n_frames:
             more = max(needed - self._room.n_frames, self._room.n_frames // 2)
-            self._room = Track.join([self._room, Track.empty(part.skeleton, np.zeros(more, np.int64))])
+            self._room = Track.join(
+                [self._room, Track.empty(part.skeleton, np.zeros(more, np.int64))]
+            )
         for column in fields(Track):
             if column.name != "skeleton":
                 getattr(self._room, column.name)[self._n : needed] = getattr(part, column.name)
@@ -54,4 +60,6 @@ class TrackBuffer:
     def track(self) -> Track:
         """The rows so far, not copied."""
         columns = [column.name for column in fields(Track) if column.name != "skeleton"]
-        return Track(self._room.skeleton, *(getattr(self._room, name)[: self._n] for name in columns))
+        return Track(
+            self._room.skeleton, *(getattr(self._room, name)[: self._n] for name in columns)
+        )

@@ -23,8 +23,16 @@ from liex_lab.errors import SessionError
 from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.lock import take_lock
 
-EVERY_S = 3.0  # between two checkpoints: as much work is lost at most, besides what it takes to begin
-_STATE, _LOCK, _SEEN, _INPUT, STRETCHES = "checkpoint.json", "lock", "seen", "input.json", "stretches"
+EVERY_S = (
+    3.0  # between two checkpoints: as much work is lost at most, besides what it takes to begin
+)
+_STATE, _LOCK, _SEEN, _INPUT, STRETCHES = (
+    "checkpoint.json",
+    "lock",
+    "seen",
+    "input.json",
+    "stretches",
+)
 _MOST_S = 1e10  # of work: three hundred years; whole numbers beyond what a float holds are no seconds either
 _MOST = 1 << 20  # values of one column that a frame may have
 OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES)  # what is no part of the finished session
@@ -56,13 +64,17 @@ class State:
 class Checkpoint:
     """The folder of an unfinished session, held by this process alone."""
 
-    def __init__(self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic
+    ) -> None:
         """Begin, or go on where a session of the same facts (JSON) was left. clock: seconds that never jump."""
         folder.mkdir(parents=True, exist_ok=True)
         check_free(folder)
         held = take_lock(folder / _LOCK)
         if held is None:  # taken in between
-            raise SessionError(f"another process has just begun to write {folder}; wait until it is done")
+            raise SessionError(
+                f"another process has just begun to write {folder}; wait until it is done"
+            )
         self.folder, self._held, self._clock = folder, held, clock
         text = json.dumps(facts, sort_keys=True, default=str)
         key = hashlib.sha256(text.encode()).hexdigest()
@@ -85,8 +97,20 @@ class Checkpoint:
     def save(self, n_frames: int, seconds: float, logs: Mapping[str, int]) -> None:
         """Take down that everything up to a frame is on disk; logs: the bytes of each log's present part."""
         self.seen.flush()
-        present = {name: [*self.state.logs.get(name, [])[: self.n_parts - 1], size] for name, size in logs.items()}
-        self._keep(State(self.state.key, n_frames, round(seconds, 3), self.state.runs, present, self.state.stretches))
+        present = {
+            name: [*self.state.logs.get(name, [])[: self.n_parts - 1], size]
+            for name, size in logs.items()
+        }
+        self._keep(
+            State(
+                self.state.key,
+                n_frames,
+                round(seconds, 3),
+                self.state.runs,
+                present,
+                self.state.stretches,
+            )
+        )
 
     def take(self, n_frames: int, seconds: float, logs: Mapping[str, Path]) -> None:
         """Take over the next part of each log, written by another process; what was seen in it is in `seen` already."""
@@ -95,7 +119,11 @@ class Checkpoint:
         for log, path in logs.items():
             sizes[log] = [*self.state.logs.get(log, [])[:k], path.stat().st_size]
             path.replace(self.part(log, k))
-        self._keep(State(self.state.key, n_frames, round(seconds, 3), k + 1, sizes, self.state.stretches + 1))
+        self._keep(
+            State(
+                self.state.key, n_frames, round(seconds, 3), k + 1, sizes, self.state.stretches + 1
+            )
+        )
         self.state.runs += 1  # the next part, not begun yet
 
     def _keep(self, state: State) -> None:
@@ -177,8 +205,14 @@ class Checkpoint:
                     return False
                 with path.open("r+b") as file:
                     file.truncate(size)
-        for path in self.folder.iterdir():  # half-written tables, and parts begun after the checkpoint
-            known = {self.part(log, k).name for log, sizes in state.logs.items() for k in range(len(sizes))}
+        for (
+            path
+        ) in self.folder.iterdir():  # half-written tables, and parts begun after the checkpoint
+            known = {
+                self.part(log, k).name
+                for log, sizes in state.logs.items()
+                for k in range(len(sizes))
+            }
             if path.name not in {*OWN, *known}:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         return Columns.cut(self.folder / _SEEN, state.n_frames)
@@ -199,7 +233,9 @@ class Columns:
 
     def append(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """The next rows (n, ...) of every column."""
-        kinds = {name: (values.dtype.str, list(values.shape[1:])) for name, values in columns.items()}
+        kinds = {
+            name: (values.dtype.str, list(values.shape[1:])) for name, values in columns.items()
+        }
         if not self._kinds:
             write_whole(self._folder / "columns.json", json.dumps(kinds))
             self._kinds = kinds
@@ -292,7 +328,9 @@ def _read_state(path: Path) -> State | None:
         counts = [state.n_frames, state.runs, state.stretches, *sizes]
         sound = isinstance(state.key, str) and 0.0 <= state.seconds < _MOST_S
         sound = sound and all(isinstance(n, int) and n >= 0 for n in counts)
-        sound = sound and all(log in LOGS and len(parts) == state.runs for log, parts in state.logs.items())
+        sound = sound and all(
+            log in LOGS and len(parts) == state.runs for log, parts in state.logs.items()
+        )
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return None
     return state if sound else None
@@ -302,7 +340,10 @@ def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
     """What columns.json says of the columns: dtype and shape of a row by name; None where it makes no sense."""
     try:
         found: dict[str, Any] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
-        kinds = {name: (np.dtype(str(kind)), [int(n) for n in shape]) for name, (kind, shape) in found.items()}
+        kinds = {
+            name: (np.dtype(str(kind)), [int(n) for n in shape])
+            for name, (kind, shape) in found.items()
+        }
     except (OSError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
         return None
     sound = all(name.isidentifier() and dtype.kind in "biufU" for name, (dtype, _) in kinds.items())

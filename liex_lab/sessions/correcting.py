@@ -39,7 +39,9 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
     row, was = _joint_row(session, frame, joint)
     place = np.asarray(place_mm, float)
     if place.shape != (3,) or not np.isfinite(place).all():
-        raise SessionError(f"a joint's place is x, y and z in mm of the arena frame, got {place_mm}")
+        raise SessionError(
+            f"a joint's place is x, y and z in mm of the arena frame, got {place_mm}"
+        )
     length, off = float(session.frames["spine_mm"].iloc[row]), float(np.linalg.norm(place - was))
     if off > length:
         raise SessionError(
@@ -49,7 +51,9 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
     return JointMove(int(frame), joint, *(round(float(x), 3) for x in place))
 
 
-def joint_move_at_pixel(session: Session, frame: int, joint: str, u_px: float, v_px: float) -> JointMove:
+def joint_move_at_pixel(
+    session: Session, frame: int, joint: str, u_px: float, v_px: float
+) -> JointMove:
     """A joint of one frame lies under the pixel (u_px, v_px) of the depth picture.
 
     The depth there is that of the skin; the joint is put as deep under it as it usually lies: the median over frames
@@ -59,8 +63,12 @@ def joint_move_at_pixel(session: Session, frame: int, joint: str, u_px: float, v
 
     row, _ = _joint_row(session, frame, joint)
     camera = session.camera
-    if not (math.isfinite(u_px) and math.isfinite(v_px) and 0 <= round(u_px) < camera.width
-            and 0 <= round(v_px) < camera.height):  # fmt: skip
+    if not (
+        math.isfinite(u_px)
+        and math.isfinite(v_px)
+        and 0 <= round(u_px) < camera.width
+        and 0 <= round(v_px) < camera.height
+    ):
         raise SessionError(
             f"a pixel is a column and a row of the depth picture of {camera.width} x {camera.height}, the top-left one "
             f"(0, 0); got ({u_px:g}, {v_px:g})"
@@ -88,9 +96,17 @@ def _inset_mm(session: Session, recording: Any, joint: str) -> float:
     """How much farther from the camera than the skin seen at its pixel a joint usually is, mm."""
     frames = session.frames
     poses = session.poses[session.poses["joint"] == joint]
-    usable = np.flatnonzero((frames["flag"].to_numpy() == "") & np.isfinite(poses["u_px"].to_numpy(float)))
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _INSET_FRAMES).astype(int))] if len(usable) else usable
-    uv, places = (poses[names].to_numpy(float) for names in (["u_px", "v_px"], ["x_mm", "y_mm", "z_mm"]))
+    usable = np.flatnonzero(
+        (frames["flag"].to_numpy() == "") & np.isfinite(poses["u_px"].to_numpy(float))
+    )
+    chosen = (
+        usable[np.unique(np.linspace(0, len(usable) - 1, _INSET_FRAMES).astype(int))]
+        if len(usable)
+        else usable
+    )
+    uv, places = (
+        poses[names].to_numpy(float) for names in (["u_px", "v_px"], ["x_mm", "y_mm", "z_mm"])
+    )
     into = session.T_arena_camera.inverse()
     found = []
     for row in chosen:
@@ -108,12 +124,18 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
         starts, stops = (bouts[name].to_numpy(float) for name in ("start_s", "stop_s"))
         off = np.maximum(starts - at_s, at_s - stops)
         near = bouts.iloc[np.sort(np.argsort(off)[:2])]
-        told = " and ".join(f"{b.action} from {b.start_s:.3f} to {b.stop_s:.3f} s" for b in near.itertuples())
-        raise SessionError(f"no bout holds {at_s:g} s; {f'the nearest are {told}' if told else 'there are none'}")
+        told = " and ".join(
+            f"{b.action} from {b.start_s:.3f} to {b.stop_s:.3f} s" for b in near.itertuples()
+        )
+        raise SessionError(
+            f"no bout holds {at_s:g} s; {f'the nearest are {told}' if told else 'there are none'}"
+        )
     return {str(k): v for k, v in inside.iloc[0].items()}
 
 
-def add_bout(session: Session, action: str, start_s: float, stop_s: float, *, new_word: bool = False) -> BoutEdit:
+def add_bout(
+    session: Session, action: str, start_s: float, stop_s: float, *, new_word: bool = False
+) -> BoutEdit:
     """From start_s to stop_s the animal does `action`; what other bouts say of that time goes.
 
     new_word: the action need not be one of the ethogram's words.
@@ -133,7 +155,9 @@ def recut_bout(session: Session, at_s: float, start_s: float, stop_s: float) -> 
     """The bout at at_s goes from start_s to stop_s."""
     bout = bout_at(session, at_s)
     word = str(bout["action"])
-    return BoutEdit("recut", word, *span_ns(session, start_s, stop_s), word, *_span_of(session, bout))
+    return BoutEdit(
+        "recut", word, *span_ns(session, start_s, stop_s), word, *_span_of(session, bout)
+    )
 
 
 def delete_bout(session: Session, at_s: float) -> BoutEdit:
@@ -151,13 +175,23 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
     from liex_lab.actions.labels import words_of
 
     time_ns, time_s = (session.frames[name].to_numpy() for name in ("time_ns", "time_s"))
-    named = session.name if "session_id" in labels and session.name in set(labels["session_id"].astype(str)) else ""
+    named = (
+        session.name
+        if "session_id" in labels and session.name in set(labels["session_id"].astype(str))
+        else ""
+    )
     bouts = Ethogram.of_words(words_of(labels, time_s, named), time_ns).bouts
     if not bouts:
-        raise SessionError(f"none of these labels lies within the session {session.name}; check their times and names")
+        raise SessionError(
+            f"none of these labels lies within the session {session.name}; check their times and names"
+        )
     first, last = int(time_ns[0]), _end_ns(session)
     edges = [first, *(t for bout in bouts for t in (bout.start_ns, bout.stop_ns)), last]
-    free = [BoutEdit("delete", "", a, b, "any") for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
+    free = [
+        BoutEdit("delete", "", a, b, "any")
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        if a < b
+    ]
     return [*free, *(BoutEdit("add", bout.action, bout.start_ns, bout.stop_ns) for bout in bouts)]
 
 
@@ -214,8 +248,14 @@ def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
     index = session.frames["frame_index"].to_numpy(np.int64)
     row = int(np.searchsorted(index, frame))
     if row == len(index) or index[row] != frame:
-        raise SessionError(f"there is no frame {frame}; the recording has {index[0]} to {index[-1]}")
-    place = session.poses[["x_mm", "y_mm", "z_mm"]].iloc[row * len(joints) + joints.index(joint)].to_numpy(float)
+        raise SessionError(
+            f"there is no frame {frame}; the recording has {index[0]} to {index[-1]}"
+        )
+    place = (
+        session.poses[["x_mm", "y_mm", "z_mm"]]
+        .iloc[row * len(joints) + joints.index(joint)]
+        .to_numpy(float)
+    )
     if not np.isfinite(place).all():
         raise SessionError(
             f"frame {frame} has no pose, so no joint of it can be moved; joints are moved where the animal was found"

@@ -21,7 +21,13 @@ from liex_lab.errors import SessionError
 
 FOLDER, LOG, REPLAY = "corrected", "corrections.json", "corrected.rrd"
 SCHEMA_VERSION = 1
-FACTS = {"frames", "actions", "action_model", "unresolved_actions", "corrections"}  # sections that may change
+FACTS = {
+    "frames",
+    "actions",
+    "action_model",
+    "unresolved_actions",
+    "corrections",
+}  # sections that may change
 EDITS = ("add", "rename", "recut", "delete")
 
 
@@ -140,7 +146,9 @@ class Log:
     def standing(self) -> tuple[Entry, ...]:
         """The corrections that nobody took back, in the order in which they were made."""
         gone = {entry.undoes for entry in self.entries if entry.what is None}
-        return tuple(entry for entry in self.entries if entry.what is not None and entry.number not in gone)
+        return tuple(
+            entry for entry in self.entries if entry.what is not None and entry.number not in gone
+        )
 
     def corrections(self, kind: type[Any]) -> list[Any]:
         """The standing corrections of one kind."""
@@ -152,7 +160,9 @@ class Log:
         for number in undo:
             if number not in known:
                 told = ", ".join(str(n) for n in sorted(known)) or "none"
-                raise SessionError(f"there is no correction {number} to take back; those that stand are {told}")
+                raise SessionError(
+                    f"there is no correction {number} to take back; those that stand are {told}"
+                )
         who, now = author or author_name(), datetime.now(UTC).isoformat(timespec="seconds")
         number = max((entry.number for entry in self.entries), default=0)
         new: list[Entry] = []
@@ -164,10 +174,12 @@ class Log:
     def to_json(self) -> str:
         """The content of corrections.json."""
         document = {
-            "schema_version": SCHEMA_VERSION, "made_of": self.made_of,
+            "schema_version": SCHEMA_VERSION,
+            "made_of": self.made_of,
             "entries": [entry.to_dict() for entry in self.entries],
-            "files": {name: dict(facts) for name, facts in self.files.items()}, "facts": dict(self.facts),
-        }  # fmt: skip
+            "files": {name: dict(facts) for name, facts in self.files.items()},
+            "facts": dict(self.facts),
+        }
         plain = json.loads(json.dumps(document, default=str, allow_nan=False))
         return json.dumps({**plain, "sum": _sum(plain)}, indent=1, ensure_ascii=False) + "\n"
 
@@ -197,7 +209,11 @@ def basis(session: Path, metadata: Mapping[str, Any]) -> str:
     stated, found = metadata.get("files") or {}, []
     for name in ("poses.parquet", "bouts.parquet", "flips.parquet"):
         facts = stated.get(name) if isinstance(stated, dict) else None
-        found.append(str(facts["sha256"]) if isinstance(facts, dict) and "sha256" in facts else sha256(session / name))
+        found.append(
+            str(facts["sha256"])
+            if isinstance(facts, dict) and "sha256" in facts
+            else sha256(session / name)
+        )
     return "-".join(one[:16] for one in found)
 
 
@@ -221,13 +237,24 @@ def read_log(session: Path) -> Log:
             raise ValueError("its sum does not fit, so it was changed")
         entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
         files, facts = document.get("files", {}), document.get("facts", {})
-        if not (isinstance(files, dict) and isinstance(facts, dict)
-                and all(isinstance(one, dict) for one in (*files.values(), *facts.values()))):  # fmt: skip
+        if not (
+            isinstance(files, dict)
+            and isinstance(facts, dict)
+            and all(isinstance(one, dict) for one in (*files.values(), *facts.values()))
+        ):
             raise TypeError("files and facts are tables of tables")
         if not set(facts) <= FACTS:
             raise ValueError(f"facts of {', '.join(sorted(set(facts) - FACTS))}")
         return Log(str(document["made_of"]), entries, files, facts)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         raise SessionError(
             f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it, or remove the folder "
             f"{FOLDER} to go on with what was measured"

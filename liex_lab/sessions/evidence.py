@@ -32,12 +32,18 @@ _BLOCK = 16_384  # frames that are in memory at a time
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     """Write observations.npz: every frame's hypotheses, and whom they are of; no pickle."""
     facts = {
-        "skeleton": subject.skeleton.table, "length_mm": subject.length_mm, "doubtful_mm": subject.doubtful_mm,
-        "bridge_s": subject.bridge_s, "joint_share": list(subject.joint_share), "stretch_sd": subject.stretch_sd,
-    }  # fmt: skip
+        "skeleton": subject.skeleton.table,
+        "length_mm": subject.length_mm,
+        "doubtful_mm": subject.doubtful_mm,
+        "bridge_s": subject.bridge_s,
+        "joint_share": list(subject.joint_share),
+        "stretch_sd": subject.stretch_sd,
+    }
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
-    with zipfile.ZipFile(folder / FILE, "w", zipfile.ZIP_DEFLATED) as kept:  # as np.savez_compressed, a part at a time
+    with zipfile.ZipFile(
+        folder / FILE, "w", zipfile.ZIP_DEFLATED
+    ) as kept:  # as np.savez_compressed, a part at a time
         for name, values in columns.items():
             with kept.open(f"{name}.npy", "w", force_zip64=True) as file:
                 kind = np.lib.format.dtype_to_descr(values.dtype)
@@ -72,10 +78,15 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
         _check_shapes(seen, len(session.frames))
         stretch = facts.get("stretch_sd")  # sessions of earlier versions do not tell
         subject = Subject(
-            skeleton, session.camera, session.T_arena_camera, float(facts["length_mm"]), float(facts["doubtful_mm"]),
-            float(facts["bridge_s"]), tuple(float(share) for share in facts["joint_share"]),
+            skeleton,
+            session.camera,
+            session.T_arena_camera,
+            float(facts["length_mm"]),
+            float(facts["doubtful_mm"]),
+            float(facts["bridge_s"]),
+            tuple(float(share) for share in facts["joint_share"]),
             None if stretch is None else float(stretch),
-        )  # fmt: skip
+        )
     return seen, subject
 
 
@@ -85,7 +96,9 @@ def _check_shapes(seen: Observations, n_frames: int) -> None:
     for name in COLUMNS:
         found, expected = getattr(seen, name), getattr(wanted, name)
         if (found.shape, found.dtype) != (expected.shape, expected.dtype):
-            raise ValueError(f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}")
+            raise ValueError(
+                f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}"
+            )
 
 
 def read_flips(session: Session) -> list[Flip]:
@@ -94,11 +107,15 @@ def read_flips(session: Session) -> list[Flip]:
     with reading_from(session.path / "flips.parquet"):
         return [
             Flip(
-                int(np.searchsorted(index, row["start_frame"])), int(np.searchsorted(index, row["stop_frame"])),
-                float(row["p_flip"]), bool(row["applied"]), str(row["source"]), str(row.get("undone_at", "")),
+                int(np.searchsorted(index, row["start_frame"])),
+                int(np.searchsorted(index, row["stop_frame"])),
+                float(row["p_flip"]),
+                bool(row["applied"]),
+                str(row["source"]),
+                str(row.get("undone_at", "")),
             )
             for row in _rows_of(session.flips)
-        ]  # fmt: skip
+        ]
 
 
 def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
@@ -106,14 +123,28 @@ def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
     about, camera = session.metadata, session.metadata["camera"]
     source, home = about["input"], {"name", "joints", "bones", "home_length_mm"}
     return Provenance(
-        name=session.name, skeleton=skeleton, camera=session.camera, T_arena_camera=session.T_arena_camera,
-        floor_distance_mm=camera["floor_distance_mm"], input_sha256=source["sha256"], plan_toml=session.plan,
-        format=source["format"], profile=source.get("profile", {}), individual=about["individual"],
-        n_frames=len(session.frames), gaps=_camera_gaps(session), problems=about["problems"],
-        truncated=source["truncated"], subject=about["subject"], session_start_time=about["session_start_time"] or "",
-        model=about["model"], animal_size={k: v for k, v in about["animal"].items() if k not in home},
-        optics=camera.get("optics", {}), arena=session.arena, zones=session.zones,
-    )  # fmt: skip
+        name=session.name,
+        skeleton=skeleton,
+        camera=session.camera,
+        T_arena_camera=session.T_arena_camera,
+        floor_distance_mm=camera["floor_distance_mm"],
+        input_sha256=source["sha256"],
+        plan_toml=session.plan,
+        format=source["format"],
+        profile=source.get("profile", {}),
+        individual=about["individual"],
+        n_frames=len(session.frames),
+        gaps=_camera_gaps(session),
+        problems=about["problems"],
+        truncated=source["truncated"],
+        subject=about["subject"],
+        session_start_time=about["session_start_time"] or "",
+        model=about["model"],
+        animal_size={k: v for k, v in about["animal"].items() if k not in home},
+        optics=camera.get("optics", {}),
+        arena=session.arena,
+        zones=session.zones,
+    )
 
 
 def _camera_gaps(session: Session) -> list[Gap]:
@@ -121,9 +152,21 @@ def _camera_gaps(session: Session) -> list[Gap]:
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
     found = []
     for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
-        at, missing = int(times[np.searchsorted(index, row["start_frame"])]), int(row["n_frames_missing"])
+        at, missing = (
+            int(times[np.searchsorted(index, row["start_frame"])]),
+            int(row["n_frames_missing"]),
+        )
         first = at - round(1e9 * (row["stop_s"] - row["start_s"])) if missing else at
-        found.append(Gap(int(row["start_frame"]), int(row["stop_frame"]), first, at, missing, str(row["reason"])))
+        found.append(
+            Gap(
+                int(row["start_frame"]),
+                int(row["stop_frame"]),
+                first,
+                at,
+                missing,
+                str(row["reason"]),
+            )
+        )
     return found
 
 

@@ -28,13 +28,22 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
         reason = f"the system refused{where}: {error.strerror or error}"
         remedy = "make room, correct the permissions or mend the drive, and try again"
     elif isinstance(error, MemoryError):
-        reason, remedy = "the memory was not enough", "give each worker more memory, or use fewer workers"
+        reason, remedy = (
+            "the memory was not enough",
+            "give each worker more memory, or use fewer workers",
+        )
     else:
         reason, remedy = f"{type(error).__name__}: {error}", _REPORT
     told: dict[str, Any] = {
-        "stage": stage, "frame": frame, "reason": reason, "remedy": remedy, "kind": type(error).__name__,
-        "at": datetime.now(UTC).isoformat(timespec="seconds"), "machine": platform.node(), "versions": versions(),
-    }  # fmt: skip
+        "stage": stage,
+        "frame": frame,
+        "reason": reason,
+        "remedy": remedy,
+        "kind": type(error).__name__,
+        "at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": platform.node(),
+        "versions": versions(),
+    }
     return {**told, "traceback": traceback.format_exception(error)} if ours else told
 
 
@@ -69,4 +78,9 @@ def read_failure(folder: Path) -> dict[str, Any] | None:
             return found
     except (ValueError, OSError, RecursionError):
         pass
-    return {"reason": f"{path} cannot be read", "stage": "", "frame": None, "remedy": "try the session again"}
+    return {
+        "reason": f"{path} cannot be read",
+        "stage": "",
+        "frame": None,
+        "remedy": "try the session again",
+    }

@@ -47,7 +47,9 @@ def rrd_messages(file: IO[bytes], size: int, start: int = RRD_HEAD) -> Iterator[
         head = file.read(16)
         kind, length = struct.unpack("<QQ", head) if len(head) == 16 else (0, size)
         if at + 16 + length > size:
-            raise SessionError("the replay was not written whole; make room on the disk and run it again")
+            raise SessionError(
+                "the replay was not written whole; make room on the disk and run it again"
+            )
         if kind == _RRD_END:
             return
         yield at, 16 + length
@@ -110,7 +112,9 @@ def _chunks_of(
             break
         at += 9 + length
     if at > end:
-        raise SessionError("the MCAP file was not written whole; make room on the disk and run it again")
+        raise SessionError(
+            "the MCAP file was not written whole; make room on the disk and run it again"
+        )
     return (first or at), at
 
 
@@ -120,10 +124,16 @@ def _chunk_index(file: IO[bytes], offset: int, length: int) -> ChunkIndex:
     compression = file.read(struct.unpack("<I", file.read(4))[0]).decode()
     (compressed,) = struct.unpack("<Q", file.read(8))
     return ChunkIndex(
-        message_start_time=start, message_end_time=stop, chunk_start_offset=offset, chunk_length=length,
-        message_index_offsets={}, message_index_length=0, compression=compression, compressed_size=compressed,
+        message_start_time=start,
+        message_end_time=stop,
+        chunk_start_offset=offset,
+        chunk_length=length,
+        message_index_offsets={},
+        message_index_length=0,
+        compression=compression,
+        compressed_size=compressed,
         uncompressed_size=size,
-    )  # fmt: skip
+    )
 
 
 def _numbered_alike(first: tuple[Path, int | None], known: Known) -> bool:
@@ -166,12 +176,18 @@ def _known_to(path: Path) -> Known:
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     if summary is None:
-        raise SessionError("the MCAP file was not written whole; make room on the disk and run it again")
+        raise SessionError(
+            "the MCAP file was not written whole; make room on the disk and run it again"
+        )
     return list(summary.schemas.values()), list(summary.channels.values())
 
 
 def _finish_mcap(
-    whole: IO[bytes], schemas: list[Schema], channels: list[Channel], indexes: list[ChunkIndex], counts: dict[int, int]
+    whole: IO[bytes],
+    schemas: list[Schema],
+    channels: list[Channel],
+    indexes: list[ChunkIndex],
+    counts: dict[int, int],
 ) -> None:
     """The end of the data and the summary."""
     end = RecordBuilder()
@@ -179,15 +195,22 @@ def _finish_mcap(
     whole.write(end.end())
     start, builder, offsets = whole.tell(), RecordBuilder(), []
     statistics = Statistics(
-        attachment_count=0, channel_count=len(channels), channel_message_counts=counts, chunk_count=len(indexes),
-        message_count=sum(counts.values()), metadata_count=0, schema_count=len(schemas),
+        attachment_count=0,
+        channel_count=len(channels),
+        channel_message_counts=counts,
+        chunk_count=len(indexes),
+        message_count=sum(counts.values()),
+        metadata_count=0,
+        schema_count=len(schemas),
         message_start_time=min((index.message_start_time for index in indexes), default=0),
         message_end_time=max((index.message_end_time for index in indexes), default=0),
-    )  # fmt: skip
+    )
     groups: list[tuple[Opcode, Sequence[Schema | Channel | Statistics | ChunkIndex]]] = [
-        (Opcode.SCHEMA, schemas), (Opcode.CHANNEL, channels), (Opcode.STATISTICS, [statistics]),
+        (Opcode.SCHEMA, schemas),
+        (Opcode.CHANNEL, channels),
+        (Opcode.STATISTICS, [statistics]),
         (Opcode.CHUNK_INDEX, indexes),
-    ]  # fmt: skip
+    ]
     for opcode, records in groups:
         group = builder.count
         for record in records:

@@ -21,9 +21,13 @@ _DEPTH_EVERY = 5  # frames; a picture takes longer to send than a skeleton
 class LiveView:
     """A stream of depth and skeletons: into a viewer of this machine ('viewer'), one at an address, or a file .rrd."""
 
-    def __init__(self, name: str, camera: Camera, T_arena_camera: SE3, skeleton: Skeleton, to: str) -> None:
+    def __init__(
+        self, name: str, camera: Camera, T_arena_camera: SE3, skeleton: Skeleton, to: str
+    ) -> None:
         self._edges = skeleton.edges
-        self._stream = rr.RecordingStream("liex_lab", recording_id=f"live-{name}", send_properties=False)
+        self._stream = rr.RecordingStream(
+            "liex_lab", recording_id=f"live-{name}", send_properties=False
+        )
         if to == "viewer":
             os.environ["RERUN_ANALYTICS"] = "0"
             self._stream.spawn(connect=True)
@@ -32,11 +36,15 @@ class LiveView:
         else:
             self._stream.connect_grpc(to)
         self._stream.log("arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        place = rr.Transform3D(translation=T_arena_camera.translation / MM_PER_UNIT, mat3x3=T_arena_camera.rotation)
+        place = rr.Transform3D(
+            translation=T_arena_camera.translation / MM_PER_UNIT, mat3x3=T_arena_camera.rotation
+        )
         self._stream.log("arena/camera", place, static=True)
         matrix = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
         lens = rr.Pinhole(
-            image_from_camera=matrix, resolution=[camera.width, camera.height], camera_xyz=rr.ViewCoordinates.RDF
+            image_from_camera=matrix,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
         )
         self._stream.log(IMAGE, lens, static=True)
         self._first_ns: int | None = None

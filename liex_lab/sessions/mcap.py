@@ -41,7 +41,10 @@ _ACTION_SCHEMA = {
             "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
         },
         "action": {"type": "string"},
-        "index": {"type": "integer", "description": "place of the word in the vocabulary, -1 for none"},
+        "index": {
+            "type": "integer",
+            "description": "place of the word in the vocabulary, -1 for none",
+        },
         "frame_index": {"type": "integer"},
     },
 }
@@ -52,18 +55,27 @@ _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 class McapWriter:
     """Writes `session.mcap`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`."""
 
-    def __init__(self, path: Path, origin: Provenance, *, level: int = 0, chunk_size: int = 128 * 1024) -> None:
+    def __init__(
+        self, path: Path, origin: Provenance, *, level: int = 0, chunk_size: int = 128 * 1024
+    ) -> None:
         """level: of compression, 0 for the usual one, 22 for the smallest file; chunk_size: bytes packed at once."""
         self._origin = origin
-        self._context = foxglove.Context()  # the global one would also receive every other writer's messages
+        self._context = (
+            foxglove.Context()
+        )  # the global one would also receive every other writer's messages
         options = MCAPWriteOptions(
-            compression=MCAPCompression.Zstd, compression_level=level, chunk_size=chunk_size, compression_threads=0,
+            compression=MCAPCompression.Zstd,
+            compression_level=level,
+            chunk_size=chunk_size,
+            compression_threads=0,
             profile="liex_lab",
-        )  # fmt: skip
+        )
         self._file = _WatchedFile(path)
         self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
         self._depth = channels.RawImageChannel("/camera/depth", context=self._context)
-        self._calibration = channels.CameraCalibrationChannel("/camera/calibration", context=self._context)
+        self._calibration = channels.CameraCalibrationChannel(
+            "/camera/calibration", context=self._context
+        )
         self._transforms = channels.FrameTransformsChannel("/tf", context=self._context)
         self._scene = channels.SceneUpdateChannel("/skeleton/scene", context=self._context)
         self._poses = channels.PosesInFrameChannel("/skeleton/joints", context=self._context)
@@ -81,13 +93,20 @@ class McapWriter:
                 self._log_camera(int(time_ns))
             height, width = image.shape
             message = messages.RawImage(
-                timestamp=_stamp(time_ns), frame_id="camera", encoding="16UC1", width=width, height=height,
-                step=2 * width, data=image.astype("<u2", copy=False).tobytes(),
-            )  # fmt: skip
+                timestamp=_stamp(time_ns),
+                frame_id="camera",
+                encoding="16UC1",
+                width=width,
+                height=height,
+                step=2 * width,
+                data=image.astype("<u2", copy=False).tobytes(),
+            )
             self._depth.log(message, log_time=int(time_ns))
         self._file.check()
 
-    def finish(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]) -> None:
+    def finish(
+        self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
+    ) -> None:
         """Skeleton, transforms, actions and notes of the whole track; closes the file."""
         track = rows.track
         for part in blocks(track.n_frames, _BLOCK):
@@ -102,7 +121,9 @@ class McapWriter:
         """Skeleton and transforms of some frames."""
         posed = track.posed
         quaternions = so3.quaternion(np.where(posed[:, None, None], track.root_rotation, np.eye(3)))
-        for i, (time_ns, seen) in enumerate(zip(track.times_ns.tolist(), posed.tolist(), strict=True)):
+        for i, (time_ns, seen) in enumerate(
+            zip(track.times_ns.tolist(), posed.tolist(), strict=True)
+        ):
             joints_m = track.joints_mm[i] / 1000.0
             self._scene.log(self._scene_update(time_ns, joints_m, seen), log_time=time_ns)
             self._poses.log(_joint_poses(time_ns, joints_m, seen), log_time=time_ns)
@@ -130,9 +151,14 @@ class McapWriter:
         self._calibrated_ns = time_ns
         k = camera.matrix
         calibration = messages.CameraCalibration(
-            timestamp=_stamp(time_ns), frame_id="camera", width=camera.width, height=camera.height,
-            K=k.ravel().tolist(), R=np.eye(3).ravel().tolist(), P=np.hstack([k, np.zeros((3, 1))]).ravel().tolist(),
-        )  # fmt: skip
+            timestamp=_stamp(time_ns),
+            frame_id="camera",
+            width=camera.width,
+            height=camera.height,
+            K=k.ravel().tolist(),
+            R=np.eye(3).ravel().tolist(),
+            P=np.hstack([k, np.zeros((3, 1))]).ravel().tolist(),
+        )
         self._calibration.log(calibration, log_time=time_ns)
         transform = _transform(time_ns, "arena", "camera", place.translation, _quaternion(place))
         self._transforms.log(messages.FrameTransforms(transforms=[transform]), log_time=time_ns)
@@ -148,15 +174,25 @@ class McapWriter:
         points = [messages.Point3(x=x, y=y, z=z) for x, y, z in joints_m.tolist()]
         ends = [points[end] for edge in self._origin.skeleton.edges for end in edge]
         lines = messages.LinePrimitive(
-            type=messages.LinePrimitiveLineType.LineList, pose=_place(0.0, 0.0, 0.0), thickness=0.002, points=ends,
+            type=messages.LinePrimitiveLineType.LineList,
+            pose=_place(0.0, 0.0, 0.0),
+            thickness=0.002,
+            points=ends,
             color=_BONE,
-        )  # fmt: skip
+        )
         size = messages.Vector3(x=0.006, y=0.006, z=0.006)
-        spheres = [messages.SpherePrimitive(pose=_place(*xyz), size=size, color=_JOINT) for xyz in joints_m.tolist()]
+        spheres = [
+            messages.SpherePrimitive(pose=_place(*xyz), size=size, color=_JOINT)
+            for xyz in joints_m.tolist()
+        ]
         entity = messages.SceneEntity(
-            timestamp=stamp, frame_id="arena", id="skeleton", lifetime=messages.Duration(sec=0, nsec=0),
-            lines=[lines], spheres=spheres,
-        )  # fmt: skip
+            timestamp=stamp,
+            frame_id="arena",
+            id="skeleton",
+            lifetime=messages.Duration(sec=0, nsec=0),
+            lines=[lines],
+            spheres=spheres,
+        )
         return messages.SceneUpdate(entities=[entity])
 
     def _annotations(self, time_ns: int, uv: Array, seen: bool) -> messages.ImageAnnotations:
@@ -166,15 +202,20 @@ class McapWriter:
         at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
         ends = [at[end] for edge in self._origin.skeleton.edges for end in edge]
         lines = messages.PointsAnnotation(
-            timestamp=_stamp(time_ns), type=messages.PointsAnnotationType.LineList, points=ends, outline_color=_JOINT,
+            timestamp=_stamp(time_ns),
+            type=messages.PointsAnnotationType.LineList,
+            points=ends,
+            outline_color=_JOINT,
             thickness=1.5,
-        )  # fmt: skip
+        )
         return messages.ImageAnnotations(points=[lines])
 
     def _log_actions(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """One message per change, at the time of the frame where it happens."""
         changes: dict[int, str] = {}
-        for start_s, stop_s, action in zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True):
+        for start_s, stop_s, action in zip(
+            bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True
+        ):
             changes[round(start_s * 1e9)] = str(action)
             changes.setdefault(round(stop_s * 1e9), "")
         first = int(rows.track.times_ns[0]) if rows.track.n_frames else 0
@@ -183,15 +224,20 @@ class McapWriter:
             row = min(int(np.searchsorted(elapsed, at)), len(elapsed) - 1)
             sec, nsec = divmod(first + at, _SECOND)
             state = {
-                "timestamp": {"sec": sec, "nsec": nsec}, "action": action,
-                "index": list(words).index(action) if action else -1, "frame_index": int(rows.frame_index[row]),
-            }  # fmt: skip
+                "timestamp": {"sec": sec, "nsec": nsec},
+                "action": action,
+                "index": list(words).index(action) if action else -1,
+                "frame_index": int(rows.frame_index[row]),
+            }
             self._actions.log(json.dumps(state).encode(), log_time=first + at)
 
     def _log_notes(self, time_ns: int, problems: Sequence[str]) -> None:
         for problem in problems:
             note = messages.Log(
-                timestamp=_stamp(time_ns), level=messages.LogLevel.Warning, message=problem, name="liex_lab"
+                timestamp=_stamp(time_ns),
+                level=messages.LogLevel.Warning,
+                message=problem,
+                name="liex_lab",
             )
             self._log.log(note, log_time=time_ns)
 
@@ -248,17 +294,23 @@ def _joint_poses(time_ns: int, joints_m: Array, seen: bool) -> messages.PosesInF
 
 def _place(x: float, y: float, z: float) -> messages.Pose:
     return messages.Pose(
-        position=messages.Vector3(x=x, y=y, z=z), orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+        position=messages.Vector3(x=x, y=y, z=z),
+        orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
     )
 
 
-def _transform(time_ns: int, parent: str, child: str, translation_mm: Array, wxyz: Array) -> messages.FrameTransform:
+def _transform(
+    time_ns: int, parent: str, child: str, translation_mm: Array, wxyz: Array
+) -> messages.FrameTransform:
     x, y, z = (translation_mm / 1000.0).tolist()
     qw, qx, qy, qz = wxyz.tolist()
     return messages.FrameTransform(
-        timestamp=_stamp(time_ns), parent_frame_id=parent, child_frame_id=child,
-        translation=messages.Vector3(x=x, y=y, z=z), rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
-    )  # fmt: skip
+        timestamp=_stamp(time_ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=messages.Vector3(x=x, y=y, z=z),
+        rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )
 
 
 def _quaternion(transform: SE3) -> Array:

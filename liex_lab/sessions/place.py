@@ -23,13 +23,21 @@ def check_place(path: Path, overwrite: bool) -> None:
     """Refuse to write over what must not be lost, or where no folder can be."""
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
-        raise SessionError(f"{nearest} is a file, and a session needs a folder; choose another place with --out")
-    if not path.exists() or (path.is_dir() and {entry.name for entry in path.iterdir()} <= {FAILED_FILE}):
+        raise SessionError(
+            f"{nearest} is a file, and a session needs a folder; choose another place with --out"
+        )
+    if not path.exists() or (
+        path.is_dir() and {entry.name for entry in path.iterdir()} <= {FAILED_FILE}
+    ):
         return  # what failed before may be replaced
     if not (path / "session.json").is_file():
-        raise SessionError(f"{path} exists and is not a session, so it is left alone; choose another place with --out")
+        raise SessionError(
+            f"{path} exists and is not a session, so it is left alone; choose another place with --out"
+        )
     if not overwrite:
-        raise SessionError(f"the session {path} exists already; choose another place with --out, or say --overwrite")
+        raise SessionError(
+            f"the session {path} exists already; choose another place with --out, or say --overwrite"
+        )
 
 
 def file_facts(folder: Path, logs: Mapping[str, Path]) -> dict[str, Any]:

@@ -27,9 +27,18 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 4
 _PACKAGES = (
-    "liex_lab", "numpy", "scipy", "numba", "scikit-learn", "pandas", "pyarrow", "opencv-python-headless", "rerun-sdk",
-    "mcap", "foxglove-sdk",
-)  # fmt: skip
+    "liex_lab",
+    "numpy",
+    "scipy",
+    "numba",
+    "scikit-learn",
+    "pandas",
+    "pyarrow",
+    "opencv-python-headless",
+    "rerun-sdk",
+    "mcap",
+    "foxglove-sdk",
+)
 
 
 @dataclass(frozen=True)
@@ -70,23 +79,39 @@ class Provenance:
     replay_candidates: bool = False
 
     @staticmethod
-    def of(recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any) -> Provenance:
+    def of(
+        recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any
+    ) -> Provenance:
         """The facts of a recording, the floor it was taken above and the plan; `more` are further fields."""
         told, stated = recording.metadata, plan.session
-        subject = {"subject_id": stated.subject_id or told.get("subject_id"), "group": stated.group,
-                   "cage": stated.cage, "sex": stated.sex, "batch": stated.batch}  # fmt: skip
+        subject = {
+            "subject_id": stated.subject_id or told.get("subject_id"),
+            "group": stated.group,
+            "cage": stated.cage,
+            "sex": stated.sex,
+            "batch": stated.batch,
+        }
         known: dict[str, Any] = {
-            "name": stated.name or recording.name, "skeleton": skeleton, "camera": recording.camera,
-            "T_arena_camera": floor.T_arena_camera, "floor_distance_mm": floor.distance_mm,
-            "input_sha256": recording.digest(), "plan_toml": plan.to_toml(), "format": recording.format,
-            "profile": dict(told.get("profile", {})), "individual": stated.individual, "n_frames": len(recording),
+            "name": stated.name or recording.name,
+            "skeleton": skeleton,
+            "camera": recording.camera,
+            "T_arena_camera": floor.T_arena_camera,
+            "floor_distance_mm": floor.distance_mm,
+            "input_sha256": recording.digest(),
+            "plan_toml": plan.to_toml(),
+            "format": recording.format,
+            "profile": dict(told.get("profile", {})),
+            "individual": stated.individual,
+            "n_frames": len(recording),
             "gaps": [*recording.gaps, *recording.faults],
-            "problems": list(recording.problems), "truncated": recording.truncated,
+            "problems": list(recording.problems),
+            "truncated": recording.truncated,
             "subject": {name: str(value) for name, value in subject.items() if value},
             "session_start_time": stated.session_start_time or told.get("session_start_time") or "",
             "optics": recording.optics,
-            "replay_depth": plan.replay.depth, "replay_candidates": plan.replay.candidates,
-        }  # fmt: skip
+            "replay_depth": plan.replay.depth,
+            "replay_candidates": plan.replay.candidates,
+        }
         return Provenance(**{**known, **more})
 
     @property
@@ -103,11 +128,13 @@ class Provenance:
     def table_metadata(self) -> dict[str, Any]:
         """What every parquet file says about itself, besides its columns."""
         return {
-            "version": package_version("liex_lab"), "schema_version": SCHEMA_VERSION,
-            "calibration_hash": self.calibration_hash, "model_hash": self.model.get("sha256", ""),
+            "version": package_version("liex_lab"),
+            "schema_version": SCHEMA_VERSION,
+            "calibration_hash": self.calibration_hash,
+            "model_hash": self.model.get("sha256", ""),
             "axes": "arena: x, y on the floor, z up from it; origin at the foot of the camera's perpendicular; mm",
             "joints": "on the body's mid-axis",
-        }  # fmt: skip
+        }
 
     def document(self) -> dict[str, Any]:
         """The part of session.json that is known before the first frame."""
@@ -118,20 +145,33 @@ class Provenance:
             "subject": dict(self.subject),
             "session_start_time": self.session_start_time or None,
             "versions": versions(),
-            "input": {"name": self.name, "format": self.format, "sha256": self.input_sha256,
-                      "truncated": self.truncated, **({"profile": self.profile} if self.profile else {})},
+            "input": {
+                "name": self.name,
+                "format": self.format,
+                "sha256": self.input_sha256,
+                "truncated": self.truncated,
+                **({"profile": self.profile} if self.profile else {}),
+            },
             "plan": plan_table(self.plan_toml),
-            "camera": {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist(),
-                       "floor_distance_mm": float(self.floor_distance_mm), "calibration_hash": self.calibration_hash,
-                       "optics": self.optics},
+            "camera": {
+                **self.camera.to_dict(),
+                "T_arena_camera": self.T_arena_camera.matrix.tolist(),
+                "floor_distance_mm": float(self.floor_distance_mm),
+                "calibration_hash": self.calibration_hash,
+                "optics": self.optics,
+            },
             "arena": self.arena.to_dict(),
             "zones": [zone.to_dict() for zone in self.zones],
-            "animal": {"name": self.skeleton.name, "joints": list(self.skeleton.names),
-                       "bones": [list(edge) for edge in self.skeleton.edges], "home_length_mm": self.skeleton.length,
-                       **self.animal_size},
+            "animal": {
+                "name": self.skeleton.name,
+                "joints": list(self.skeleton.names),
+                "bones": [list(edge) for edge in self.skeleton.edges],
+                "home_length_mm": self.skeleton.length,
+                **self.animal_size,
+            },
             "model": dict(self.model),
             "problems": list(self.problems),
-        }  # fmt: skip
+        }
 
 
 def plan_table(plan_toml: str) -> dict[str, Any]:
@@ -139,7 +179,9 @@ def plan_table(plan_toml: str) -> dict[str, Any]:
     try:
         return tomllib.loads(plan_toml)
     except tomllib.TOMLDecodeError as error:
-        raise SessionError(f"the plan to be stored is not TOML ({error}); pass the plan's own TOML text") from None
+        raise SessionError(
+            f"the plan to be stored is not TOML ({error}); pass the plan's own TOML text"
+        ) from None
 
 
 @cache
@@ -153,7 +195,10 @@ def package_version(name: str) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
-    return {"python": platform.python_version(), **{name: package_version(name) for name in _PACKAGES}}
+    return {
+        "python": platform.python_version(),
+        **{name: package_version(name) for name in _PACKAGES},
+    }
 
 
 def _hash(value: Any) -> str:

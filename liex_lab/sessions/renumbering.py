@@ -25,20 +25,30 @@ def renumber(path: Path, first: Known, last: Known, out: Path) -> Known:
     channels, channel_of = _joined(first[1], last[1], "topic")
     ours = {channel.id for channel in first[1]}
     channels = [
-        channel if channel.id in ours else replace(channel, schema_id=schema_of.get(channel.schema_id, 0))
+        channel
+        if channel.id in ours
+        else replace(channel, schema_id=schema_of.get(channel.schema_id, 0))
         for channel in channels
-    ]  # fmt: skip
+    ]
     with path.open("rb") as source, out.open("wb") as target:
         writer = Writer(target, _CHUNK_BYTES, CompressionType.ZSTD, IndexType.ALL)
         writer.start(profile="liex_lab")
         for schema in sorted(schemas, key=lambda one: one.id):
             assert writer.register_schema(schema.name, schema.encoding, schema.data) == schema.id
         for channel in sorted(channels, key=lambda one: one.id):
-            assert writer.register_channel(
-                channel.topic, channel.message_encoding, channel.schema_id, channel.metadata) == channel.id  # fmt: skip
+            assert (
+                writer.register_channel(
+                    channel.topic, channel.message_encoding, channel.schema_id, channel.metadata
+                )
+                == channel.id
+            )
         for _, channel, message in make_reader(source).iter_messages(log_time_order=False):
             writer.add_message(
-                channel_of[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+                channel_of[channel.id],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
             )
         writer.finish()
     return schemas, channels
@@ -50,6 +60,8 @@ def _joined(first: list, last: list, name: str) -> tuple[list, dict[int, int]]:
     for one in last:
         key = getattr(one, name)
         if key not in joined:
-            joined[key] = replace(one, id=max((known.id for known in joined.values()), default=0) + 1)
+            joined[key] = replace(
+                one, id=max((known.id for known in joined.values()), default=0) + 1
+            )
         ids[one.id] = joined[key].id
     return list(joined.values()), ids

@@ -32,14 +32,19 @@ class Results:
         """The tables of the track itself: frames, poses, rotations, gaps, flips, sessions."""
         rows, described = self.rows, self.origin.table_metadata()
         own: dict[str, Any] = {
-            "frames": rows.frames(), "poses": rows.poses(), "rotations": rows.rotations(), "gaps": [rows.gaps()],
+            "frames": rows.frames(),
+            "poses": rows.poses(),
+            "rotations": rows.rotations(),
+            "gaps": [rows.gaps()],
             "flips": [rows.flips(self.flips)],
             "sessions": [self.session_row()],
-        }  # fmt: skip
+        }
         for name, blocks in own.items():
             tables.write_table(folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
 
-    def write_measured(self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]) -> None:
+    def write_measured(
+        self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]
+    ) -> None:
         """The tables of behaviour, summary.csv, and columns.json, which describes every table there is."""
         described = self.origin.table_metadata()
         for name, result in results.items():
@@ -48,9 +53,13 @@ class Results:
                 continue
             if name == "summary":
                 tables.check_described(result.columns, schema, name)
-                result.map(tables.harmless).to_csv(folder / "summary.csv", index=False, lineterminator="\n")
+                result.map(tables.harmless).to_csv(
+                    folder / "summary.csv", index=False, lineterminator="\n"
+                )
             else:
-                tables.write_table(folder / f"{name}.parquet", schema, tables.from_pandas(result), described)
+                tables.write_table(
+                    folder / f"{name}.parquet", schema, tables.from_pandas(result), described
+                )
         text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
         (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
 
@@ -59,22 +68,32 @@ class Results:
         rows, track, subject = self.rows, self.rows.track, self.origin.subject
         step = median_step(rows.time_s)
         return {
-            "session_id": rows.session_id, "individual": rows.individual,
-            **{name: subject.get(name, "") for name in ("subject_id", "group", "cage", "sex", "batch")},
+            "session_id": rows.session_id,
+            "individual": rows.individual,
+            **{
+                name: subject.get(name, "")
+                for name in ("subject_id", "group", "cage", "sex", "batch")
+            },
             "session_start_time": self.origin.session_start_time,
-            "n_frames": track.n_frames, "n_frames_observed": int(track.observed.sum()),
+            "n_frames": track.n_frames,
+            "n_frames_observed": int(track.observed.sum()),
             "observed_s": float((stop_times(rows.time_s) - rows.time_s)[track.observed].sum()),
             "fps_median": 1.0 / step if step else float("nan"),
-            "calibration_hash": self.origin.calibration_hash, "software_version": package_version("liex_lab"),
-        }  # fmt: skip
+            "calibration_hash": self.origin.calibration_hash,
+            "software_version": package_version("liex_lab"),
+        }
 
     def counts(self) -> dict[str, Any]:
         """How many frames there are, and how they were measured: `frames` of session.json."""
         rows, track, row = self.rows, self.rows.track, self.session_row()
         flags = {flag or "good": int(np.sum(track.flag == flag)) for flag in np.unique(track.flag)}
         return {
-            "n_frames": track.n_frames, "n_observed": int(track.observed.sum()), "flags": flags,
-            "n_missing": int(rows.missing_before().sum()), "n_gaps": int((rows.missing_before() > 0).sum()),
-            "duration_s": float(stop_times(rows.time_s)[-1]), "observed_s": row["observed_s"],
+            "n_frames": track.n_frames,
+            "n_observed": int(track.observed.sum()),
+            "flags": flags,
+            "n_missing": int(rows.missing_before().sum()),
+            "n_gaps": int((rows.missing_before() > 0).sum()),
+            "duration_s": float(stop_times(rows.time_s)[-1]),
+            "observed_s": row["observed_s"],
             "fps_median": None if np.isnan(row["fps_median"]) else row["fps_median"],
-        }  # fmt: skip
+        }

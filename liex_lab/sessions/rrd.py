@@ -42,16 +42,38 @@ CANDIDATES = "arena/candidates"
 ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
 _PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
-_NOISY_PNG = (16, 1, 17, 2)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
+_NOISY_PNG = (
+    16,
+    1,
+    17,
+    2,
+)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
 # pictures, and their bytes, in one message: for each message the index that ends the file takes some 5 kB of memory
 _TOGETHER, _TOGETHER_BYTES = 64, 1 << 23
 _BLOCK = 8192  # frames of small things sent in one go
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
 # Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
-PALETTE = (0xEE6677, 0xCCBB44, 0x4477AA, 0xBBBBBB, 0x228833, 0x66CCEE, 0xAA3377, 0x332288, 0x999933, 0xEE8866,
-           0x44BB99, 0x882255)  # fmt: skip
-_FLAG_COLOURS = {"doubtful": 0xCCBB44, "not_found": 0xEE6677, "no_depth": 0xBBBBBB, "corrected": 0x4477AA}
+PALETTE = (
+    0xEE6677,
+    0xCCBB44,
+    0x4477AA,
+    0xBBBBBB,
+    0x228833,
+    0x66CCEE,
+    0xAA3377,
+    0x332288,
+    0x999933,
+    0xEE8866,
+    0x44BB99,
+    0x882255,
+)
+_FLAG_COLOURS = {
+    "doubtful": 0xCCBB44,
+    "not_found": 0xEE6677,
+    "no_depth": 0xBBBBBB,
+    "corrected": 0x4477AA,
+}
 _WALL, _WORST = 0x9AA0A6, 12
 _HOLDS_95 = 2.795  # standard deviations of a Gaussian in space
 _SPREAD = [255, 170, 60, 140]
@@ -65,11 +87,17 @@ class ReplayWriter:
     own entities (see `corrected_entity`).
     """
 
-    def __init__(self, path: Path, origin: Provenance, blueprint: Any = None, *, corrected: bool = False) -> None:
+    def __init__(
+        self, path: Path, origin: Provenance, blueprint: Any = None, *, corrected: bool = False
+    ) -> None:
         self._origin = origin
         self._first_ns: int | None = None
-        self._waiting: list[tuple[int, int, NDArray[np.uint8], str]] = []  # frame, ns since the first, depth, its kind
-        stream = rr.RecordingStream("liex_lab", recording_id=origin.recording_id, send_properties=False)
+        self._waiting: list[
+            tuple[int, int, NDArray[np.uint8], str]
+        ] = []  # frame, ns since the first, depth, its kind
+        stream = rr.RecordingStream(
+            "liex_lab", recording_id=origin.recording_id, send_properties=False
+        )
         stream.set_log_time_enabled(False)
         self._stream: Any = _Renamed(stream) if corrected else stream
         self._path, self._n_sent, self._checked, self._n_found = path, 0, 0, 0
@@ -92,7 +120,10 @@ class ReplayWriter:
             self._log_depth_kind(depth[0])
         for index, time_ns, image in zip(frame_index, times_ns, depth, strict=True):
             self._waiting.append((int(index), int(time_ns) - self._first_ns, *packed(image)))
-            if len(self._waiting) == _TOGETHER or sum(blob.nbytes for _, _, blob, _ in self._waiting) > _TOGETHER_BYTES:
+            if (
+                len(self._waiting) == _TOGETHER
+                or sum(blob.nbytes for _, _, blob, _ in self._waiting) > _TOGETHER_BYTES
+            ):
                 self._send_depth()
 
     def _send_depth(self) -> None:
@@ -100,15 +131,22 @@ class ReplayWriter:
         if self._waiting:
             index, elapsed, blobs, kinds = zip(*self._waiting, strict=True)
             columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
-            self._stream.send_columns(DEPTH, _timeline(np.array(index), np.array(elapsed)), [*columns])
+            self._stream.send_columns(
+                DEPTH, _timeline(np.array(index), np.array(elapsed)), [*columns]
+            )
             self._stream.flush()
             self._n_sent += 1
             self._waiting.clear()
 
     def finish(
-        self, rows: Rows, kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str],
+        self,
+        rows: Rows,
+        kinematics: pd.DataFrame,
+        bouts: pd.DataFrame,
+        words: Sequence[str],
+        problems: Sequence[str],
         candidates: Observations | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the ethogram's vocabulary;
         candidates: what single frames thought possible, where that is to be seen, too.
         """
@@ -118,7 +156,9 @@ class ReplayWriter:
         self._log_root(rows, index, elapsed)
         if candidates is not None:
             self._log_candidates(candidates, index, elapsed)
-        scalars = [("error/predicted", "predicted error (mm)", 0xEE6677, rows.track.predicted_error_mm)]
+        scalars = [
+            ("error/predicted", "predicted error (mm)", 0xEE6677, rows.track.predicted_error_mm)
+        ]
         for name, label, colour in (
             ("speed_mm_s", "speed (mm/s)", 0x4477AA),
             ("nose_height_mm", "nose height (mm)", 0x228833),
@@ -126,9 +166,13 @@ class ReplayWriter:
             ("tail_beat_hz", "tail beat (Hz)", 0x66CCEE),
         ):
             if name in kinematics:
-                scalars.append((f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float)))
+                scalars.append(
+                    (f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float))
+                )
         for entity, label, colour, values in scalars:
-            self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True)
+            self._stream.log(
+                entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True
+            )
             for part in blocks(len(index), _BLOCK):
                 columns = rr.Scalars.columns(scalars=values[part])
                 self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
@@ -140,9 +184,13 @@ class ReplayWriter:
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(
-            "session", rr.AnyValues(session_id=self._origin.name, animal=self._origin.skeleton.name,
-                                    input_sha256=self._origin.input_sha256)
-        )  # fmt: skip
+            "session",
+            rr.AnyValues(
+                session_id=self._origin.name,
+                animal=self._origin.skeleton.name,
+                input_sha256=self._origin.input_sha256,
+            ),
+        )
         self.flushed()
         self.abandon()
 
@@ -158,7 +206,9 @@ class ReplayWriter:
             for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
                 self._checked, self._n_found = at + length, self._n_found + 1
         if self._n_found < self._n_sent:
-            raise SessionError("the replay was not written whole; make room on the disk and run it again")
+            raise SessionError(
+                "the replay was not written whole; make room on the disk and run it again"
+            )
         return size
 
     def abandon(self) -> None:
@@ -169,7 +219,9 @@ class ReplayWriter:
     def _log_scene(self) -> None:
         camera, T_arena_camera = self._origin.camera, self._origin.T_arena_camera
         self._stream.log("arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        pose = rr.Transform3D(translation=T_arena_camera.translation / 1000.0, mat3x3=T_arena_camera.rotation)
+        pose = rr.Transform3D(
+            translation=T_arena_camera.translation / 1000.0, mat3x3=T_arena_camera.rotation
+        )
         self._stream.log("arena/camera", pose, static=True)
         lens = rr.Pinhole(
             image_from_camera=camera.matrix,
@@ -199,58 +251,97 @@ class ReplayWriter:
     def _log_depth_kind(self, first: NDArray[np.uint16]) -> None:
         """What holds for every depth image: unit, colours, layout."""
         look: dict[str, Any] = {
-            "meter": MM_PER_UNIT, "colormap": "viridis", "point_fill_ratio": 0.25,
+            "meter": MM_PER_UNIT,
+            "colormap": "viridis",
+            "point_fill_ratio": 0.25,
             "depth_range": colour_range(first, self._origin.floor_distance_mm),
-        }  # fmt: skip
+        }
         kind = rr.EncodedDepthImage.from_fields(**look)
         self._stream.log(DEPTH, kind, static=True)
 
-    def _log_skeleton(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+    def _log_skeleton(
+        self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]
+    ) -> None:
         """Joints and bones in the arena, and over the picture; a frame without a pose shows none."""
         track, skeleton = rows.track, rows.track.skeleton
         names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
-        bones = rr.ClassDescription(info=rr.AnnotationInfo(id=1, label=skeleton.name, color=_BONE),
-                                    keypoint_annotations=names)  # fmt: skip
-        radii = {SKELETON: (0.003, 0.0015), OVERLAY: (rr.Radius.ui_points(3.5), rr.Radius.ui_points(1.2))}
-        for entity, dot, line in ((SKELETON, rr.Points3D, rr.LineStrips3D), (OVERLAY, rr.Points2D, rr.LineStrips2D)):
+        bones = rr.ClassDescription(
+            info=rr.AnnotationInfo(id=1, label=skeleton.name, color=_BONE),
+            keypoint_annotations=names,
+        )
+        radii = {
+            SKELETON: (0.003, 0.0015),
+            OVERLAY: (rr.Radius.ui_points(3.5), rr.Radius.ui_points(1.2)),
+        }
+        for entity, dot, line in (
+            (SKELETON, rr.Points3D, rr.LineStrips3D),
+            (OVERLAY, rr.Points2D, rr.LineStrips2D),
+        ):
             thick, thin = radii[entity]
             self._stream.log(entity, rr.AnnotationContext([bones]), static=True)
-            self._stream.log(f"{entity}/joints", dot.from_fields(radii=thick, colors=_JOINT, show_labels=False),
-                             static=True)  # fmt: skip
-            self._stream.log(f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True)
-        look = rr.Ellipsoids3D.from_fields(colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003)
+            self._stream.log(
+                f"{entity}/joints",
+                dot.from_fields(radii=thick, colors=_JOINT, show_labels=False),
+                static=True,
+            )
+            self._stream.log(
+                f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True
+            )
+        look = rr.Ellipsoids3D.from_fields(
+            colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003
+        )
         self._stream.log(UNCERTAINTY, look, static=True)
         girth = float(self._origin.animal_size.get("girth", 1.0))
         carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
         for part in blocks(track.n_frames, _BLOCK):
             when, seen = _timeline(index[part], elapsed[part]), track[part].posed
-            self._send_points(SKELETON, when, track.joints_mm[part][seen] / 1000.0, seen, rr.Points3D, rr.LineStrips3D)
+            self._send_points(
+                SKELETON,
+                when,
+                track.joints_mm[part][seen] / 1000.0,
+                seen,
+                rr.Points3D,
+                rr.LineStrips3D,
+            )
             send_body(self._stream, track, part, when, carriers)
             self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
-            self._send_points(OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D)
+            self._send_points(
+                OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D
+            )
             self._stream.flush()  # or hours of it wait in memory
             track.rest()
 
     def _send_points(
-        self, entity: str, when: list[rr.TimeColumn], points: Array, seen: NDArray[np.bool_], dot: Any, line: Any
+        self,
+        entity: str,
+        when: list[rr.TimeColumn],
+        points: Array,
+        seen: NDArray[np.bool_],
+        dot: Any,
+        line: Any,
     ) -> None:
         """Points (k, J, 2 or 3) of the k frames that are `seen` out of those of `when`, as dots and as bones."""
         skeleton, size = self._origin.skeleton, points.shape[-1]
         edges = np.array(skeleton.edges, np.int64).reshape(-1, 2)
         dots = dot.columns(
-            positions=points.reshape(-1, size), class_ids=np.ones(points.shape[0] * points.shape[1], np.uint16),
+            positions=points.reshape(-1, size),
+            class_ids=np.ones(points.shape[0] * points.shape[1], np.uint16),
             keypoint_ids=np.tile(np.arange(skeleton.n_joints, dtype=np.uint16), len(points)),
-        )  # fmt: skip
+        )
         strips = line.columns(strips=points[:, edges].reshape(-1, 2, size).astype(np.float32))
         n_dots, n_bones = np.where(seen, skeleton.n_joints, 0), np.where(seen, len(edges), 0)
         self._stream.send_columns(f"{entity}/joints", when, [*dots.partition(n_dots)])
         self._stream.send_columns(f"{entity}/bones", when, [*strips.partition(n_bones)])
 
-    def _send_spheres(self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]) -> None:
+    def _send_spheres(
+        self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]
+    ) -> None:
         """Around each joint (k, J, 3) of the k frames `seen` a sphere that holds it with 95 %; sd_mm (k, J)."""
         size = np.repeat(_HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 1), 3, axis=1) / MM_PER_UNIT
-        spheres = rr.Ellipsoids3D.columns(half_sizes=size, centers=joints_mm.reshape(-1, 3) / MM_PER_UNIT)
+        spheres = rr.Ellipsoids3D.columns(
+            half_sizes=size, centers=joints_mm.reshape(-1, 3) / MM_PER_UNIT
+        )
         n_spheres = np.where(seen, joints_mm.shape[1], 0)
         self._stream.send_columns(UNCERTAINTY, when, [*spheres.partition(n_spheres)])
 
@@ -266,11 +357,15 @@ class ReplayWriter:
             if not len(where):
                 continue
             xyzw = np.roll(so3.quaternion(track.root_rotation[where]), -1, axis=-1)
-            columns = rr.Transform3D.columns(translation=track.root_mm[where] / 1000.0, quaternion=xyzw)
+            columns = rr.Transform3D.columns(
+                translation=track.root_mm[where] / 1000.0, quaternion=xyzw
+            )
             self._stream.send_columns(ROOT, _timeline(index[where], elapsed[where]), [*columns])
             track.rest()
 
-    def _log_candidates(self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
+    def _log_candidates(
+        self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]
+    ) -> None:
         """The bones of every pose that a frame thought possible, each rank in its colour."""
         edges = np.array(seen.skeleton.edges, np.int64).reshape(-1, 2)
         for h, colour in zip(range(seen.known.shape[1]), cycle(PALETTE), strict=False):
@@ -282,7 +377,9 @@ class ReplayWriter:
                 joints = seen[part].joints(range(seen.skeleton.n_joints))[known, h] / MM_PER_UNIT
                 strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
                 when = _timeline(index[part], elapsed[part])
-                self._stream.send_columns(entity, when, [*strips.partition(np.where(known, len(edges), 0))])
+                self._stream.send_columns(
+                    entity, when, [*strips.partition(np.where(known, len(edges), 0))]
+                )
                 seen.rest()
 
     def _log_worst(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
@@ -298,21 +395,34 @@ class ReplayWriter:
 
     def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """The lane of the actions, and the lane of frames to distrust."""
-        spans = list(zip(bouts["start_frame"], bouts["stop_frame"], bouts["start_s"], bouts["stop_s"], bouts["action"],
-                         strict=True))  # fmt: skip
+        spans = list(
+            zip(
+                bouts["start_frame"],
+                bouts["stop_frame"],
+                bouts["start_s"],
+                bouts["stop_s"],
+                bouts["action"],
+                strict=True,
+            )
+        )
         end = (int(rows.frame_index[-1]) + 1, float(stop_times(rows.time_s)[-1]))
         self._log_lane(ACTIONS, spans, dict(zip(words, cycle(PALETTE), strict=False)), end)
         count, time, stop = frame_count(rows.frame_index), rows.time_s, stop_times(rows.time_s)
         marked = [
             (int(count[a]), int(count[b]), float(time[a]), float(stop[b - 1]), str(flag))
-            for a, b, flag in stretches(rows.track.flag) if flag
-        ]  # fmt: skip
+            for a, b, flag in stretches(rows.track.flag)
+            if flag
+        ]
         self._log_lane(TRACKING, marked, _FLAG_COLOURS, end)
 
-    def _log_lane(self, entity: str, spans: Sequence[Any], colours: dict[str, int], end: tuple[int, float]) -> None:
+    def _log_lane(
+        self, entity: str, spans: Sequence[Any], colours: dict[str, int], end: tuple[int, float]
+    ) -> None:
         """One lane of half-open spans (start_frame, stop_frame, start_s, stop_s, word), ordered."""
         labels = [word.replace("_", " ") for word in colours]
-        kind = rr.StateConfiguration(values=list(colours), labels=labels, colors=_rgba(list(colours.values())))
+        kind = rr.StateConfiguration(
+            values=list(colours), labels=labels, colors=_rgba(list(colours.values()))
+        )
         self._stream.log(entity, kind, static=True)
         changes: list[tuple[int, float, str]] = []
         for k, (start_frame, stop_frame, start_s, stop_s, word) in enumerate(spans):
@@ -323,8 +433,11 @@ class ReplayWriter:
             changes = [(0, 0.0, ""), (*end, "")]
         frames, times, words = zip(*changes, strict=True)
         elapsed = np.rint(np.array(times) * 1e9).astype(np.int64)
-        self._stream.send_columns(entity, _timeline(np.array(frames), elapsed),
-                                  [*rr.StateChange.columns(state=list(words))])  # fmt: skip
+        self._stream.send_columns(
+            entity,
+            _timeline(np.array(frames), elapsed),
+            [*rr.StateChange.columns(state=list(words))],
+        )
 
 
 def corrected_entity(entity: str) -> str:
@@ -368,8 +481,12 @@ def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
     """Depth in mm between which the colours spread: the floor as the first frame shows it, and 80 mm above it."""
     read = depth[depth > 0]
-    near, far = np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
-    near = max(float(near), floor_distance_mm - 60.0) - 80.0  # a floor tilted by 10 degrees, but not the walls
+    near, far = (
+        np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
+    )
+    near = (
+        max(float(near), floor_distance_mm - 60.0) - 80.0
+    )  # a floor tilted by 10 degrees, but not the walls
     return max(near, 1.0), max(float(far), near + 10.0) + 10.0
 
 

@@ -48,7 +48,12 @@ def body_parts(skeleton: Skeleton, girth: float = 1.0) -> list[BodyPart]:
         used, renumbered = np.unique(own, return_inverse=True)
         into = SE3(frames.rotation[joint], frames.translation[joint]).inverse()
         parts.append(
-            BodyPart(int(joint), into @ vertices[used], renumbered.reshape(own.shape), normals[used] @ into.rotation.T)
+            BodyPart(
+                int(joint),
+                into @ vertices[used],
+                renumbered.reshape(own.shape),
+                normals[used] @ into.rotation.T,
+            )
         )
     return parts
 
@@ -59,7 +64,9 @@ def _carriers(skeleton: Skeleton, vertices: Array) -> NDArray[np.int64]:
     off = []
     for parent, child in skeleton.edges:
         along = home[child] - home[parent]
-        share = np.clip((vertices - home[parent]) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+        share = np.clip(
+            (vertices - home[parent]) @ along / max(float(along @ along), 1e-12), 0.0, 1.0
+        )
         off.append(np.linalg.norm(vertices - home[parent] - share[:, None] * along, axis=1))
     return np.array([parent for parent, _ in skeleton.edges], np.int64)[np.argmin(off, axis=0)]
 
@@ -79,10 +86,14 @@ def log_body(stream: Any, skeleton: Skeleton, girth: float) -> list[int]:
     parts = body_parts(skeleton, girth)
     for part in parts:
         mesh = rr.Mesh3D(
-            vertex_positions=part.vertices / 1000.0, triangle_indices=part.faces, vertex_normals=part.normals,
+            vertex_positions=part.vertices / 1000.0,
+            triangle_indices=part.faces,
+            vertex_normals=part.normals,
             albedo_factor=_SKIN,
-        )  # fmt: skip
-        stream.log(f"{BODY}/{rr.escape_entity_path_part(skeleton.names[part.joint])}", mesh, static=True)
+        )
+        stream.log(
+            f"{BODY}/{rr.escape_entity_path_part(skeleton.names[part.joint])}", mesh, static=True
+        )
     return [part.joint for part in parts]
 
 
@@ -97,5 +108,9 @@ def send_body(stream: Any, track: Track, rows: slice, when: list[Any], carriers:
         place[seen] = frames.translation[:, joint] / 1000.0
         xyzw[seen] = np.roll(so3.quaternion(frames.rotation[:, joint]), -1, axis=-1)
         size = np.where(seen, np.nan_to_num(part.scale), 0.0)
-        columns = rr.Transform3D.columns(translation=place, quaternion=xyzw, scale=np.repeat(size[:, None], 3, axis=1))
-        stream.send_columns(f"{BODY}/{rr.escape_entity_path_part(track.skeleton.names[joint])}", when, [*columns])
+        columns = rr.Transform3D.columns(
+            translation=place, quaternion=xyzw, scale=np.repeat(size[:, None], 3, axis=1)
+        )
+        stream.send_columns(
+            f"{BODY}/{rr.escape_entity_path_part(track.skeleton.names[joint])}", when, [*columns]
+        )

@@ -26,15 +26,37 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FILES = (
-    "session.json", "plan.toml", "frames.parquet", "poses.parquet", "rotations.parquet", "kinematics.parquet",
-    "bouts.parquet", "gaps.parquet", "flips.parquet", "sessions.parquet", "summary.csv", "transitions.parquet",
-    "activity.parquet", "zones.parquet", "columns.json", "session.rrd", "session.mcap", "observations.npz",
-    "replay.rbl", "foxglove.json",
-)  # fmt: skip
+    "session.json",
+    "plan.toml",
+    "frames.parquet",
+    "poses.parquet",
+    "rotations.parquet",
+    "kinematics.parquet",
+    "bouts.parquet",
+    "gaps.parquet",
+    "flips.parquet",
+    "sessions.parquet",
+    "summary.csv",
+    "transitions.parquet",
+    "activity.parquet",
+    "zones.parquet",
+    "columns.json",
+    "session.rrd",
+    "session.mcap",
+    "observations.npz",
+    "replay.rbl",
+    "foxglove.json",
+)
 _OPTIONAL = {
-    "kinematics.parquet", "summary.csv", "transitions.parquet", "activity.parquet", "zones.parquet", "observations.npz",
-    "replay.rbl", "foxglove.json",
-}  # fmt: skip
+    "kinematics.parquet",
+    "summary.csv",
+    "transitions.parquet",
+    "activity.parquet",
+    "zones.parquet",
+    "observations.npz",
+    "replay.rbl",
+    "foxglove.json",
+}
 
 
 class Session:
@@ -55,7 +77,9 @@ class Session:
         document = folder / "session.json"
         if not document.is_file():
             what = "is not a folder" if not folder.is_dir() else "holds no session.json"
-            raise SessionError(f"a session is a folder that `liex run` wrote, but {folder} {what}; check the path")
+            raise SessionError(
+                f"a session is a folder that `liex run` wrote, but {folder} {what}; check the path"
+            )
         try:
             metadata = json.loads(document.read_text(encoding="utf-8"))
             found = int(metadata["schema_version"])
@@ -71,7 +95,9 @@ class Session:
             )
         for name in FILES:
             if name not in _OPTIONAL and not (folder / name).is_file():
-                raise SessionError(f"the session {folder} lacks {name}; run `liex run` on the recording again")
+                raise SessionError(
+                    f"the session {folder} lacks {name}; run `liex run` on the recording again"
+                )
         log = Log("") if raw else read_log(folder)
         return Session(folder, metadata, log if applies(log, folder, metadata) else None)
 
@@ -131,7 +157,9 @@ class Session:
 
         path = self.file("summary.csv")
         if not path.is_file():
-            raise SessionError(f"the session {self.path} has no summary.csv; it was written without behaviour measures")
+            raise SessionError(
+                f"the session {self.path} has no summary.csv; it was written without behaviour measures"
+            )
         with reading_from(path):
             table = pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
             return table.map(as_it_was)
@@ -186,10 +214,14 @@ class Session:
             if path.is_file():
                 with reading_from(path):
                     known = pq.read_schema(path).names
-                    other.__dict__[name] = _narrow(path, [column for column in columns if column in known])
+                    other.__dict__[name] = _narrow(
+                        path, [column for column in columns if column in known]
+                    )
         return other
 
-    def table(self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None) -> pd.DataFrame:
+    def table(
+        self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
+    ) -> pd.DataFrame:
         """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
         import pandas as pd
 
@@ -222,7 +254,10 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
 
     with pq.ParquetFile(path, pre_buffer=False) as file:
         wanted = None if columns is None else [*dict.fromkeys([*columns, "frame_index"])]
-        groups = (file.read_row_group(k, wanted, use_threads=False).to_pandas() for k in range(file.num_row_groups))
+        groups = (
+            file.read_row_group(k, wanted, use_threads=False).to_pandas()
+            for k in range(file.num_row_groups)
+        )
         found = [group[group["frame_index"].isin(frame_index)] for group in groups]
     give_back()
     rows = pd.concat(found, ignore_index=True)

@@ -71,13 +71,19 @@ class StretchWriter:
         """The next frames."""
         from liex_lab.recordings.rvl import to_millimetres
 
-        depth, times = [to_millimetres(frame.depth) for frame in frames], [int(frame.time_ns) for frame in frames]
+        depth, times = (
+            [to_millimetres(frame.depth) for frame in frames],
+            [int(frame.time_ns) for frame in frames],
+        )
         self._replay.add([int(frame.index) for frame in frames], times, depth)
         self._mcap.add(times, depth)
         self._seen.append(seen_rows(frames, seen))
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         try:
             if error is None:

@@ -56,16 +56,24 @@ class Keepsakes:
         if not usable:
             return []
         (folder / FOLDER).mkdir()
-        chosen = sorted({usable[k] for k in np.linspace(0, len(usable) - 1, _SHOWN).round().astype(int)})
+        chosen = sorted(
+            {usable[k] for k in np.linspace(0, len(usable) - 1, _SHOWN).round().astype(int)}
+        )
         entries = []
         for row in chosen:
             left, top, picture = self._cut(row, rows, camera)
             name = f"{FOLDER}/frame_{int(rows.frame_index[row]):07d}.png"
             cv2.imwrite(str(folder / name), picture)
-            entries.append({
-                "file": name, "frame_index": int(rows.frame_index[row]), "left_px": left, "top_px": top,
-                "width_px": picture.shape[1], "height_px": picture.shape[0],
-            })  # fmt: skip
+            entries.append(
+                {
+                    "file": name,
+                    "frame_index": int(rows.frame_index[row]),
+                    "left_px": left,
+                    "top_px": top,
+                    "width_px": picture.shape[1],
+                    "height_px": picture.shape[0],
+                }
+            )
         return entries
 
     def _cut(self, row: int, rows: Rows, camera: Camera) -> tuple[int, int, NDArray[np.uint16]]:
@@ -74,10 +82,16 @@ class Keepsakes:
         extent = np.nanmax(np.linalg.norm(uv - centre, axis=1))
         near = depth[depth > 0]
         distance = float(np.median(near)) if len(near) else 1000.0
-        half = max(_HALF_SPINES * float(rows.track.spine_mm[row]) * camera.fx / distance, 1.3 * extent, 16.0)
+        half = max(
+            _HALF_SPINES * float(rows.track.spine_mm[row]) * camera.fx / distance,
+            1.3 * extent,
+            16.0,
+        )
         half_px = int(np.ceil(half))
         left, top = int(np.round(centre[0])) - half_px, int(np.round(centre[1])) - half_px
-        padded = np.zeros((2 * half_px, 2 * half_px), np.uint16)  # beyond the picture's edge nothing was read
+        padded = np.zeros(
+            (2 * half_px, 2 * half_px), np.uint16
+        )  # beyond the picture's edge nothing was read
         height, width = depth.shape
         x0, x1 = max(left, 0), min(left + 2 * half_px, width)
         y0, y1 = max(top, 0), min(top + 2 * half_px, height)

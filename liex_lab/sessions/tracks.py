@@ -30,7 +30,9 @@ def skeleton_of(session: Session) -> Skeleton:
     if kept is not None:
         return kept
     planned = session.metadata["plan"].get("animal")
-    return Skeleton.load(planned["skeleton"] if isinstance(planned, dict) else session.metadata["animal"]["name"])
+    return Skeleton.load(
+        planned["skeleton"] if isinstance(planned, dict) else session.metadata["animal"]["name"]
+    )
 
 
 def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
@@ -39,7 +41,9 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     frames, n, j = session.frames, len(session.frames), skeleton.n_joints
     poses, rotations = session.poses, session.rotations
     if len(poses) != n * j or len(rotations) != n * (j + 1):
-        raise SessionError(f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it again")
+        raise SessionError(
+            f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it again"
+        )
     track = Track.empty(skeleton, frames["time_ns"].to_numpy(np.int64))
     track.joints_mm[:] = _columns(poses, [f"{a}_mm" for a in "xyz"]).reshape(n, j, 3)
     track.uv_px[:] = _columns(poses, ["u_px", "v_px"]).reshape(n, j, 2)
@@ -51,7 +55,9 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     track.root_rotation[seen] = so3.exp(turns[seen, 0])
     track.root_mm[:] = _columns(rotations, [f"t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
     shift = _columns(rotations, [f"sd_t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
-    track.cov_root[:] = _covariance(rotations.iloc[:: j + 1], np.concatenate([spread[:, 0], shift], axis=1))
+    track.cov_root[:] = _covariance(
+        rotations.iloc[:: j + 1], np.concatenate([spread[:, 0], shift], axis=1)
+    )
     for name in _SCALARS:
         if name in frames:
             getattr(track, name)[:] = frames[name].to_numpy()
@@ -75,10 +81,16 @@ def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
 def wall_of(session: Session) -> Array:
     """(n,) distance from the nearest wall, mm; NaN where it is not known."""
     frames = session.frames
-    return frames["wall_distance_mm"].to_numpy(float) if "wall_distance_mm" in frames else np.full(len(frames), np.nan)
+    return (
+        frames["wall_distance_mm"].to_numpy(float)
+        if "wall_distance_mm" in frames
+        else np.full(len(frames), np.nan)
+    )
 
 
 def _columns(table: pd.DataFrame, names: list[str]) -> Array:
     """Columns side by side, NaN where an older table lacks one."""
     lacking = np.full(len(table), np.nan)
-    return np.column_stack([table[name].to_numpy(float) if name in table else lacking for name in names])
+    return np.column_stack(
+        [table[name].to_numpy(float) if name in table else lacking for name in names]
+    )

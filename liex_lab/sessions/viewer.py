@@ -36,7 +36,9 @@ class Shown:
 
 def has_screen() -> bool:
     """Whether a window can be shown here."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return sys.platform != "linux" or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
 
 
 def replays_with(replay: Path) -> list[Path]:
@@ -59,13 +61,17 @@ def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     if not replay.is_file():
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
     if not headless and not has_screen():
-        raise LiexError(f"Rerun needs a screen and there is none here; open {replay} on a computer that has one")
+        raise LiexError(
+            f"Rerun needs a screen and there is none here; open {replay} on a computer that has one"
+        )
     from rerun.experimental import ViewerClient
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    process = _begin("--port", str(port), "--hide-welcome-screen", *(["--headless"] if headless else []))
+    process = _begin(
+        "--port", str(port), "--hide-welcome-screen", *(["--headless"] if headless else [])
+    )
     ends, seen = time.monotonic() + _PATIENCE_S, ""
     while time.monotonic() < ends and process.poll() is None:
         try:
@@ -78,16 +84,22 @@ def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
             seen = str(error).partition("\n")[0][:200]
             time.sleep(0.3)
     _end(process)
-    raise LiexError(f"Rerun did not show {replay} ({seen or 'it ended at once'}); try `liex show` in a terminal")
+    raise LiexError(
+        f"Rerun did not show {replay} ({seen or 'it ended at once'}); try `liex show` in a terminal"
+    )
 
 
 def _begin(*arguments: str) -> subprocess.Popen[bytes]:
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
     command = [sys.executable, "-m", "rerun", *arguments, "--bind", "127.0.0.1"]
     viewer = subprocess.Popen(
-        command, env={**os.environ, "RERUN_ANALYTICS": "0"}, start_new_session=True, stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        command,
+        env={**os.environ, "RERUN_ANALYTICS": "0"},
+        start_new_session=True,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     atexit.register(_end, viewer)
     return viewer
 

@@ -45,7 +45,9 @@ INDEX, TIMES = "frame_index", "frame_time_ns"
 _BEHIND = 4  # batches of 16 frames that the logs may be behind, both together
 Kept = TypeVar("Kept")
 
-BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json as known so far -> a Rerun blueprint
+BlueprintMaker = Callable[
+    [dict[str, Any]], Any
+]  # session.json as known so far -> a Rerun blueprint
 ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in it
 
 
@@ -86,7 +88,9 @@ class SessionWriter:
             array("q", before.get(name, np.zeros(0, np.int64)).tobytes()) for name in (INDEX, TIMES)
         )
         self._logging: deque[Future[None]] = deque()
-        self._loggers = {log: ThreadPoolExecutor(1) for log in LOGS}  # each writes in order, and beside the other
+        self._loggers = {
+            log: ThreadPoolExecutor(1) for log in LOGS
+        }  # each writes in order, and beside the other
         try:
             self._open_logs(blueprint)
         except BaseException:
@@ -99,7 +103,9 @@ class SessionWriter:
         from liex_lab.sessions.rrd import ReplayWriter
 
         made = blueprint(self._document) if blueprint else None
-        replay, messages = (self._checkpoint.part(log, self._checkpoint.n_parts - 1) for log in LOGS)
+        replay, messages = (
+            self._checkpoint.part(log, self._checkpoint.n_parts - 1) for log in LOGS
+        )
         self._replay = ReplayWriter(replay, self.origin, made)
         self._mcap = McapWriter(messages, self.origin)
         if self._times_ns:
@@ -109,13 +115,18 @@ class SessionWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if self._done:
             return
         self._abandon(keep=error is not None)
         if error is None:
-            raise SessionError("a session left without close() is not kept; call close() at the end of the block")
+            raise SessionError(
+                "a session left without close() is not kept; call close() at the end of the block"
+            )
 
     @property
     def n_frames(self) -> int:
@@ -128,7 +139,12 @@ class SessionWriter:
 
         self._keepsakes.again(self.n_frames, lambda row: to_millimetres(depth(row)))
 
-    def add(self, frames: Sequence[DepthFrame], track_part: Track | None = None, seen: Columnar | None = None) -> None:
+    def add(
+        self,
+        frames: Sequence[DepthFrame],
+        track_part: Track | None = None,
+        seen: Columnar | None = None,
+    ) -> None:
         """Consecutive frames and, unless `close` gets the whole track, their part of it.
 
         seen: what was seen in them, kept on disk until the session is whole: the work can go on from there, see `seen`.
@@ -143,7 +159,9 @@ class SessionWriter:
             _check_times(np.array(times, np.int64), track_part)
             self._held.append(track_part)
         index = [int(frame.index) for frame in frames]
-        for start in range(0, len(frames), 16):  # bounds the copies, however many frames come at once
+        for start in range(
+            0, len(frames), 16
+        ):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [to_millimetres(frame.depth) for frame in frames[part]]
             self._settle(_BEHIND)
@@ -163,7 +181,10 @@ class SessionWriter:
     def seen(self, kind: Callable[..., Kept]) -> Kept:
         """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its columns in order."""
         kept = self._checkpoint.seen.read()
-        return kind(self.origin.skeleton, *(values for name, values in kept.items() if name not in (INDEX, TIMES)))
+        return kind(
+            self.origin.skeleton,
+            *(values for name, values in kept.items() if name not in (INDEX, TIMES)),
+        )
 
     def _settle(self, behind: int = 0) -> None:
         """Wait until the logs are at most so many batches behind; what went wrong is raised here."""
@@ -179,7 +200,9 @@ class SessionWriter:
         self._settle()
         sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
         if len(self._checkpoint.seen) == len(self._index):
-            self._checkpoint.save(len(self._index), self._checkpoint.seconds_before + self._elapsed, sizes)
+            self._checkpoint.save(
+                len(self._index), self._checkpoint.seconds_before + self._elapsed, sizes
+            )
 
     @property
     def room(self) -> Room:
@@ -210,7 +233,15 @@ class SessionWriter:
         """The track as the tables see it."""
         origin = self.origin
         index = np.array(self._index, np.int64)
-        return Rows(self.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones)
+        return Rows(
+            self.track,
+            index,
+            origin.name,
+            origin.individual,
+            origin.gaps,
+            origin.arena,
+            origin.zones,
+        )
 
     def note(self, **sections: Any) -> None:
         """Add facts found on the way to session.json: tables are merged, lists extended, the rest replaced."""
@@ -218,7 +249,11 @@ class SessionWriter:
             known = self._document.get(name)
             if isinstance(known, dict) and isinstance(value, Mapping):
                 self._document[name] = {**known, **value}
-            elif isinstance(known, list) and isinstance(value, Sequence) and not isinstance(value, str):
+            elif (
+                isinstance(known, list)
+                and isinstance(value, Sequence)
+                and not isinstance(value, str)
+            ):
                 self._document[name] = known + [item for item in value if item not in known]
             else:
                 self._document[name] = value
@@ -241,7 +276,9 @@ class SessionWriter:
         from liex_lab.sessions.session import Session
 
         if not self._index:
-            raise SessionError("the recording holds no frame, so there is no session to write; see `liex doctor`")
+            raise SessionError(
+                "the recording holds no frame, so there is no session to write; see `liex doctor`"
+            )
         began = time.perf_counter()
         self._settle()
         if self._checkpoint.state.n_frames:  # it took long: what follows may be interrupted, too
@@ -250,19 +287,26 @@ class SessionWriter:
         _check_times(np.array(self._times_ns, np.int64), rows.track)
         results = dict(results or {})
         if "bouts" not in results:
-            results["bouts"] = tables.empty_table([*tables.BOUTS, *(c for c in columns if c.table == "bouts")])
+            results["bouts"] = tables.empty_table(
+                [*tables.BOUTS, *(c for c in columns if c.table == "bouts")]
+            )
         bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
         rows.track.rest()
         of_track.write_measured(self._folder, results, columns)
         give_back()
-        words = [*(actions or {}), *sorted({str(word) for word in bouts["action"]} - set(actions or {}))]
+        words = [
+            *(actions or {}),
+            *sorted({str(word) for word in bouts["action"]} - set(actions or {})),
+        ]
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
         self._checkpoint.join_logs()
-        self.note(actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {}))
+        self.note(
+            actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {})
+        )
         self._document["thumbnails"] = self._keepsakes.save(self._folder, rows, self.origin.camera)
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
@@ -289,10 +333,18 @@ class SessionWriter:
         return {
             "frames": results.counts(),
             "depth_unit_mm": 1.0,
-            "timings_s": {**timings_s, "write": round(self._seconds, 4), "total": round(elapsed, 4)},
+            "timings_s": {
+                **timings_s,
+                "write": round(self._seconds, 4),
+                "total": round(elapsed, 4),
+            },
             "frames_per_s": round(self.n_frames / elapsed, 2),
             "peak_memory_mb": peak_memory_mb(),
-            "machine": {"name": platform.node(), "system": platform.platform(), "cores": os.cpu_count()},
+            "machine": {
+                "name": platform.node(),
+                "system": platform.platform(),
+                "cores": os.cpu_count(),
+            },
             "interruptions": self._checkpoint.n_interruptions,
         }
 
@@ -302,7 +354,9 @@ class SessionWriter:
         check_place(self.path, self._overwrite)
         if self.path.exists():
             made = corrected_folder(self.path)
-            if made.is_dir():  # what people said is not lost; it applies again where the poses came out the same
+            if (
+                made.is_dir()
+            ):  # what people said is not lost; it applies again where the poses came out the same
                 shutil.copytree(made, self._folder / FOLDER)
             shutil.rmtree(old, ignore_errors=True)
             self.path.rename(old)

@@ -83,78 +83,206 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
         u, v = intrinsics[0] * xc / zc + intrinsics[2], intrinsics[1] * yc / zc + intrinsics[3]
         low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
     left, top = max(0, int(low_u) - int(u0) - 1), max(0, int(low_v) - int(v0) - 1)
-    right, bottom = min(depth.shape[1], int(high_u) - int(u0) + 2), min(depth.shape[0], int(high_v) - int(v0) + 2)
+    right, bottom = (
+        min(depth.shape[1], int(high_u) - int(u0) + 2),
+        min(depth.shape[0], int(high_v) - int(v0) + 2),
+    )
     if low_u > high_u or left >= right or top >= bottom:
         return
     inverse = np.zeros((bottom - top, right - left))
-    draw(vertices, faces, rotation, translation, intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3],
-         u0 + left, v0 + top, inverse)  # fmt: skip
+    draw(
+        vertices,
+        faces,
+        rotation,
+        translation,
+        intrinsics[0],
+        intrinsics[1],
+        intrinsics[2],
+        intrinsics[3],
+        u0 + left,
+        v0 + top,
+        inverse,
+    )
     merge(inverse, label, top, left, depth, what)
 
 
 @njit(cache=True)
 def _window(
-    animal, faces, thing, thing_faces, has_thing, R_arena_camera, height, intrinsics, picture, origin, wall, rough,
-    sensor, seed, table, depth_out, background_out,
-):  # fmt: skip
+    animal,
+    faces,
+    thing,
+    thing_faces,
+    has_thing,
+    R_arena_camera,
+    height,
+    intrinsics,
+    picture,
+    origin,
+    wall,
+    rough,
+    sensor,
+    seed,
+    table,
+    depth_out,
+    background_out,
+):
     """One training window: the still scene, its estimate, the animal, perhaps a thing beside it, and the sensor."""
     shape = depth_out.shape
     state = np.array([seed], np.uint64)
     field, depth = np.empty(shape, np.float32), np.empty(shape, np.float32)
     what = np.empty(shape, np.uint8)
     smooth_field(state, table, 24.0, field)
-    floor_and_wall(origin[0], origin[1], picture, intrinsics, R_arena_camera, height, wall, field, rough, depth, what)
+    floor_and_wall(
+        origin[0],
+        origin[1],
+        picture,
+        intrinsics,
+        R_arena_camera,
+        height,
+        wall,
+        field,
+        rough,
+        depth,
+        what,
+    )
     smooth_field(state, table, 9.0, field)
     for r in range(shape[0]):
         for c in range(shape[1]):
             # a background is learned from many frames: nearly free of noise, a little off in patches
             error = sensor[BACKGROUND] * (0.4 * field[r, c] + 0.3 * normal(state, table))
-            background_out[r, c] = int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
+            background_out[r, c] = (
+                int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
+            )
     rotation = np.ascontiguousarray(R_arena_camera.T)
     translation = -height * rotation[:, 2]
     u0, v0 = float(origin[0]), float(origin[1])
     draw_onto(animal, faces, rotation, translation, intrinsics, u0, v0, ANIMAL, depth, what)
     if has_thing:
-        draw_onto(thing, thing_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what)
+        draw_onto(
+            thing, thing_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what
+        )
     for r in range(shape[0]):
         for c in range(shape[1]):
             u, v = origin[0] + c, origin[1] + r
             if u < 0 or v < 0 or u >= picture[0] or v >= picture[1]:
                 depth[r, c] = 0.0
-    sense(depth, what, sensor, intrinsics[0], intrinsics[2] - u0, intrinsics[3] - v0, state, table, field, depth_out)
+    sense(
+        depth,
+        what,
+        sensor,
+        intrinsics[0],
+        intrinsics[2] - u0,
+        intrinsics[3] - v0,
+        state,
+        table,
+        field,
+        depth_out,
+    )
 
 
 @njit(cache=True, parallel=True)
 def draw_windows(
-    animal, faces, thing, thing_faces, has_thing, R_arena_camera, height, intrinsics, picture, origin, wall, rough,
-    sensor, seed, table, depth_out, background_out,
-):  # fmt: skip
+    animal,
+    faces,
+    thing,
+    thing_faces,
+    has_thing,
+    R_arena_camera,
+    height,
+    intrinsics,
+    picture,
+    origin,
+    wall,
+    rough,
+    sensor,
+    seed,
+    table,
+    depth_out,
+    background_out,
+):
     for i in prange(len(animal)):
-        _window(animal[i], faces, thing[i], thing_faces, has_thing[i], R_arena_camera[i], height[i], intrinsics[i],
-                picture[i], origin[i], wall[i], rough[i], sensor[i], seed[i], table, depth_out[i],
-                background_out[i])  # fmt: skip
+        _window(
+            animal[i],
+            faces,
+            thing[i],
+            thing_faces,
+            has_thing[i],
+            R_arena_camera[i],
+            height[i],
+            intrinsics[i],
+            picture[i],
+            origin[i],
+            wall[i],
+            rough[i],
+            sensor[i],
+            seed[i],
+            table,
+            depth_out[i],
+            background_out[i],
+        )
 
 
 @njit(cache=True)
 def frame(
-    still, animal, faces, thing, thing_faces, has_thing, rotation, translation, intrinsics, sensor, seed, table, out
-):  # fmt: skip
+    still,
+    animal,
+    faces,
+    thing,
+    thing_faces,
+    has_thing,
+    rotation,
+    translation,
+    intrinsics,
+    sensor,
+    seed,
+    table,
+    out,
+):
     """One full frame (H, W) uint16 mm: the still scene (H, W) mm, the animal and perhaps a thing, and the sensor."""
     state = np.array([seed], np.uint64)
     depth = still.copy()
     what = np.where(still > 0, np.uint8(STILL), np.uint8(NOTHING))
     draw_onto(animal, faces, rotation, translation, intrinsics, 0.0, 0.0, ANIMAL, depth, what)
     if has_thing:
-        draw_onto(thing, thing_faces, rotation, translation, intrinsics, 0.0, 0.0, OBJECT, depth, what)
+        draw_onto(
+            thing, thing_faces, rotation, translation, intrinsics, 0.0, 0.0, OBJECT, depth, what
+        )
     field = np.empty(depth.shape, np.float32)
-    sense(depth, what, sensor, intrinsics[0], intrinsics[2], intrinsics[3], state, table, field, out)
+    sense(
+        depth, what, sensor, intrinsics[0], intrinsics[2], intrinsics[3], state, table, field, out
+    )
 
 
 @njit(cache=True, parallel=True)
 def frames_parallel(
-    still, animal, faces, thing, thing_faces, has_thing, rotation, translation, intrinsics, sensor, seed, table, out
-):  # fmt: skip
+    still,
+    animal,
+    faces,
+    thing,
+    thing_faces,
+    has_thing,
+    rotation,
+    translation,
+    intrinsics,
+    sensor,
+    seed,
+    table,
+    out,
+):
     """`frame` for a batch: animal, thing, has_thing, sensor, seed and out (n, ...) differ, the rest is shared."""
     for i in prange(len(animal)):
-        frame(still, animal[i], faces, thing[i], thing_faces, has_thing[i], rotation, translation, intrinsics,
-              sensor[i], seed[i], table, out[i])  # fmt: skip
+        frame(
+            still,
+            animal[i],
+            faces,
+            thing[i],
+            thing_faces,
+            has_thing[i],
+            rotation,
+            translation,
+            intrinsics,
+            sensor[i],
+            seed[i],
+            table,
+            out[i],
+        )

@@ -17,8 +17,28 @@ BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
 SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
 
 # columns of a row of sensor parameters
-KIND, NOISE, EROSION, FUR, BIAS, HOLES, DARK, SIDE, SMOOTH, WHITE, LUMPS, EDGE_DROP, GRID, JITTER, FLYING = range(15)
-UNIT, BACKGROUND, OUTLIERS = 15, 16, 17  # mm a step of the picture; error of a learned background; outliers' rarity
+(
+    KIND,
+    NOISE,
+    EROSION,
+    FUR,
+    BIAS,
+    HOLES,
+    DARK,
+    SIDE,
+    SMOOTH,
+    WHITE,
+    LUMPS,
+    EDGE_DROP,
+    GRID,
+    JITTER,
+    FLYING,
+) = range(15)
+UNIT, BACKGROUND, OUTLIERS = (
+    15,
+    16,
+    17,
+)  # mm a step of the picture; error of a learned background; outliers' rarity
 N_PARAMETERS = 18
 TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
 
@@ -85,7 +105,10 @@ def smooth_field(state, table, spacing, out):
         t = np.float32(at - node)
         for u in range(width):
             k, s = column_of[u], share_of[u]
-            a, b = above[k] + s * (above[k + 1] - above[k]), below[k] + s * (below[k + 1] - below[k])
+            a, b = (
+                above[k] + s * (above[k + 1] - above[k]),
+                below[k] + s * (below[k + 1] - below[k]),
+            )
             out[v, u] = a + t * (b - a)
 
 
@@ -248,14 +271,26 @@ def light_field(depth, what, p, state, table, out):
     """
     height, width = depth.shape
     fields = np.empty((6, height, width), np.float32)
-    fine, coarse, blank, wrong, move_u, move_v = fields[0], fields[1], fields[2], fields[3], fields[4], fields[5]
+    fine, coarse, blank, wrong, move_u, move_v = (
+        fields[0],
+        fields[1],
+        fields[2],
+        fields[3],
+        fields[4],
+        fields[5],
+    )
     smooth_field(state, table, p[GRID], fine)
     smooth_field(state, table, 4.0 * p[GRID], coarse)
     smooth_field(state, table, 2.0 * p[GRID], blank)
     smooth_field(state, table, 1.0 * p[GRID], wrong)
     smooth_field(state, table, 1.5 * p[GRID], move_u)
     smooth_field(state, table, 1.5 * p[GRID], move_v)
-    strength, jitter, per_mm, per_step = p[NOISE], np.float32(p[JITTER]), 1.0 / TYPICAL_MM, 1.0 / p[UNIT]
+    strength, jitter, per_mm, per_step = (
+        p[NOISE],
+        np.float32(p[JITTER]),
+        1.0 / TYPICAL_MM,
+        1.0 / p[UNIT],
+    )
     for v in range(height):
         for u in range(width):
             row = min(max(int(v + jitter * move_v[v, u] + np.float32(0.5)), 0), height - 1)
@@ -275,7 +310,10 @@ def light_field(depth, what, p, state, table, out):
                 z += 1.5 * spread * p[SMOOTH] * coarse[v, u]
             if abs(wrong[v, u]) > p[OUTLIERS] - 0.25 * (strength - 1.0):
                 z += 12.0 * wrong[v, u] * (0.3 + uniform(state))
-            z += spread * (p[SMOOTH] * (0.7 * fine[v, u] + 0.7 * coarse[v, u]) + p[WHITE] * normal(state, table))
+            z += spread * (
+                p[SMOOTH] * (0.7 * fine[v, u] + 0.7 * coarse[v, u])
+                + p[WHITE] * normal(state, table)
+            )
             out[v, u] = int(z * per_step + 0.5) if z > 0.0 else 0
 
 

@@ -37,17 +37,27 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
     if kind not in _KINDS:
-        raise RecordingError(f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in {_EXAMPLE}")
+        raise RecordingError(
+            f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in {_EXAMPLE}"
+        )
     stated = dict(parse_qsl(query, keep_blank_values=True))
-    animal = _ANIMALS[kind] if kind in _ANIMALS else stated.pop("animal", "mouse" if kind in _SEQUENCES else "")
+    animal = (
+        _ANIMALS[kind]
+        if kind in _ANIMALS
+        else stated.pop("animal", "mouse" if kind in _SEQUENCES else "")
+    )
     if not animal:
-        raise RecordingError(f"{address} lacks the animal that moves, as in synthetic:move?animal=snake.toml&seed=3")
+        raise RecordingError(
+            f"{address} lacks the animal that moves, as in synthetic:move?animal=snake.toml&seed=3"
+        )
     skeleton = Skeleton.load(animal)
     settings = _settings(kind, skeleton.length)
     for key in stated:
         if key not in settings:
             near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
-            raise RecordingError(f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}")
+            raise RecordingError(
+                f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}"
+            )
     values = {key: _value(address, key, text, settings[key]) for key, text in stated.items()}
     world = world_of(skeleton)
     session: TrueRecording
@@ -58,7 +68,9 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
         seed, n_frames = values.pop("seed", 0), values.pop("frames", 300)
         session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
     if camera is not None:
-        session.camera = fitting(camera, session.width, session.height, "the camera that was stated")
+        session.camera = fitting(
+            camera, session.width, session.height, "the camera that was stated"
+        )
     return session
 
 
@@ -67,17 +79,26 @@ _Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]
 
 def _settings(kind: str, home_mm: float) -> dict[str, _Setting]:
     """Of each setting: how to read it, what holds for it, what to say otherwise."""
-    low, high = (30.0, 150.0) if kind == "walk" else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES)
+    low, high = (
+        (30.0, 150.0)
+        if kind == "walk"
+        else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES)
+    )
     settings: dict[str, _Setting] = {
         "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
-        "frames": (int, lambda n: 1 <= n <= _MOST_FRAMES, f"a whole number from 1 to {_MOST_FRAMES}"),
+        "frames": (
+            int,
+            lambda n: 1 <= n <= _MOST_FRAMES,
+            f"a whole number from 1 to {_MOST_FRAMES}",
+        ),
         "spine_mm": (float, lambda mm: low <= mm <= high, f"a length from {low:g} to {high:g} mm"),
     }
     if sensors := _SENSORS.get(kind):
         settings["sensor"] = (
-            lambda name: BY_NAME[name] if name in sensors else BY_NAME[""], lambda _: True,
+            lambda name: BY_NAME[name] if name in sensors else BY_NAME[""],
+            lambda _: True,
             f"one of {', '.join(sensors)}",
-        )  # fmt: skip
+        )
     return settings
 
 
@@ -90,4 +111,6 @@ def _value(address: str, key: str, text: str, setting: _Setting) -> Any:
             return value
     except (KeyError, ValueError):
         pass
-    raise RecordingError(f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}")
+    raise RecordingError(
+        f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}"
+    )

@@ -13,7 +13,9 @@ from liex_lab.simulation.objects import N_PARTS, THING_FACES, draw_thing, rounde
 from liex_lab.simulation.scene import Stage
 
 Array = NDArray[np.float64]
-Beside = Callable[[np.random.Generator, Array, float], Array]  # a second object from joints (n, J, 3) and a length
+Beside = Callable[
+    [np.random.Generator, Array, float], Array
+]  # a second object from joints (n, J, 3) and a length
 
 # kind: (share of the events, shortest and longest in s)
 EVENTS = {
@@ -51,7 +53,9 @@ class Event:
     stop: int
 
 
-def draw_script(rng: np.random.Generator, n_frames: int, step_s: float) -> tuple[list[Event], NDArray[np.int64]]:
+def draw_script(
+    rng: np.random.Generator, n_frames: int, step_s: float
+) -> tuple[list[Event], NDArray[np.int64]]:
     """Events over n frames, and how many steps of the camera's clock lie before each frame (n,), 1 as a rule.
 
     The events come in shuffled decks, the first with one of each, so that none is long absent. Frames that are dropped
@@ -86,9 +90,14 @@ def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArra
 
 
 def draw_things(
-    rng: np.random.Generator, events: list[Event], eye: Array, joints: Array, length_mm: float, beside: Beside,
+    rng: np.random.Generator,
+    events: list[Event],
+    eye: Array,
+    joints: Array,
+    length_mm: float,
+    beside: Beside,
     floats: bool = True,
-) -> Array:  # fmt: skip
+) -> Array:
     """Meshes (n, 2 V, 3) mm of the occluder and of a second object in each frame; behind the camera where there is
     none. joints (n, J, 3) mm: the animal's, arena frame, where eye (3,) is the camera.
     """
@@ -103,7 +112,9 @@ def draw_things(
     return things
 
 
-def _passing(rng: np.random.Generator, eye: Array, joints: Array, length_mm: float, floats: bool) -> Array:
+def _passing(
+    rng: np.random.Generator, eye: Array, joints: Array, length_mm: float, floats: bool
+) -> Array:
     """A bar (n, V, 3) mm that is moved across the view between the camera and the animal."""
     height = 0.65 * eye[2] if floats else min(3.0 * length_mm, 0.5 * eye[2])
     target = joints[len(joints) // 2].mean(axis=0)
@@ -130,7 +141,11 @@ def beside_animal(
         place = joints[rng.integers(len(joints)), 0, :2] + rng.normal(0.0, 1.6, 2) * length_mm
         reach = np.abs(mesh[:, :2]).max()
         free = np.linalg.norm(way - place, axis=1).min() - reach
-        cost = abs(free - 0.5 * length_mm) + max(0.0, reach - float(stage.room(place))) + 50.0 * (free < 0)
+        cost = (
+            abs(free - 0.5 * length_mm)
+            + max(0.0, reach - float(stage.room(place)))
+            + 50.0 * (free < 0)
+        )
         if cost < best_cost:
             best, best_cost = place, cost
     return np.broadcast_to(mesh + np.array([*best, 0.0]), (len(joints), *mesh.shape))
@@ -141,10 +156,16 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
     centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
     radii[0] = rng.uniform(*_HELD, 3) * length_mm
     power = np.full(N_PARTS, rng.choice([2.0, 8.0]))
-    mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(-1, 3)
+    mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(
+        -1, 3
+    )
     way = rng.uniform(-np.pi, np.pi)
     toward = np.array([np.cos(way), np.sin(way)])
-    reach = (joints[..., :2] @ toward).max() + np.hypot(*radii[0, :2]) + rng.uniform(*_HELD_ASIDE) * length_mm
+    reach = (
+        (joints[..., :2] @ toward).max()
+        + np.hypot(*radii[0, :2])
+        + rng.uniform(*_HELD_ASIDE) * length_mm
+    )
     middle = joints.mean(axis=(0, 1))
     place = np.array([*(middle[:2] + (reach - middle[:2] @ toward) * toward), middle[2]])
     return np.broadcast_to(mesh + place, (len(joints), *mesh.shape))
@@ -163,7 +184,12 @@ class Loss:
 
     @staticmethod
     def draw(
-        rng: np.random.Generator, events: list[Event], camera: Camera, joints: Array, length_mm: float, floats: bool
+        rng: np.random.Generator,
+        events: list[Event],
+        camera: Camera,
+        joints: Array,
+        length_mm: float,
+        floats: bool,
     ) -> Loss:
         """What is lost in n frames of these events; joints (n, J, 3) mm: camera frame."""
         n = len(joints)
@@ -179,12 +205,24 @@ class Loss:
                 for i in range(event.start, event.stop):
                     centres = joints[i, rng.integers(joints.shape[1], size=int(rng.integers(2, 5)))]
                     centres = centres + rng.normal(0.0, 0.1 * length_mm, centres.shape)
-                    px = camera.fx / centres[:, 2:] * rng.uniform(*_HOLE, (len(centres), 1)) * length_mm
+                    px = (
+                        camera.fx
+                        / centres[:, 2:]
+                        * rng.uniform(*_HOLE, (len(centres), 1))
+                        * length_mm
+                    )
                     discs[i] = np.concatenate([camera.project(centres), px], axis=1)
         return Loss(tuple(discs), faint, dropout)
 
-    def apply(self, depths: NDArray[np.float32], still: NDArray[np.float32] | None, first: int,
-              seeds: NDArray[np.uint64], middle_px: Array, reach_px: Array) -> None:  # fmt: skip
+    def apply(
+        self,
+        depths: NDArray[np.float32],
+        still: NDArray[np.float32] | None,
+        first: int,
+        seeds: NDArray[np.uint64],
+        middle_px: Array,
+        reach_px: Array,
+    ) -> None:
         """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W) mm, where anything is
         lost in it; middle_px (n, 2) and reach_px (n,): where the animal is in the picture.
         """

@@ -21,9 +21,13 @@ from liex_lab.simulation.species import Postures
 Array = NDArray[np.float64]
 
 TANK = Setting(
-    camera_mm=(230.0, 330.0), tilt_rad=float(np.radians(6.0)), walls_mm=(30.0, 110.0), open_share=0.2,
-    clutter=("pellet", "plant"), scale=0.3,
-)  # fmt: skip
+    camera_mm=(230.0, 330.0),
+    tilt_rad=float(np.radians(6.0)),
+    walls_mm=(30.0, 110.0),
+    open_share=0.2,
+    clutter=("pellet", "plant"),
+    scale=0.3,
+)
 # at rest or gliding, scooting with waves down the body, J: the hind half bent, C: both halves, S: against each other
 KINDS = ("glide", "scoot", "j", "c", "s")
 SHARES = (0.28, 0.30, 0.14, 0.14, 0.14)
@@ -48,7 +52,9 @@ class FishHabits:
         """N fish."""
         return vary_body(rng, self.skeleton, family, n)
 
-    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
+    def postures(
+        self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
+    ) -> Postures:
         """Fish that glide, scoot and turn, mostly level, at any height over the floor."""
         n = len(size)
         kind = rng.choice(len(KINDS), n, p=SHARES)
@@ -78,20 +84,48 @@ def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.in
     way = rng.choice([-1.0, 1.0], n)
     slight = rng.normal(0.0, 1.0, (2, n)) * [[0.6], [1.2]]
     strong = rng.uniform(0.0, 1.0, (2, n))
-    front = np.choose(kind, [slight[0], 1.2 * slight[0], 1.2 * slight[0], way * (2 + 7 * strong[0]),
-                             way * (1.5 + 5 * strong[0])])  # fmt: skip
-    hind = np.choose(kind, [slight[1], 1.5 * slight[1], way * (2.5 + 6.5 * strong[1]), way * (1.5 + 9 * strong[1]),
-                            -way * (2 + 6.5 * strong[1])])  # fmt: skip
-    amplitude = np.choose(kind, [0.4, 1.0 + 5.0 * strong[0], 1.5 * strong[0], 1.5 * strong[0], 2.0 * strong[0]])
-    phase, length, middle = rng.uniform(-np.pi, np.pi, n), rng.uniform(0.7, 1.4, n), rng.normal(_FRONT, 0.06, n)
+    front = np.choose(
+        kind,
+        [
+            slight[0],
+            1.2 * slight[0],
+            1.2 * slight[0],
+            way * (2 + 7 * strong[0]),
+            way * (1.5 + 5 * strong[0]),
+        ],
+    )
+    hind = np.choose(
+        kind,
+        [
+            slight[1],
+            1.5 * slight[1],
+            way * (2.5 + 6.5 * strong[1]),
+            way * (1.5 + 9 * strong[1]),
+            -way * (2 + 6.5 * strong[1]),
+        ],
+    )
+    amplitude = np.choose(
+        kind, [0.4, 1.0 + 5.0 * strong[0], 1.5 * strong[0], 1.5 * strong[0], 2.0 * strong[0]]
+    )
+    phase, length, middle = (
+        rng.uniform(-np.pi, np.pi, n),
+        rng.uniform(0.7, 1.4, n),
+        rng.normal(_FRONT, 0.06, n),
+    )
     own = rng.normal(0.0, 0.5, (n, 4))
     return bend_profile(skeleton, front, hind, amplitude, phase, length, middle, own)
 
 
 def bend_profile(
-    skeleton: Skeleton, front: Array, hind: Array, amplitude: Array, phase: Array, length: Array, middle: Array,
+    skeleton: Skeleton,
+    front: Array,
+    hind: Array,
+    amplitude: Array,
+    phase: Array,
+    length: Array,
+    middle: Array,
     own: Array,
-) -> Array:  # fmt: skip
+) -> Array:
     """Yaw (n, J) rad of two arcs with a wave over them.
 
     front, hind, amplitude (n,): degrees a joint; phase rad, length of the wave and where the arcs meet (n,), of the
@@ -101,7 +135,11 @@ def bend_profile(
     joint = 20.0 / max(1, skeleton.n_joints - 1)
     share = 1.0 / (1.0 + np.exp(-(s - middle[:, None]) / 0.05))
     arcs = front[:, None] * (1.0 - share) + hind[:, None] * share
-    wave = amplitude[:, None] * (0.35 + 0.65 * s) * np.sin(2 * np.pi * s / length[:, None] - phase[:, None])
+    wave = (
+        amplitude[:, None]
+        * (0.35 + 0.65 * s)
+        * np.sin(2 * np.pi * s / length[:, None] - phase[:, None])
+    )
     stand = np.stack([np.sin(np.pi * (k + 1) * s + k) for k in range(own.shape[1])])
     yaw = np.radians((arcs + wave + own @ stand) * joint) * skeleton.axes[:, 2]
     yaw[:, 0] = 0.0

@@ -58,7 +58,10 @@ class GenericHabits:
         scale = float(np.clip(self.skeleton.relative_size, 0.3, 2.0))
         # seen across the picture, with room to go about; no camera of this kind reads nearer than its least distance
         least = ARENA.camera_mm[0] if self.sensors == SENSORS else 230.0
-        near = max(least, 2.2 * length * max(sensor.camera.fx / sensor.camera.height for sensor in self.sensors))
+        near = max(
+            least,
+            2.2 * length * max(sensor.camera.fx / sensor.camera.height for sensor in self.sensors),
+        )
         walls = (ARENA.walls_mm[0] * scale, ARENA.walls_mm[1] * scale)
         return Setting(camera_mm=(near, 1.6 * near), walls_mm=walls, scale=scale)
 
@@ -73,14 +76,18 @@ class GenericHabits:
         """N bodies, varied in girth and proportions."""
         return vary_body(rng, self.skeleton, family, n)
 
-    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
+    def postures(
+        self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
+    ) -> Postures:
         """Postures within the joints' limits, smooth along the chains."""
         n = len(size)
         angles = draw_angles(rng, self.skeleton, n)
         heading = rng.uniform(-np.pi, np.pi, n)
         if self.floats:
             tilt = np.clip(rng.normal(0.0, 0.25, (2, n)), -0.9, 0.9)
-            pose = _centred(self.skeleton, angles, root_rotation(heading, tilt[0], 0.6 * tilt[1]), size)
+            pose = _centred(
+                self.skeleton, angles, root_rotation(heading, tilt[0], 0.6 * tilt[1]), size
+            )
             low, high = self._extent(pose, shape, size)
             room = np.maximum(_NEAR_SHARE * camera_mm - high, -low + 1.0)
             pose.root.translation[:, 2] += -low + rng.random(n) * (room + low)
@@ -104,7 +111,9 @@ class GenericHabits:
         n = len(size)
         tilts = rng.normal(0.0, _TILT_RAD, (_TILTS, 2, n))
         tilts[0] = 0.0
-        poses = [_centred(self.skeleton, angles, root_rotation(heading, t[0], t[1]), size) for t in tilts]
+        poses = [
+            _centred(self.skeleton, angles, root_rotation(heading, t[0], t[1]), size) for t in tilts
+        ]
         height = []
         for pose in poses:
             z = pose.joints(self.skeleton)[..., 2]
@@ -163,12 +172,16 @@ def moving_session(
     """n_frames of one animal that goes about and changes its posture; arguments as in `SyntheticSession.draw`."""
     rng = np.random.default_rng(seed)
     skeleton, sensor = habits.skeleton, sensor or habits.sensors[-1]
-    length = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    length = (
+        skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    )
     stage = Stage.draw(rng, sensor.camera, length, habits.setting)
     shape = habits.shapes(rng, family, 1)
     step_s = habits.frame_ns * 1e-9
     size, slow = np.full(n_frames, length / skeleton.length), _CHANGE_S / step_s
-    change = np.maximum.accumulate(np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0))
+    change = np.maximum.accumulate(
+        np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0)
+    )
     drawn = draw_angles(rng, skeleton, n_frames)[change].reshape(n_frames, -1)
     angles = smoothed(drawn, 0.4 * slow).reshape(n_frames, -1, 3)
     speed = np.maximum(smoothed(rng.normal(0.4, 0.8, (n_frames, 1)), slow)[:, 0], 0.0)
@@ -176,12 +189,20 @@ def moving_session(
     level, body = np.zeros(n_frames), shape[0].broadcast(n_frames)
     flat = _centred(skeleton, angles, root_rotation(level, level, level), size)
     low, high = habits._extent(flat, body, size)
-    top = _NEAR_SHARE * float(stage.T_arena_camera.translation[2]) - float(high.max()) if habits.floats else 0.0
+    top = (
+        _NEAR_SHARE * float(stage.T_arena_camera.translation[2]) - float(high.max())
+        if habits.floats
+        else 0.0
+    )
     water = (-float(low.min()) + 1.0, max(top, -float(low.min()) + 1.0))
     position, heading = wander(rng, stage, length, speed, turning, level, water, step_s)
     pose = _centred(skeleton, angles, root_rotation(heading, level, level), size)
     pose.root.translation[:] += position
     if not habits.floats:
         pose.root.translation[:, 2] -= position[:, 2] + low
-    cast = assemble(rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False)
-    return SyntheticSession(name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns)
+    cast = assemble(
+        rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False
+    )
+    return SyntheticSession(
+        name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+    )

@@ -59,7 +59,9 @@ def walking_session(
     rng = np.random.default_rng(seed)
     habits = MouseHabits() if habits is None else habits
     skeleton = habits.skeleton
-    spine = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    spine = (
+        skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    )
     stage = Stage.draw(rng, sensor.camera, spine)
     shape = habits.shapes(rng, family, 1)
     kinds, spines_per_s = _walk_script(rng, n_frames)
@@ -67,14 +69,24 @@ def walking_session(
     position, heading = _path(rng, stage, spine, spines_per_s * spine)
     # the trunk sways with the stride
     phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
-    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [1.0, -0.5, -0.5]
+    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [
+        1.0,
+        -0.5,
+        -0.5,
+    ]
     pose, girth = stand(
-        skeleton, posture, heading, np.full(n_frames, spine / skeleton.length), shape[0].broadcast(n_frames),
+        skeleton,
+        posture,
+        heading,
+        np.full(n_frames, spine / skeleton.length),
+        shape[0].broadcast(n_frames),
         _smooth(rng.uniform(0.0, 3.0, n_frames)[:, None])[:, 0],
-    )  # fmt: skip
+    )
     middle = pose.joints(skeleton)[..., :2].mean(axis=1)
     pose.root.translation[:, :2] += position - middle
-    cast = assemble(rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, False)
+    cast = assemble(
+        rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, False
+    )
     assert cast.bends is not None  # mice have tails
     cast.bends[:] = cast.bends[:1] + 4.0 * _smooth(rng.normal(0.0, 0.05, cast.bends.shape))
     return SyntheticSession(name, stage, cast)
@@ -87,7 +99,12 @@ def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], A
     at = 0
     while at < n:
         if not deck:  # dealt out before it is shuffled again, so that nothing is long absent
-            deck = [int(k) for k in rng.permutation(np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(5)]))]
+            deck = [
+                int(k)
+                for k in rng.permutation(
+                    np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(5)])
+                )
+            ]
         kind = deck.pop()
         _, shortest, longest, (slow, fast) = _STRETCHES[kind]
         stop = at + int(_RATE_HZ * rng.uniform(shortest, longest))
@@ -96,7 +113,9 @@ def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], A
     return kinds, np.maximum(_smooth(speed[:, None])[:, 0], 0.0)
 
 
-def _flow(rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]) -> Posture:
+def _flow(
+    rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]
+) -> Posture:
     """One posture a stretch, held with slow changes within it, and blended where the next begins."""
     drawn = draw_postures(rng, skeleton, kinds, shape)
     n = len(kinds)
@@ -112,13 +131,21 @@ def _smooth(rows: Array) -> Array:
     reach = int(4 * _BLEND_S * _RATE_HZ)
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_BLEND_S * _RATE_HZ)) ** 2)
     padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1)
+    return np.stack(
+        [np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1
+    )
 
 
-def _path(rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array) -> tuple[Array, Array]:
+def _path(
+    rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array
+) -> tuple[Array, Array]:
     """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back before a wall."""
     n, camera = len(speed), stage.camera
-    middle = floor_point(camera, stage.T_arena_camera, np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]))
+    middle = floor_point(
+        camera,
+        stage.T_arena_camera,
+        np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]),
+    )
     home = stage.centre if stage.freedom(stage.centre) > stage.freedom(middle) else middle
     margin = min(0.85 * spine_mm, 0.7 * stage.freedom(home))
     position, heading = np.empty((n, 2)), np.empty(n)
@@ -155,7 +182,9 @@ def swimming_session(
     rng = np.random.default_rng(seed)
     habits = FishHabits() if habits is None else habits
     skeleton = habits.skeleton
-    length = skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    length = (
+        skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+    )
     stage = Stage.draw(rng, sensor.camera, length, habits.setting)
     shape = habits.shapes(rng, family, 1)
     step_s = habits.frame_ns * 1e-9
@@ -164,23 +193,40 @@ def swimming_session(
     # a turn begins in front and leaves the body at the tail; the wave runs from head to tail
     hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
     yaw = bend_profile(
-        skeleton, _BEND_PER_TURN * turning, 1.3 * _BEND_PER_TURN * hind, amplitude, beat, np.ones(n_frames), middle,
+        skeleton,
+        _BEND_PER_TURN * turning,
+        1.3 * _BEND_PER_TURN * hind,
+        amplitude,
+        beat,
+        np.ones(n_frames),
+        middle,
         smoothed(rng.normal(0.0, 0.8, (n_frames, 4)), 6.0),
-    )  # fmt: skip
+    )
     size = np.full(n_frames, length / skeleton.length)
     pitch = _CLIMB_RAD * np.tanh(smoothed(rng.normal(0.0, 6.0, (n_frames, 1)), 25.0)[:, 0])
     roll = np.radians(smoothed(rng.normal(0.0, 12.0, (n_frames, 1)), 8.0)[:, 0])
     level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
     low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
-    top = max(float(stage.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
-    position, heading = wander(rng, stage, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s)
+    top = max(
+        float(stage.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()),
+        float(low.max()) + 2.0,
+    )
+    position, heading = wander(
+        rng, stage, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s
+    )
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
-    cast = assemble(rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False)
-    return SyntheticSession(name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns)
+    cast = assemble(
+        rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False
+    )
+    return SyntheticSession(
+        name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+    )
 
 
-def _swim_script(rng: np.random.Generator, n: int, step_s: float) -> tuple[Array, Array, Array, Array]:
+def _swim_script(
+    rng: np.random.Generator, n: int, step_s: float
+) -> tuple[Array, Array, Array, Array]:
     """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,) rad of the tail."""
     speed, turning, amplitude, rate = np.zeros((4, n))
     at, pace = 0, 0.0
@@ -190,7 +236,10 @@ def _swim_script(rng: np.random.Generator, n: int, step_s: float) -> tuple[Array
         stop = min(at + beating, n)
         pace = max(reached, pace)
         speed[at:stop] = pace
-        amplitude[at:stop], rate[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1]), beats
+        amplitude[at:stop], rate[at:stop] = (
+            rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1]),
+            beats,
+        )
         if rng.random() < _TURN_SHARE:
             brief = min(at + max(2, int(_TURN_S / step_s)), n)
             turning[at:brief] = rng.choice([-1.0, 1.0]) * rng.uniform(*_TURN_RAD_S)
@@ -198,25 +247,42 @@ def _swim_script(rng: np.random.Generator, n: int, step_s: float) -> tuple[Array
         speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / _GLIDE_S)
         pace *= float(np.exp(-resting * step_s / _GLIDE_S))
         at = stop + resting
-    turning = smoothed(turning[:, None], 1.2)[:, 0] + smoothed(rng.normal(0.0, 3.0, (n, 1)), 12.0)[:, 0]
+    turning = (
+        smoothed(turning[:, None], 1.2)[:, 0] + smoothed(rng.normal(0.0, 3.0, (n, 1)), 12.0)[:, 0]
+    )
     amplitude = smoothed(amplitude[:, None], 2.0)[:, 0]
-    return smoothed(speed[:, None], 1.5)[:, 0], turning, amplitude, 2 * np.pi * np.cumsum(rate) * step_s
+    return (
+        smoothed(speed[:, None], 1.5)[:, 0],
+        turning,
+        amplitude,
+        2 * np.pi * np.cumsum(rate) * step_s,
+    )
 
 
 def wander(
-    rng: np.random.Generator, stage: Stage, length: float, speed: Array, turning: Array, pitch: Array,
-    water: tuple[float, float], step_s: float,
-) -> tuple[Array, Array]:  # fmt: skip
+    rng: np.random.Generator,
+    stage: Stage,
+    length: float,
+    speed: Array,
+    turning: Array,
+    pitch: Array,
+    water: tuple[float, float],
+    step_s: float,
+) -> tuple[Array, Array]:
     """Positions (n, 3) mm of the body's middle between two heights of the water, and headings (n,) rad.
 
     The fish turns away from walls and from the border of the picture; where there is no way on it stays.
     """
     n = len(speed)
-    centre = stage.camera.unproject([(stage.camera.width - 1) / 2, (stage.camera.height - 1) / 2], 1.0)
+    centre = stage.camera.unproject(
+        [(stage.camera.width - 1) / 2, (stage.camera.height - 1) / 2], 1.0
+    )
     ray = stage.T_arena_camera.rotation @ centre
     low, high = water
     z = rng.uniform(low, high)
-    home = (stage.T_arena_camera.translation + ray * (stage.T_arena_camera.translation[2] - z) / -ray[2])[:2]
+    home = (
+        stage.T_arena_camera.translation + ray * (stage.T_arena_camera.translation[2] - z) / -ray[2]
+    )[:2]
     margin = 0.6 * length
     position, headings = np.empty((n, 3)), np.empty(n)
     xy, way = home + rng.normal(0.0, 0.1 * length, 2), rng.uniform(-np.pi, np.pi)
@@ -240,4 +306,6 @@ def smoothed(rows: Array, frames: float) -> Array:
     reach = int(4 * frames)
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
     padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1)
+    return np.stack(
+        [np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1
+    )

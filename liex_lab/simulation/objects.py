@@ -36,17 +36,28 @@ def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
     unit = SPHERE / (np.abs(SPHERE) ** p).sum(axis=-1, keepdims=True) ** (1.0 / p)
     local = unit * np.asarray(radii, float)[..., None, :]
     c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
-    turned = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
+    turned = np.stack(
+        [
+            c * local[..., 0] - s * local[..., 1],
+            s * local[..., 0] + c * local[..., 1],
+            local[..., 2],
+        ],
+        -1,
+    )
     return turned + np.asarray(centre, float)[..., None, :]
 
 
-def _pellet(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array) -> None:
+def _pellet(
+    rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
+) -> None:
     """A lump of food on its way down."""
     radii[0] = spine_mm * rng.uniform(0.04, 0.13) * rng.uniform(0.7, 1.0, 3)
     centre[0, 2] = radii[0, 2] + spine_mm * rng.uniform(0.0, 2.0)
 
 
-def _plant(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array) -> None:
+def _plant(
+    rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
+) -> None:
     """A tuft of thin leaves that stand in the water."""
     for k in range(N_PARTS):
         tall = spine_mm * rng.uniform(0.3, 0.9)
@@ -55,12 +66,16 @@ def _plant(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Arra
         yaw[k] = rng.uniform(-np.pi, np.pi)
 
 
-def _fish(rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array) -> None:
+def _fish(
+    rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
+) -> None:
     """Another fish, well smaller than the animal: a body and a tail."""
     long, heading = spine_mm * rng.uniform(0.30, 0.55), rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(heading), np.sin(heading)])
     lift = spine_mm * rng.uniform(0.15, 1.5)
-    for k, (at, length, wide, high) in enumerate([(0.12, 0.40, 0.075, 0.11), (-0.32, 0.22, 0.02, 0.07)]):
+    for k, (at, length, wide, high) in enumerate(
+        [(0.12, 0.40, 0.075, 0.11), (-0.32, 0.22, 0.02, 0.07)]
+    ):
         centre[k] = [*(at * long * ahead), lift]
         radii[k], yaw[k] = long * np.array([length, wide, high]), heading
 
@@ -86,7 +101,12 @@ def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
     elif kind in _IN_WATER:
         _IN_WATER[kind](rng, spine_mm, centre, radii, yaw)
     elif kind == "cable":
-        step, thick, heading, bend = rng.uniform(10, 22), rng.uniform(3, 7), rng.uniform(-3, 3), rng.normal(0, 0.25)
+        step, thick, heading, bend = (
+            rng.uniform(10, 22),
+            rng.uniform(3, 7),
+            rng.uniform(-3, 3),
+            rng.normal(0, 0.25),
+        )
         at = np.array([-3.5 * step * np.cos(heading), -3.5 * step * np.sin(heading)])
         for k in range(N_PARTS):
             centre[k], radii[k], yaw[k] = [*at, thick], [0.8 * step, thick, thick], heading
@@ -94,7 +114,12 @@ def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
             heading += bend + rng.normal(0, 0.15)
     else:
         lift, size, pointing = rng.uniform(0, 50), rng.uniform(0.8, 1.1), rng.uniform(-np.pi, np.pi)
-        centre[0], radii[0], power[0], yaw[0] = [0, 0, lift + 16], size * np.array([42.0, 38.0, 15.0]), 3.0, pointing
+        centre[0], radii[0], power[0], yaw[0] = (
+            [0, 0, lift + 16],
+            size * np.array([42.0, 38.0, 15.0]),
+            3.0,
+            pointing,
+        )
         for k in range(1, 6):
             fan = pointing + (k - 3) * 0.28
             reach = size * (70.0 if k < 5 else 55.0)

@@ -59,7 +59,9 @@ def sample_postures(
     return stand(skeleton, posture, heading, size, bodies, rng.uniform(0.0, _MAX_GAP_MM, n))
 
 
-def draw_postures(rng: np.random.Generator, skeleton: Skeleton, kinds: NDArray[np.int64], shape: BodyShape) -> Posture:
+def draw_postures(
+    rng: np.random.Generator, skeleton: Skeleton, kinds: NDArray[np.int64], shape: BodyShape
+) -> Posture:
     """Postures of the given kinds (n,), for bodies of the given shapes (n)."""
     n, n_bones = len(kinds), skeleton.n_joints - 1
     bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
@@ -95,7 +97,10 @@ def draw_postures(rng: np.random.Generator, skeleton: Skeleton, kinds: NDArray[n
 
 
 def _draw_turns(
-    rng: np.random.Generator, skeleton: Skeleton, curled: NDArray[np.bool_], reaching: NDArray[np.bool_]
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    curled: NDArray[np.bool_],
+    reaching: NDArray[np.bool_],
 ) -> Array:
     """Turns (n, J) rad to the left at the joints: slight, or up to 100 degrees in all, and the head's own."""
     n, inner = len(curled), skeleton.n_joints - 2
@@ -104,7 +109,9 @@ def _draw_turns(
     total = np.radians(rng.uniform(30.0, 100.0, (n, 1))) * rng.choice([-1.0, 1.0], (n, 1))
     curl = total * rng.dirichlet(np.full(inner, 3.0), n) + 0.5 * slight
     turn[:, 1:-1] = np.where(curled, curl, slight)
-    head = np.radians(np.where(reaching[:, 0], rng.uniform(-60.0, 60.0, n), rng.normal(0.0, 10.0, n)))
+    head = np.radians(
+        np.where(reaching[:, 0], rng.uniform(-60.0, 60.0, n), rng.normal(0.0, 10.0, n))
+    )
     turn[:, -2] += head
     return turn
 
@@ -139,13 +146,21 @@ def stand(
         frames = pose.frames(skeleton)
         lowest = np.empty((len(size), len(stations)))
         _lowest_points(
-            frames.translation, frames.rotation, girth, stations, shape.half_width, shape.half_height, lowest
+            frames.translation,
+            frames.rotation,
+            girth,
+            stations,
+            shape.half_width,
+            shape.half_height,
+            lowest,
         )
         height = gap - lowest[:, rear].min(axis=1)
         deficit = np.maximum(gap - (lowest[:, ~rear].min(axis=1) + height), 0.0)
         if deficit.max() < 0.2:
             break
-        elevation = elevation + np.where(deficit > 0.2, deficit / (0.5 * scale * skeleton.length), 0.0)
+        elevation = elevation + np.where(
+            deficit > 0.2, deficit / (0.5 * scale * skeleton.length), 0.0
+        )
     sunk = np.maximum(-(lowest.min(axis=1) + height), 0.0)
     pose.root.translation[:, 2] = height + sunk
     return pose, girth
@@ -167,5 +182,8 @@ def _lowest_points(joints, rotations, girth, stations, half_width, half_height, 
         chain_arc(joints[i], arc)
         for r in range(len(stations)):
             spine_frame(joints[i], rotations[i], arc, stations[r], frame)
-            side, rise = girth[i] * half_width[i, r] * frame[2, 2], girth[i] * half_height[i, r] * frame[3, 2]
+            side, rise = (
+                girth[i] * half_width[i, r] * frame[2, 2],
+                girth[i] * half_height[i, r] * frame[3, 2],
+            )
             out[i, r] = frame[0, 2] - np.sqrt(side * side + rise * rise)

@@ -84,15 +84,25 @@ class TrueRecording(Recording):
 class SyntheticSession(TrueRecording):
     """A virtual animal in a virtual arena; shape: its body."""
 
-    def __init__(self, name: str, stage: Stage, cast: Cast, times_ns: NDArray[np.int64] | None = None) -> None:
+    def __init__(
+        self, name: str, stage: Stage, cast: Cast, times_ns: NDArray[np.int64] | None = None
+    ) -> None:
         n = len(cast.seeds)
         times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
-        super().__init__(name=name, format="synthetic", camera=stage.camera, times_ns=times, read=self._depth)
+        super().__init__(
+            name=name, format="synthetic", camera=stage.camera, times_ns=times, read=self._depth
+        )
         self.stage, self.cast, self.skeleton = stage, cast, cast.skeleton
-        self.surface, self.shape, self.spine_mm = Surface.of(cast.skeleton), cast.shape, cast.spine_mm
+        self.surface, self.shape, self.spine_mm = (
+            Surface.of(cast.skeleton),
+            cast.shape,
+            cast.spine_mm,
+        )
         self.T_arena_camera = stage.T_arena_camera
         normal = -self.T_arena_camera.rotation[2]
-        self.floor = Floor.from_plane(normal, float(self.T_arena_camera.translation[2]), stage.camera)
+        self.floor = Floor.from_plane(
+            normal, float(self.T_arena_camera.translation[2]), stage.camera
+        )
         self.pose = cast.pose.moved(self.T_arena_camera.inverse())
         self.joints_camera = self.pose.joints(self.skeleton)
         self.joints_arena = cast.pose.joints(self.skeleton)
@@ -103,18 +113,30 @@ class SyntheticSession(TrueRecording):
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth (n, H, W) mm of frames start to stop, made on all threads."""
         cast, part, camera = self.cast, slice(start, stop), self.stage.camera
-        pose = Pose(SE3(cast.pose.root.rotation[part], cast.pose.root.translation[part]), cast.pose.angles[part],
-                    cast.pose.scale[part])  # fmt: skip
+        pose = Pose(
+            SE3(cast.pose.root.rotation[part], cast.pose.root.translation[part]),
+            cast.pose.angles[part],
+            cast.pose.scale[part],
+        )
         bends = None if cast.bends is None else cast.bends[part]
         vertices = self.surface.vertices(pose, cast.shape, cast.girth[part], bends)
         out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
         T_camera_arena = self.T_arena_camera.inverse()
         _stage.frames_parallel(
-            self.stage.still, vertices, self.surface.faces, cast.things[part], cast.thing_faces, cast.shown[part],
-            np.ascontiguousarray(T_camera_arena.rotation), T_camera_arena.translation,
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), cast.parameters[part], cast.seeds[part],
-            NORMAL, out,
-        )  # fmt: skip
+            self.stage.still,
+            vertices,
+            self.surface.faces,
+            cast.things[part],
+            cast.thing_faces,
+            cast.shown[part],
+            np.ascontiguousarray(T_camera_arena.rotation),
+            T_camera_arena.translation,
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            cast.parameters[part],
+            cast.seeds[part],
+            NORMAL,
+            out,
+        )
         unit = float(cast.parameters[0, UNIT])
         return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
 
@@ -123,7 +145,9 @@ class SyntheticSession(TrueRecording):
         for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
-            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+            yield [
+                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
+            ]
 
     @staticmethod
     def draw(
@@ -147,22 +171,52 @@ class SyntheticSession(TrueRecording):
         rng = np.random.default_rng(seed)
         habits = MouseHabits() if habits is None else habits
         home = habits.skeleton.length
-        sensor = habits.sensors[int(rng.integers(len(habits.sensors)))] if sensor is None else sensor
+        sensor = (
+            habits.sensors[int(rng.integers(len(habits.sensors)))] if sensor is None else sensor
+        )
         drawn = home * float(rng.uniform(*habits.sizes))
         spine = drawn if spine_mm is None else float(spine_mm)
         stage = Stage.draw(rng, sensor.camera, spine, habits.setting)
         shape = habits.shapes(rng, family, 1)
-        size, camera_mm = np.full(n_frames, spine / home), np.full(n_frames, stage.T_arena_camera.translation[2])
+        size, camera_mm = (
+            np.full(n_frames, spine / home),
+            np.full(n_frames, stage.T_arena_camera.translation[2]),
+        )
         pose, girth, _ = habits.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
-        cast = assemble(rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, True)
+        cast = assemble(
+            rng,
+            stage,
+            sensor,
+            habits,
+            spine,
+            shape,
+            pose,
+            girth,
+            noise,
+            erosion_px,
+            thing_share,
+            True,
+        )
         times = np.arange(n_frames, dtype=np.int64) * habits.frame_ns
-        return SyntheticSession(name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", stage, cast, times)
+        return SyntheticSession(
+            name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", stage, cast, times
+        )
 
 
 def assemble(
-    rng: np.random.Generator, stage: Stage, sensor: Sensor, habits: Habits, spine_mm: float, shape: Body,
-    pose: Pose, girth: Array, noise: float, erosion_px: int, thing_share: float, scatter: bool,
-) -> Cast:  # fmt: skip
+    rng: np.random.Generator,
+    stage: Stage,
+    sensor: Sensor,
+    habits: Habits,
+    spine_mm: float,
+    shape: Body,
+    pose: Pose,
+    girth: Array,
+    noise: float,
+    erosion_px: int,
+    thing_share: float,
+    scatter: bool,
+) -> Cast:
     """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things beside it."""
     n = len(girth)
     surface = Surface.of(habits.skeleton)
@@ -177,11 +231,19 @@ def assemble(
     things, shown = _beside(rng, stage, trunk, spine_mm, thing_share, habits, sensor.stride)
     parameters = np.repeat(sensor.draw(rng, 1, shape.fur, noise, erosion_px), n, axis=0)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    return Cast(habits.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds)
+    return Cast(
+        habits.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds
+    )
 
 
 def _beside(
-    rng: np.random.Generator, stage: Stage, trunk: Array, spine_mm: float, share: float, habits: Habits, stride: int
+    rng: np.random.Generator,
+    stage: Stage,
+    trunk: Array,
+    spine_mm: float,
+    share: float,
+    habits: Habits,
+    stride: int,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """One thing for a session, at a free place of its own in every frame: (n, V, 3) mm and where it is shown (n,)."""
     mesh = draw_thing(rng, str(rng.choice(habits.things)), spine_mm)
@@ -208,7 +270,10 @@ def _beside(
 def _covers(stage: Stage, thing: Array, trunk: Array, margin_px: float) -> bool:
     """Whether the thing and the animal overlap in the picture or nearly so."""
     T_camera_arena = stage.T_arena_camera.inverse()
-    a, b = stage.camera.project(T_camera_arena @ thing), stage.camera.project(T_camera_arena @ trunk)
+    a, b = (
+        stage.camera.project(T_camera_arena @ thing),
+        stage.camera.project(T_camera_arena @ trunk),
+    )
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
     around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()

@@ -61,7 +61,9 @@ class Stage:
     still: NDArray[np.float32]
 
     @staticmethod
-    def draw(rng: np.random.Generator, camera: Camera, spine_mm: float, setting: Setting = ARENA) -> Stage:
+    def draw(
+        rng: np.random.Generator, camera: Camera, spine_mm: float, setting: Setting = ARENA
+    ) -> Stage:
         """A random arena, large enough for the animal, its floor's centre in view."""
         T = draw_views(rng, 1, setting)
         T_arena_camera = SE3(T.rotation[0], T.translation[0])
@@ -76,11 +78,22 @@ class Stage:
         middle = np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0])
         centre = floor_point(camera, T_arena_camera, middle) + rng.uniform(-0.15, 0.15, 2) * half
         low, high = setting.walls_mm
-        yaw, wall_mm = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(low, min(high, 0.7 * height)))
+        yaw, wall_mm = (
+            float(rng.uniform(-0.3, 0.3)),
+            float(rng.uniform(low, min(high, 0.7 * height))),
+        )
         if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
         stage = Stage(
-            camera, T_arena_camera, kind, centre, half, yaw, wall_mm, np.zeros((0, 2)), np.zeros((0, 0), np.float32)
+            camera,
+            T_arena_camera,
+            kind,
+            centre,
+            half,
+            yaw,
+            wall_mm,
+            np.zeros((0, 2)),
+            np.zeros((0, 0), np.float32),
         )
         return stage._furnished(rng, spine_mm, setting)
 
@@ -97,8 +110,17 @@ class Stage:
             still = np.where((thing > 0) & ((still == 0) | (thing < still)), thing, still)
             outline.append(mesh[:, :2])
         clutter = np.concatenate(outline) if outline else np.zeros((0, 2))
-        return Stage(self.camera, self.T_arena_camera, self.kind, self.centre, self.half, self.yaw, self.wall_mm,
-                     clutter, still)  # fmt: skip
+        return Stage(
+            self.camera,
+            self.T_arena_camera,
+            self.kind,
+            self.centre,
+            self.half,
+            self.yaw,
+            self.wall_mm,
+            clutter,
+            still,
+        )
 
     @staticmethod
     def _turned(xy: Array, yaw: float) -> Array:
@@ -147,7 +169,9 @@ class Stage:
         if self.wall_mm == 0.0:
             depth = np.where(beyond, floor - raised / fall, depth)
         elif rng.random() < 0.4:  # the untidy room around the arena
-            around = height + rng.uniform(0.0, 700.0) * scale - 60.0 * _unevenness(rng, ground, scale)
+            around = (
+                height + rng.uniform(0.0, 700.0) * scale - 60.0 * _unevenness(rng, ground, scale)
+            )
             depth = np.where(beyond & (d[..., 2] < -0.2), around / fall, depth)
         return np.where((depth > 100.0) & (depth < 4500.0), depth, 0.0).astype(np.float32)
 
@@ -159,12 +183,18 @@ class Stage:
             a, b = np.sum(d * d, axis=-1), d @ start
             c = start @ start - self.half[0] ** 2
             root = b * b - a * c
-            return np.where((root > 0) & (a > 1e-12), (-b + np.sqrt(np.maximum(root, 0))) / np.maximum(a, 1e-12), 0.0)
+            return np.where(
+                (root > 0) & (a > 1e-12),
+                (-b + np.sqrt(np.maximum(root, 0))) / np.maximum(a, 1e-12),
+                0.0,
+            )
         with np.errstate(divide="ignore", invalid="ignore"):
             leave = (np.sign(d) * self.half - start) / d
         return np.maximum(np.nanmin(np.where(np.isfinite(leave), leave, np.inf), axis=-1), 0.0)
 
-    def places(self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None) -> Array:
+    def places(
+        self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None
+    ) -> Array:
         """Shifts (n, 2) mm that bring each of n bodies to a random free place on the floor, whole and in the picture.
 
         outline (n, K, 2) mm: outermost points of the bodies on the floor; tops, bottoms (n,) mm: how high they reach
@@ -180,20 +210,30 @@ class Stage:
         for height in (np.zeros(n) if bottoms is None else bottoms, tops):
             above = np.broadcast_to(height[:, None, None, None], (*points.shape[:-1], 1))
             uv = c.project(T_camera_arena @ np.concatenate([points, above], axis=-1))
-            border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3)) - _EDGE_PX
+            border = (
+                np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3))
+                - _EDGE_PX
+            )
             room = np.minimum(room, border)
         if len(self.clutter):
-            gap = np.linalg.norm(points[:, :, :, None] - self.clutter[::7], axis=-1).min(axis=(2, 3)) - _CLUTTER_MM
+            gap = (
+                np.linalg.norm(points[:, :, :, None] - self.clutter[::7], axis=-1).min(axis=(2, 3))
+                - _CLUTTER_MM
+            )
             room = np.minimum(room, gap)
         # the first place with room enough, else the roomiest
-        chosen = np.where((room > 0).any(axis=1), np.argmax(room > 0, axis=1), np.argmax(room, axis=1))
+        chosen = np.where(
+            (room > 0).any(axis=1), np.argmax(room > 0, axis=1), np.argmax(room, axis=1)
+        )
         return aim[np.arange(n), chosen] - middle
 
 
 def draw_views(rng: np.random.Generator, m: int, setting: Setting = ARENA) -> SE3:
     """T_arena_camera (m) of cameras that look down on a setting, tilted in any direction."""
     tilt, toward = setting.tilt_rad * np.sqrt(rng.random(m)), rng.uniform(-np.pi, np.pi, m)
-    up = -np.stack([np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)], axis=-1)
+    up = -np.stack(
+        [np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)], axis=-1
+    )
     x = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
     height = rng.uniform(*setting.camera_mm, m)
@@ -220,5 +260,9 @@ def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
     for _ in range(4):
         way, length = rng.uniform(-np.pi, np.pi), rng.uniform(70.0, 350.0) * scale
         along = ground @ np.array([np.cos(way), np.sin(way)])
-        waves += rng.uniform(0.0, 0.7) * scale * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
+        waves += (
+            rng.uniform(0.0, 0.7)
+            * scale
+            * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
+        )
     return waves

@@ -41,14 +41,21 @@ class Sensor:
         smooth, white, noise = (parameters[:, column] for column in (k.SMOOTH, k.WHITE, k.NOISE))
         return noise * (distance_mm / k.TYPICAL_MM) ** 2 * np.hypot(0.8 * smooth, white)
 
-    def draw(self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0) -> Array:
+    def draw(
+        self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0
+    ) -> Array:
         """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given fur (n,).
 
         noise multiplies random errors and the rate of holes; erosion_px strips pixels off the animal's outline.
         """
         p = np.zeros((n, k.N_PARAMETERS))
         p[:, k.UNIT], p[:, k.BACKGROUND] = self.unit_mm, 1.0
-        p[:, k.KIND], p[:, k.NOISE], p[:, k.EROSION], p[:, k.FUR] = self.kind, noise, erosion_px, fur
+        p[:, k.KIND], p[:, k.NOISE], p[:, k.EROSION], p[:, k.FUR] = (
+            self.kind,
+            noise,
+            erosion_px,
+            fur,
+        )
         p[:, k.HOLES] = 10 ** rng.uniform(-4.5, -3.0, n)
         dark = rng.random(n) < 0.4
         p[:, k.DARK] = np.where(dark, 10 ** rng.uniform(-3.0, -1.7, n), 0.0)
@@ -93,7 +100,10 @@ PRIMESENSE_SENSOR = Sensor("PrimeSense", PRIMESENSE, k.PRIMESENSE_KIND)
 KINECT_V2_SENSOR = Sensor("Kinect v2", KINECT_V2, k.KINECT_V2_KIND)
 PRIMESENSE_QVGA_SENSOR = Sensor("PrimeSense QVGA", PRIMESENSE_QVGA, k.PRIMESENSE_KIND)
 RAYTRIX_R5_SENSOR = Sensor("Raytrix R5", RAYTRIX_R5, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2)
-SENSORS = (PRIMESENSE_SENSOR, KINECT_V2_SENSOR)  # those that sessions and training windows are drawn from
+SENSORS = (
+    PRIMESENSE_SENSOR,
+    KINECT_V2_SENSOR,
+)  # those that sessions and training windows are drawn from
 BY_NAME = {
     sensor.name.lower().replace(" ", "-"): sensor
     for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR, RAYTRIX_R5_SENSOR)

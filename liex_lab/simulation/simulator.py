@@ -53,7 +53,9 @@ class World(Protocol):
     ) -> Iterator[TrainingWindows]:
         """Blocks of training images from block `first` on; see `windows.training_blocks`."""
 
-    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> Sequence[TrueRecording]:
+    def test_split(
+        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
+    ) -> Sequence[TrueRecording]:
         """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing it."""
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
@@ -85,11 +87,15 @@ class RenderedWorld:
         """What the training images were made from."""
         return "rendered from a seed; no recording of an animal was used"
 
-    def training_blocks(self, seed: int, n_blocks: int, **settings: Any) -> Iterator[TrainingWindows]:
+    def training_blocks(
+        self, seed: int, n_blocks: int, **settings: Any
+    ) -> Iterator[TrainingWindows]:
         """Blocks of training images."""
         return windows.training_blocks(seed, n_blocks, self.habits, **settings)
 
-    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+    def test_split(
+        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
+    ) -> list[SyntheticSession]:
         """The recordings of a split."""
         return synthetic.test_split(name, spine_mm, n_sessions, self.habits)
 

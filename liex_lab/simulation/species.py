@@ -59,7 +59,9 @@ class Habits(Protocol):
     def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
         """N bodies of a family, see `body.shape.FAMILIES`."""
 
-    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
+    def postures(
+        self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
+    ) -> Postures:
         """A posture for each of n animals of the given sizes (n,) over home and shapes (n), anywhere on or above the
         floor, under cameras camera_mm (n,) above it.
         """
@@ -84,7 +86,9 @@ class MouseHabits:
         """N mice."""
         return draw_shapes(rng, self.skeleton, family, n)
 
-    def postures(self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array) -> Postures:
+    def postures(
+        self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
+    ) -> Postures:
         """Mice that go about, curl up, rear, hunch and reach."""
         assert isinstance(shape, BodyShape)
         kinds = rng.choice(len(KINDS), len(size), p=SHARES)

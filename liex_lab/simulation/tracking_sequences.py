@@ -46,9 +46,16 @@ class TestSequence(TrueRecording):
 
     __test__ = False
 
-    def __init__(self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str) -> None:
-        super().__init__(name=name, format="synthetic", camera=scene.camera, times_ns=scene.times_ns.copy(),
-                         read=lambda index: self.depths(index, index + 1)[0])  # fmt: skip
+    def __init__(
+        self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str
+    ) -> None:
+        super().__init__(
+            name=name,
+            format="synthetic",
+            camera=scene.camera,
+            times_ns=scene.times_ns.copy(),
+            read=lambda index: self.depths(index, index + 1)[0],
+        )
         for fact in _TRUTH:
             setattr(self, fact, getattr(scene, fact))
         self.scene, self.events, self._loss = scene, events, loss
@@ -67,16 +74,32 @@ class TestSequence(TrueRecording):
         for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
-            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+            yield [
+                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
+            ]
 
 
-_TRUTH = ("skeleton", "surface", "spine_mm", "pose", "joints_camera", "joints_arena", "T_arena_camera", "floor")
+_TRUTH = (
+    "skeleton",
+    "surface",
+    "spine_mm",
+    "pose",
+    "joints_camera",
+    "joints_arena",
+    "T_arena_camera",
+    "floor",
+)
 
 
 def tracking_sequence(
-    world: World, name: str, *, seed: int | None = None, n_frames: int | None = None, sensor: Sensor | None = None,
+    world: World,
+    name: str,
+    *,
+    seed: int | None = None,
+    n_frames: int | None = None,
+    sensor: Sensor | None = None,
     spine_mm: float | None = None,
-) -> TestSequence:  # fmt: skip
+) -> TestSequence:
     """The fixed sequence 'easy' or 'hard' of an animal's world; other seeds make sequences of its kind, to develop on.
 
     hard: bursts of holes, frames dropped, a bar passing between camera and animal, a second object, an animal that is
@@ -94,14 +117,22 @@ def tracking_sequence(
         events, steps = hazards.draw_script(rng, n, step_ns * 1e-9)
         pace = hazards.pace(rng, events, n)
     rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
-    base = world.motion(own_seed, int(rows[-1]) + 1, sensor=sensor, noise=kind.noise,
-                        erosion_px=kind.erosion_px * sensor.stride, spine_mm=spine_mm)  # fmt: skip
+    base = world.motion(
+        own_seed,
+        int(rows[-1]) + 1,
+        sensor=sensor,
+        noise=kind.noise,
+        erosion_px=kind.erosion_px * sensor.stride,
+        spine_mm=spine_mm,
+    )
     times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(step_ns)
     loss = Loss.draw(rng, events, base.camera, base.joints_camera[rows], base.spine_mm, floats)
     title = f"track-{name}-{base.skeleton.name}-{own_seed[0]}"
     place = _hands if isinstance(base, HandSession) else _animals
     scene, hidden = place(rng, world, base, rows, times, events, title)
-    return TestSequence(scene, sorted([*events, *hidden], key=lambda event: (event.start, event.stop)), loss, title)
+    return TestSequence(
+        scene, sorted([*events, *hidden], key=lambda event: (event.start, event.stop)), loss, title
+    )
 
 
 def _setting(world: World, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
@@ -110,29 +141,49 @@ def _setting(world: World, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
         return sensor or NYU_SENSOR, FRAME_NS, True
     if isinstance(world, RenderedWorld):
         return sensor or world.habits.sensors[0], world.habits.frame_ns, world.habits.floats
-    raise RecordingError(f"there are no test sequences of a {world.skeleton.name}; mouse, fish and hand have them")
+    raise RecordingError(
+        f"there are no test sequences of a {world.skeleton.name}; mouse, fish and hand have them"
+    )
 
 
 def _hands(
-    rng: np.random.Generator, world: World, base: TrueRecording, rows: NDArray[np.int64], times: NDArray[np.int64],
-    events: list[Event], title: str,
-) -> tuple[HandSession, list[Event]]:  # fmt: skip
+    rng: np.random.Generator,
+    world: World,
+    base: TrueRecording,
+    rows: NDArray[np.int64],
+    times: NDArray[np.int64],
+    events: list[Event],
+    title: str,
+) -> tuple[HandSession, list[Event]]:
     """Some moments of a hand, with things before and beside it, and when it is hidden."""
     assert isinstance(base, HandSession)
     cast, hidden = base.cast[rows], list[Event]()
     if events:
-        arena = hazards.draw_things(rng, events, base.T_arena_camera.translation, base.joints_arena[rows],
-                                    base.spine_mm, hazards.beside_hand)  # fmt: skip
+        arena = hazards.draw_things(
+            rng,
+            events,
+            base.T_arena_camera.translation,
+            base.joints_arena[rows],
+            base.spine_mm,
+            hazards.beside_hand,
+        )
         things = base.T_arena_camera.inverse() @ arena
-        cast = replace(cast, thing=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES)
+        cast = replace(
+            cast, thing=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES
+        )
         hidden = _hidden(base.camera, cast.hand, things, events)
     return HandSession(title, base.skeleton, base.sensor, cast, times), hidden
 
 
 def _animals(
-    rng: np.random.Generator, world: World, base: TrueRecording, rows: NDArray[np.int64], times: NDArray[np.int64],
-    events: list[Event], title: str,
-) -> tuple[SyntheticSession, list[Event]]:  # fmt: skip
+    rng: np.random.Generator,
+    world: World,
+    base: TrueRecording,
+    rows: NDArray[np.int64],
+    times: NDArray[np.int64],
+    events: list[Event],
+    title: str,
+) -> tuple[SyntheticSession, list[Event]]:
     """As `_hands` of an animal."""
     assert isinstance(base, SyntheticSession)
     assert isinstance(world, RenderedWorld)
@@ -142,23 +193,43 @@ def _animals(
         return hazards.beside_animal(rng, stage, joints, length_mm, habits.things)
 
     if events:
-        things = hazards.draw_things(rng, events, base.T_arena_camera.translation, base.joints_arena[rows],
-                                     base.spine_mm, beside, habits.floats)  # fmt: skip
-        cast = replace(cast, things=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES)
+        things = hazards.draw_things(
+            rng,
+            events,
+            base.T_arena_camera.translation,
+            base.joints_arena[rows],
+            base.spine_mm,
+            beside,
+            habits.floats,
+        )
+        cast = replace(
+            cast, things=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES
+        )
         surface, T_camera_arena = Surface.of(base.skeleton), base.T_arena_camera.inverse()
-        body = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[:, : surface.n_trunk_vertices]
+        body = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[
+            :, : surface.n_trunk_vertices
+        ]
         hidden = _hidden(base.camera, T_camera_arena @ body, T_camera_arena @ things, events)
     return SyntheticSession(title, stage, cast, times), hidden
 
 
 def _taken(cast: Cast, rows: NDArray[np.int64]) -> Cast:
     """Some moments of what moves, in another order of time."""
-    pose = Pose(SE3(cast.pose.root.rotation[rows], cast.pose.root.translation[rows]), cast.pose.angles[rows],
-                cast.pose.scale[rows])  # fmt: skip
+    pose = Pose(
+        SE3(cast.pose.root.rotation[rows], cast.pose.root.translation[rows]),
+        cast.pose.angles[rows],
+        cast.pose.scale[rows],
+    )
     return replace(
-        cast, pose=pose, girth=cast.girth[rows], bends=None if cast.bends is None else cast.bends[rows],
-        things=cast.things[rows], shown=cast.shown[rows], parameters=cast.parameters[rows], seeds=cast.seeds[rows],
-    )  # fmt: skip
+        cast,
+        pose=pose,
+        girth=cast.girth[rows],
+        bends=None if cast.bends is None else cast.bends[rows],
+        things=cast.things[rows],
+        shown=cast.shown[rows],
+        parameters=cast.parameters[rows],
+        seeds=cast.seeds[rows],
+    )
 
 
 def _hidden(camera: Camera, body: Array, things: Array, events: list[Event]) -> list[Event]:

@@ -85,7 +85,10 @@ class TrainingWindows:
             values: list[Any] = [getattr(part, field.name) for part in parts]
             if isinstance(values[0], SE3):
                 columns.append(
-                    SE3(np.concatenate([v.rotation for v in values]), np.concatenate([v.translation for v in values]))
+                    SE3(
+                        np.concatenate([v.rotation for v in values]),
+                        np.concatenate([v.translation for v in values]),
+                    )
                 )
             elif isinstance(values[0], float | bool):  # of all images alike
                 columns.append(values[0])
@@ -125,9 +128,17 @@ def training_windows(
     """N training images; the first n of `training_blocks`, which explains the arguments."""
     parts, left = [], n
     for block in training_blocks(
-        seed, -(-n // BLOCK), habits, family=family, noise=noise, erosion_px=erosion_px,
-        degraded_share=degraded_share, spine_mm=spine_mm, window_px=window_px, parallel=parallel,
-    ):  # fmt: skip
+        seed,
+        -(-n // BLOCK),
+        habits,
+        family=family,
+        noise=noise,
+        erosion_px=erosion_px,
+        degraded_share=degraded_share,
+        spine_mm=spine_mm,
+        window_px=window_px,
+        parallel=parallel,
+    ):
         parts.append(block if left >= BLOCK else block[:left])
         left -= BLOCK
     return TrainingWindows.joined(parts)
@@ -159,13 +170,20 @@ def training_blocks(
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
         looks = _draw_looks(rng, habits, family, noise, erosion_px, degraded_share, spine_mm)
-        yield _draw_block(rng, habits, surface, looks, window_px, number * (BLOCK // PER_SESSION), parallel)
+        yield _draw_block(
+            rng, habits, surface, looks, window_px, number * (BLOCK // PER_SESSION), parallel
+        )
 
 
 def _draw_looks(
-    rng: np.random.Generator, habits: Habits, family: str, noise: float, erosion_px: int, degraded_share: float,
+    rng: np.random.Generator,
+    habits: Habits,
+    family: str,
+    noise: float,
+    erosion_px: int,
+    degraded_share: float,
     spine_mm: float | None,
-) -> _Looks:  # fmt: skip
+) -> _Looks:
     """Cameras, floors and animals of one block's mini-sessions, repeated for each of their images."""
     m, skeleton = BLOCK // PER_SESSION, habits.skeleton
     sensor = np.arange(m) % len(habits.sensors)
@@ -187,11 +205,16 @@ def _draw_looks(
     T_arena_camera = draw_views(rng, m, habits.setting)
     scale = habits.setting.scale
     return _Looks(
-        sensor[each], intrinsics[each], picture[each],
-        SE3(T_arena_camera.rotation[each], T_arena_camera.translation[each]), parameters[each],
-        (nominal / skeleton.length * rng.uniform(*habits.sizes, m))[each], shape[each],
-        scale * rng.uniform(0.0, 1.0, m)[each], (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale])[each],
-    )  # fmt: skip
+        sensor[each],
+        intrinsics[each],
+        picture[each],
+        SE3(T_arena_camera.rotation[each], T_arena_camera.translation[each]),
+        parameters[each],
+        (nominal / skeleton.length * rng.uniform(*habits.sizes, m))[each],
+        shape[each],
+        scale * rng.uniform(0.0, 1.0, m)[each],
+        (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale])[each],
+    )
 
 
 def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
@@ -202,50 +225,93 @@ def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
     parameters[worse & eroded, EROSION] += 1
 
 
-def inverse_depth_plane(T_arena_camera: SE3, intrinsics: Array, tilt_and_lift: Array | None = None) -> Array:
+def inverse_depth_plane(
+    T_arena_camera: SE3, intrinsics: Array, tilt_and_lift: Array | None = None
+) -> Array:
     """Coefficients (n, 3) of the floor: 1 / z = a u + b v + c. Optionally of one wrongly estimated.
 
     tilt_and_lift (n, 3): slopes of the wrong floor along the arena's x and y, rad, and its height below the camera, mm.
     """
     wrong = np.zeros((len(intrinsics), 3)) if tilt_and_lift is None else tilt_and_lift
     slope = np.stack([wrong[:, 0], wrong[:, 1], -np.ones(len(wrong))], axis=-1)
-    normal = np.einsum("nji,nj->ni", T_arena_camera.rotation, slope / np.linalg.norm(slope, axis=-1, keepdims=True))
+    normal = np.einsum(
+        "nji,nj->ni", T_arena_camera.rotation, slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    )
     distance = T_arena_camera.translation[:, 2] + wrong[:, 2]
     a, b = normal[:, 0] / intrinsics[:, 0] / distance, normal[:, 1] / intrinsics[:, 1] / distance
-    return np.stack([a, b, normal[:, 2] / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]], axis=-1)
+    return np.stack(
+        [a, b, normal[:, 2] / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]], axis=-1
+    )
 
 
 def _draw_block(
-    rng: np.random.Generator, habits: Habits, surface: Surface, looks: _Looks, window_px: int, first_session: int,
+    rng: np.random.Generator,
+    habits: Habits,
+    surface: Surface,
+    looks: _Looks,
+    window_px: int,
+    first_session: int,
     parallel: bool,
-) -> TrainingWindows:  # fmt: skip
+) -> TrainingWindows:
     """The images of one block."""
     n, skeleton, scale = len(looks.size), habits.skeleton, habits.setting.scale
-    pose, girth, kinds = habits.postures(rng, looks.size, looks.shape, looks.T_arena_camera.translation[:, 2])
+    pose, girth, kinds = habits.postures(
+        rng, looks.size, looks.shape, looks.T_arena_camera.translation[:, 2]
+    )
     _place(rng, habits, pose, looks)
     vertices = surface.vertices(pose, looks.shape, girth, habits.bends(rng, n), parallel)
     trunk = vertices[:, : surface.n_trunk_vertices]
     T_camera_arena = looks.T_arena_camera.inverse()
     origin = window_origin(trunk, T_camera_arena, looks.intrinsics, window_px)
-    thing, has_thing = _draw_neighbours(rng, trunk, looks.size * skeleton.length, scale, habits.floats)
-    walls, seeds = _draw_walls(rng, trunk, habits.setting), rng.integers(1, 2**63, n).astype(np.uint64)
+    thing, has_thing = _draw_neighbours(
+        rng, trunk, looks.size * skeleton.length, scale, habits.floats
+    )
+    walls, seeds = (
+        _draw_walls(rng, trunk, habits.setting),
+        rng.integers(1, 2**63, n).astype(np.uint64),
+    )
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
         _stage.draw_windows(
-            vertices, surface.faces, thing, PART_FACES, has_thing, looks.T_arena_camera.rotation,
-            looks.T_arena_camera.translation[:, 2].copy(), looks.intrinsics, looks.picture, origin, walls, looks.rough,
-            looks.parameters, seeds, NORMAL, depth, background,
-        )  # fmt: skip
+            vertices,
+            surface.faces,
+            thing,
+            PART_FACES,
+            has_thing,
+            looks.T_arena_camera.rotation,
+            looks.T_arena_camera.translation[:, 2].copy(),
+            looks.intrinsics,
+            looks.picture,
+            origin,
+            walls,
+            looks.rough,
+            looks.parameters,
+            seeds,
+            NORMAL,
+            depth,
+            background,
+        )
     seen = pose.moved(T_camera_arena)
     return TrainingWindows(
-        depth, background, origin.astype(np.int32), looks.intrinsics,
+        depth,
+        background,
+        origin.astype(np.int32),
+        looks.intrinsics,
         inverse_depth_plane(looks.T_arena_camera, looks.intrinsics, looks.floor_error),
-        inverse_depth_plane(looks.T_arena_camera, looks.intrinsics), looks.T_arena_camera, seen.root, seen.angles,
-        seen.scale, seen.joints(skeleton), looks.size * skeleton.length,
-        first_session + np.arange(n) // PER_SESSION, looks.sensor, kinds, habits.sensors[0].unit_mm,
+        inverse_depth_plane(looks.T_arena_camera, looks.intrinsics),
+        looks.T_arena_camera,
+        seen.root,
+        seen.angles,
+        seen.scale,
+        seen.joints(skeleton),
+        looks.size * skeleton.length,
+        first_session + np.arange(n) // PER_SESSION,
+        looks.sensor,
+        kinds,
+        habits.sensors[0].unit_mm,
         habits.sensors[0].spread_mm(looks.parameters, looks.T_arena_camera.translation[:, 2]),
-    )  # fmt: skip
+    )
 
 
 def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) -> None:
@@ -254,18 +320,29 @@ def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) 
     middle = pose.joints(skeleton).mean(axis=1)
     height = T.translation[:, 2] - (middle[:, 2] if habits.floats else 0.0)
     margin = 0.85 * pose.scale * skeleton.length * looks.intrinsics[:, 0] / height + 6.0
-    uv = np.stack([margin + rng.random(n) * (looks.picture[:, k] - 2.0 * margin) for k in range(2)], axis=-1)
-    ray = np.concatenate([(uv - looks.intrinsics[:, 2:]) / looks.intrinsics[:, :2], np.ones((n, 1))], axis=1)
+    uv = np.stack(
+        [margin + rng.random(n) * (looks.picture[:, k] - 2.0 * margin) for k in range(2)], axis=-1
+    )
+    ray = np.concatenate(
+        [(uv - looks.intrinsics[:, 2:]) / looks.intrinsics[:, :2], np.ones((n, 1))], axis=1
+    )
     direction = np.einsum("nij,nj->ni", T.rotation, ray)
     spot = (height / -direction[:, 2])[:, None] * direction[:, :2]
     pose.root.translation[:, :2] += spot - middle[:, :2]
 
 
-def window_origin(trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int) -> NDArray[np.int64]:
+def window_origin(
+    trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int
+) -> NDArray[np.int64]:
     """Where (n, 2) a window must start for the trunk (n, V, 3) to lie in its middle."""
-    p = np.einsum("nij,nvj->nvi", T_camera_arena.rotation, trunk) + T_camera_arena.translation[:, None]
+    p = (
+        np.einsum("nij,nvj->nvi", T_camera_arena.rotation, trunk)
+        + T_camera_arena.translation[:, None]
+    )
     uv = p[..., :2] / p[..., 2:] * intrinsics[:, None, :2] + intrinsics[:, None, 2:]
-    return np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + 0.5).astype(np.int64)
+    return np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + 0.5).astype(
+        np.int64
+    )
 
 
 def _draw_neighbours(
@@ -283,10 +360,18 @@ def _draw_neighbours(
     middle = trunk[..., :2].mean(axis=1)
     clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1])
     clear = clear + scale * rng.uniform(5.0, 40.0, n)
-    lift = rng.uniform(0.0, 1.0, n) * np.maximum(trunk[..., 2].max(axis=1) - radii[:, 2], 0.0) if floats else 0.0
-    centre = np.concatenate([middle + clear[:, None] * toward, (radii[:, 2] + lift)[:, None]], axis=-1)
+    lift = (
+        rng.uniform(0.0, 1.0, n) * np.maximum(trunk[..., 2].max(axis=1) - radii[:, 2], 0.0)
+        if floats
+        else 0.0
+    )
+    centre = np.concatenate(
+        [middle + clear[:, None] * toward, (radii[:, 2] + lift)[:, None]], axis=-1
+    )
     power = np.where(rng.random(n) < 0.5, 2.0, 10.0)
-    return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < _THING_SHARE
+    return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(
+        n
+    ) < _THING_SHARE
 
 
 def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Array:
@@ -295,8 +380,16 @@ def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Arr
     middle = trunk[..., :2].mean(axis=1)
     way = np.arctan2(middle[:, 1], middle[:, 0]) + rng.normal(0.0, 0.7, n)
     outward = np.stack([np.cos(way), np.sin(way)], axis=-1)
-    distance = np.einsum("nvk,nk->nv", trunk[..., :2], outward).max(axis=1) + scale * rng.uniform(1.0, 60.0, n)
+    distance = np.einsum("nvk,nk->nv", trunk[..., :2], outward).max(axis=1) + scale * rng.uniform(
+        1.0, 60.0, n
+    )
     there = (rng.random(n) < _WALL_SHARE) & (distance > 40.0 * scale)
     low, high = setting.walls_mm
-    height, rounding, spread = rng.uniform(0.75 * low, high, n), rng.uniform(0, 12, n), rng.uniform(6, 25, n)
-    return np.column_stack([outward, np.where(there, distance, 0.0), height, scale * rounding, scale * spread])
+    height, rounding, spread = (
+        rng.uniform(0.75 * low, high, n),
+        rng.uniform(0, 12, n),
+        rng.uniform(6, 25, n),
+    )
+    return np.column_stack(
+        [outward, np.where(there, distance, 0.0), height, scale * rounding, scale * spread]
+    )

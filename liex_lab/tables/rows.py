@@ -24,8 +24,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-GAP_FACTOR = 1.5  # median steps; a longer one means that frames are missing (as in recordings.timestamps)
-_Found = tuple[float, float, int, int, int, str]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
+GAP_FACTOR = (
+    1.5  # median steps; a longer one means that frames are missing (as in recordings.timestamps)
+)
+_Found = tuple[
+    float, float, int, int, int, str
+]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
 LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
 _ALL = frozenset(column.name for column in FRAMES)
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
@@ -73,27 +77,37 @@ class Rows:
     def _frame_rows(self, part: slice, missing: NDArray[np.int64]) -> Block:
         track = self.track[part]
         return {
-            **self._who, **self._when(part, 1),
-            "time_ns": track.times_ns, "gap_before": missing,
-            "predicted_error_mm": track.predicted_error_mm, "residual_mm": track.residual_mm,
+            **self._who,
+            **self._when(part, 1),
+            "time_ns": track.times_ns,
+            "gap_before": missing,
+            "predicted_error_mm": track.predicted_error_mm,
+            "residual_mm": track.residual_mm,
             "n_foreground_px": track.n_foreground_px,
             **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
             **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
             "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
             "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
-            "spine_mm": track.spine_mm, "scale": track.scale,
-            "p_flip": track.p_flip, "bridged": track.bridged, "flag": track.flag,
-        }  # fmt: skip
+            "spine_mm": track.spine_mm,
+            "scale": track.scale,
+            "p_flip": track.p_flip,
+            "bridged": track.bridged,
+            "flag": track.flag,
+        }
 
     def _pose_rows(self, part: slice) -> Block:
         track, n_joints = self.track[part], self.track.skeleton.n_joints
         return {
-            **self._who, **self._when(part, n_joints),
-            "joint": Words(np.tile(np.arange(n_joints), track.n_frames), tuple(track.skeleton.names)),
+            **self._who,
+            **self._when(part, n_joints),
+            "joint": Words(
+                np.tile(np.arange(n_joints), track.n_frames), tuple(track.skeleton.names)
+            ),
             **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
             **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
-            "score": nearness(track.sd_mm, _NEAR * track.spine_mm[:, None]).ravel(), "sd_mm": track.sd_mm.ravel(),
-        }  # fmt: skip
+            "score": nearness(track.sd_mm, _NEAR * track.spine_mm[:, None]).ravel(),
+            "sd_mm": track.sd_mm.ravel(),
+        }
 
     def _rotation_rows(self, part: slice) -> Block:
         track, n_rows = self.track[part], self.track.skeleton.n_joints + 1
@@ -105,12 +119,15 @@ class Rows:
         together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
         together[:, 0] = track.cov_root[:, *np.triu_indices(6, 1)]
         return {
-            **self._who, **self._when(part, n_rows),
+            **self._who,
+            **self._when(part, n_rows),
             "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
-            **_xyz("w{}_rad", turn), **_xyz("sd_w{}_rad", spread), **_xyz("t{}_mm", shift),
+            **_xyz("w{}_rad", turn),
+            **_xyz("sd_w{}_rad", spread),
+            **_xyz("t{}_mm", shift),
             **_xyz("sd_t{}_mm", sd_shift),
             **{name: together[..., k].ravel() for k, name in enumerate(ROOT_COVARIANCES)},
-        }  # fmt: skip
+        }
 
     def missing_before(self) -> NDArray[np.int64]:
         """(n,) frames that the camera did not deliver just before each frame."""
@@ -139,7 +156,10 @@ class Rows:
         names = ("start_s", "stop_s", "start_frame", "stop_frame", "n_frames_missing", "reason")
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
         kinds = (float, float, np.int64, np.int64, np.int64, str)
-        return {**self._who, **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)}}
+        return {
+            **self._who,
+            **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)},
+        }
 
     def flips(self, flips: Sequence[Flip]) -> Block:
         """The table `flips`, in order of time."""
@@ -162,12 +182,21 @@ class Rows:
         time, found = self.time_s, []
         stops = stop_times(time)
         for gap in self.camera_gaps:
-            row = int(np.searchsorted(self.track.times_ns, gap.stop_ns if gap.n_frames_missing else gap.start_ns))
+            row = int(
+                np.searchsorted(
+                    self.track.times_ns, gap.stop_ns if gap.n_frames_missing else gap.start_ns
+                )
+            )
             if row == len(time):
                 continue
             frame = int(self.frame_index[row])
             if gap.n_frames_missing:
-                span = (float(stops[row - 1]) if row else float(time[row]), float(time[row]), frame, frame)
+                span = (
+                    float(stops[row - 1]) if row else float(time[row]),
+                    float(time[row]),
+                    frame,
+                    frame,
+                )
             else:
                 span = (float(time[row]), float(stops[row]), frame, frame + 1)
             found.append((*span, gap.n_frames_missing, gap.reason))
@@ -181,9 +210,10 @@ class Rows:
         times = self.track.times_ns
         since = np.diff(times[max(part.start - 1, 0) : part.stop]) * 1e-9
         columns = {
-            "frame_index": self.frame_index[part], "time_s": (times[part] - times[:1]).astype(np.float64) * 1e-9,
+            "frame_index": self.frame_index[part],
+            "time_s": (times[part] - times[:1]).astype(np.float64) * 1e-9,
             "dt_s": since if part.start else np.concatenate([[np.nan], since])[: len(times[part])],
-        }  # fmt: skip
+        }
         return {name: np.repeat(column, repeat) for name, column in columns.items()}
 
     def _parts(self, rows_per_frame: int) -> Iterator[slice]:
@@ -263,15 +293,18 @@ def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.D
     stop_ns = np.array([bout.stop_ns for bout in ethogram], np.int64)
     count = np.append(index, index[-1:] + 1)
     n = len(ethogram)
-    return pd.DataFrame({
-        "session_id": pd.Series([frames["session_id"].iloc[0]] * n, dtype="str"),
-        "individual": pd.Series([frames["individual"].iloc[0]] * n, dtype="str"),
-        "action": pd.Series([bout.action for bout in ethogram], dtype="str"),
-        "start_s": (start_ns - first) * 1e-9, "stop_s": (stop_ns - first) * 1e-9,
-        "duration_s": (stop_ns - start_ns) * 1e-9,
-        "start_frame": count[np.searchsorted(times_ns, start_ns)],
-        "stop_frame": count[np.searchsorted(times_ns, stop_ns)],
-        "score": np.array([bout.score for bout in ethogram], float),
-        "source": pd.Series([ethogram.source] * n, dtype="str"),
-        "model_hash": pd.Series([model_hash] * n, dtype="str"),
-    })  # fmt: skip
+    return pd.DataFrame(
+        {
+            "session_id": pd.Series([frames["session_id"].iloc[0]] * n, dtype="str"),
+            "individual": pd.Series([frames["individual"].iloc[0]] * n, dtype="str"),
+            "action": pd.Series([bout.action for bout in ethogram], dtype="str"),
+            "start_s": (start_ns - first) * 1e-9,
+            "stop_s": (stop_ns - first) * 1e-9,
+            "duration_s": (stop_ns - start_ns) * 1e-9,
+            "start_frame": count[np.searchsorted(times_ns, start_ns)],
+            "stop_frame": count[np.searchsorted(times_ns, stop_ns)],
+            "score": np.array([bout.score for bout in ethogram], float),
+            "source": pd.Series([ethogram.source] * n, dtype="str"),
+            "model_hash": pd.Series([model_hash] * n, dtype="str"),
+        }
+    )

@@ -53,140 +53,379 @@ def columns(table: str, *rows: tuple[str, ...]) -> tuple[Column, ...]:
 
 _WHO = (
     ("session_id", "string", "", "name of the session: one recording's results"),
-    ("individual", "string", "", "name of the animal within the session; the sessions table maps it to subject_id"),
+    (
+        "individual",
+        "string",
+        "",
+        "name of the animal within the session; the sessions table maps it to subject_id",
+    ),
 )
 _WHEN = (
     ("frame_index", "int64", "", "the camera's own count of the frame", "", "recording"),
-    ("time_s", "float64", "s", "time of the frame since the recording's first frame", "", "the recording's clock"),
-    ("dt_s", "float64", "s", "time since the previous recorded frame; empty at the first", "", "the recording's clock"),
+    (
+        "time_s",
+        "float64",
+        "s",
+        "time of the frame since the recording's first frame",
+        "",
+        "the recording's clock",
+    ),
+    (
+        "dt_s",
+        "float64",
+        "s",
+        "time since the previous recorded frame; empty at the first",
+        "",
+        "the recording's clock",
+    ),
 )
 _SPAN = (
     ("start_s", "float64", "s", "onset, since the first frame", "", ""),
-    ("stop_s", "float64", "s", "time of the first frame outside; at a gap or the end, last frame + median dt", "", ""),
+    (
+        "stop_s",
+        "float64",
+        "s",
+        "time of the first frame outside; at a gap or the end, last frame + median dt",
+        "",
+        "",
+    ),
     ("start_frame", "int64", "", "frame_index of the first frame inside"),
-    ("stop_frame", "int64", "", "frame_index of the first frame outside; at the end of the recording, last + 1"),
+    (
+        "stop_frame",
+        "int64",
+        "",
+        "frame_index of the first frame outside; at the end of the recording, last + 1",
+    ),
 )
 _AXES = "arena frame: z up from the floor, origin below the camera, x along the picture's rows"
 _MID = "joints lie on the body's mid-axis, not on the skin"
 
 FRAMES = columns(
-    "frames", *_WHO, *_WHEN,
+    "frames",
+    *_WHO,
+    *_WHEN,
     ("time_ns", "int64", "ns", "time stamp of the frame as recorded", "", "the recording's clock"),
-    ("gap_before", "int64", "", "frames that the camera did not deliver just before this one", "", "recording"),
-    ("predicted_error_mm", "float64", "mm", "joint error to be expected in this frame, mean over the joints", "",
-     "learned metric of the model, and the smoother"),
-    ("residual_mm", "float64", "mm", "distance between the body's surface and the depth seen, within the animal, with "
-     "the pose that the frame says by itself", "median of |rendered - observed|", "fit"),
+    (
+        "gap_before",
+        "int64",
+        "",
+        "frames that the camera did not deliver just before this one",
+        "",
+        "recording",
+    ),
+    (
+        "predicted_error_mm",
+        "float64",
+        "mm",
+        "joint error to be expected in this frame, mean over the joints",
+        "",
+        "learned metric of the model, and the smoother",
+    ),
+    (
+        "residual_mm",
+        "float64",
+        "mm",
+        "distance between the body's surface and the depth seen, within the animal, with "
+        "the pose that the frame says by itself",
+        "median of |rendered - observed|",
+        "fit",
+    ),
     ("n_foreground_px", "int64", "px", "pixels taken for the animal", "", "foreground"),
-    *((f"centroid_{a}_mm", "float64", "mm", f"centre of the animal's outline as seen from above; {_AXES}",
-       "mean over its pixels, weighted by the area they cover", "foreground") for a in "xy"),
-    ("centroid_z_mm", "float64", "mm", "mean height of the animal's back above the floor", "", "foreground"),
-    ("centroid_u_px", "float64", "px", "column of the centroid in the depth picture", "", "foreground"),
-    ("centroid_v_px", "float64", "px", "row of the centroid in the depth picture", "", "foreground"),
-    ("wall_distance_mm", "float64", "mm", "distance of the centroid from the nearest wall, negative beyond it; empty "
-     "where the arena's shape is not known", "to the circle or rectangle in session.json, arena", "arena"),
-    ("zone", "string", "", "the zones that the centroid lies in, in the order of the zones' file, with ; between them; "
-     "empty outside all of them and where there is no centroid", "", "arena.zones of the plan"),
-    ("spine_mm", "float64", "mm", "length of the fitted chain of joints, all bones added up",
-     "scale x length of the skeleton at home", "fit"),
+    *(
+        (
+            f"centroid_{a}_mm",
+            "float64",
+            "mm",
+            f"centre of the animal's outline as seen from above; {_AXES}",
+            "mean over its pixels, weighted by the area they cover",
+            "foreground",
+        )
+        for a in "xy"
+    ),
+    (
+        "centroid_z_mm",
+        "float64",
+        "mm",
+        "mean height of the animal's back above the floor",
+        "",
+        "foreground",
+    ),
+    (
+        "centroid_u_px",
+        "float64",
+        "px",
+        "column of the centroid in the depth picture",
+        "",
+        "foreground",
+    ),
+    (
+        "centroid_v_px",
+        "float64",
+        "px",
+        "row of the centroid in the depth picture",
+        "",
+        "foreground",
+    ),
+    (
+        "wall_distance_mm",
+        "float64",
+        "mm",
+        "distance of the centroid from the nearest wall, negative beyond it; empty "
+        "where the arena's shape is not known",
+        "to the circle or rectangle in session.json, arena",
+        "arena",
+    ),
+    (
+        "zone",
+        "string",
+        "",
+        "the zones that the centroid lies in, in the order of the zones' file, with ; between them; "
+        "empty outside all of them and where there is no centroid",
+        "",
+        "arena.zones of the plan",
+    ),
+    (
+        "spine_mm",
+        "float64",
+        "mm",
+        "length of the fitted chain of joints, all bones added up",
+        "scale x length of the skeleton at home",
+        "fit",
+    ),
     ("scale", "float64", "", "size of the animal relative to the skeleton's file", "", "fit"),
-    ("p_flip", "float64", "", "probability that head and tail are exchanged in this pose", "two states over the whole "
-     "recording: what each frame says of either, and how fast animals turn", "tracker"),
-    ("bridged", "bool", "", "nothing was measured; the pose is what lies between two measured ones, of which the "
-     "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour leave it out", "",
-     "tracker"),
-    ("flag", "string", "", "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
-     "person placed joints of it; not_found or no_depth: nothing was measured, and there is no pose where it is not "
-     "bridged", "", "tracker"),
-)  # fmt: skip
+    (
+        "p_flip",
+        "float64",
+        "",
+        "probability that head and tail are exchanged in this pose",
+        "two states over the whole "
+        "recording: what each frame says of either, and how fast animals turn",
+        "tracker",
+    ),
+    (
+        "bridged",
+        "bool",
+        "",
+        "nothing was measured; the pose is what lies between two measured ones, of which the "
+        "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour leave it out",
+        "",
+        "tracker",
+    ),
+    (
+        "flag",
+        "string",
+        "",
+        "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
+        "person placed joints of it; not_found or no_depth: nothing was measured, and there is no pose where it is not "
+        "bridged",
+        "",
+        "tracker",
+    ),
+)
 
 POSES = columns(
-    "poses", *_WHO, *_WHEN,
+    "poses",
+    *_WHO,
+    *_WHEN,
     ("joint", "string", "", f"name of the joint in the skeleton; {_MID}"),
     ("x_mm", "float64", "mm", f"position of the joint; {_AXES}; {_MID}", "", "fit"),
     ("y_mm", "float64", "mm", f"position of the joint; {_AXES}; {_MID}", "", "fit"),
     ("z_mm", "float64", "mm", f"height of the joint above the floor; {_AXES}; {_MID}", "", "fit"),
-    ("u_px", "float64", "px", "column of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
-     "pinhole projection", "fit"),
-    ("v_px", "float64", "px", "row of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
-     "pinhole projection", "fit"),
-    ("score", "float64", "", "probability that the joint lies within 10 % of the spine's length of the truth",
-     "chi distribution with 3 degrees of freedom at 0.1 spine_mm / sd_mm", "sd_mm"),
-    ("sd_mm", "float64", "mm", "standard deviation of the joint along one axis", "sqrt(trace of covariance / 3)",
-     "posterior of the smoother"),
-)  # fmt: skip
+    (
+        "u_px",
+        "float64",
+        "px",
+        "column of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
+        "pinhole projection",
+        "fit",
+    ),
+    (
+        "v_px",
+        "float64",
+        "px",
+        "row of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
+        "pinhole projection",
+        "fit",
+    ),
+    (
+        "score",
+        "float64",
+        "",
+        "probability that the joint lies within 10 % of the spine's length of the truth",
+        "chi distribution with 3 degrees of freedom at 0.1 spine_mm / sd_mm",
+        "sd_mm",
+    ),
+    (
+        "sd_mm",
+        "float64",
+        "mm",
+        "standard deviation of the joint along one axis",
+        "sqrt(trace of covariance / 3)",
+        "posterior of the smoother",
+    ),
+)
 
 _TURN = "rotation vector relative to the parent joint; row 'root': the body's base relative to the arena"
-_SHIFT = "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
+_SHIFT = (
+    "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
+)
 _SPREAD = "posterior of the smoother"
 _OF_ROOT = ("wx_rad", "wy_rad", "wz_rad", "tx_mm", "ty_mm", "tz_mm")
 # of each pair of them, row by row of the upper triangle: name and unit
 ROOT_COVARIANCES = {
     f"cov_{a[:2]}_{b[:2]}_{unit}": unit.replace("2", "²").replace("_", " ")
-    for k, a in enumerate(_OF_ROOT) for b in _OF_ROOT[k + 1 :]
+    for k, a in enumerate(_OF_ROOT)
+    for b in _OF_ROOT[k + 1 :]
     for unit in [a[3:] + "2" if a[3:] == b[3:] else f"{a[3:]}_{b[3:]}"]
-}  # fmt: skip
+}
 ROTATIONS = columns(
-    "rotations", *_WHO, *_WHEN,
-    ("joint", "string", "", "name of the joint; 'root' is the rigid transform of the body's base, T_arena_root"),
-    *((f"w{axis}_rad", "float64", "rad", f"{axis} of the {_TURN}", "logarithm of the rotation", "fit")
-      for axis in "xyz"),
-    *((f"sd_w{axis}_rad", "float64", "rad", f"standard deviation of w{axis}_rad, in the joint's own frame", "", _SPREAD)
-      for axis in "xyz"),
+    "rotations",
+    *_WHO,
+    *_WHEN,
+    (
+        "joint",
+        "string",
+        "",
+        "name of the joint; 'root' is the rigid transform of the body's base, T_arena_root",
+    ),
+    *(
+        (
+            f"w{axis}_rad",
+            "float64",
+            "rad",
+            f"{axis} of the {_TURN}",
+            "logarithm of the rotation",
+            "fit",
+        )
+        for axis in "xyz"
+    ),
+    *(
+        (
+            f"sd_w{axis}_rad",
+            "float64",
+            "rad",
+            f"standard deviation of w{axis}_rad, in the joint's own frame",
+            "",
+            _SPREAD,
+        )
+        for axis in "xyz"
+    ),
     *((f"t{axis}_mm", "float64", "mm", f"{axis}; {_SHIFT}", "", "fit") for axis in "xyz"),
-    *((f"sd_t{axis}_mm", "float64", "mm", f"standard deviation of t{axis}_mm, in the root's own frame", "", _SPREAD)
-      for axis in "xyz"),
-    *((name, "float64", unit, f"row 'root' only: covariance of the root's {name[4:6]} and {name[7:9]}, in its own "
-       "frame; the variances are the squares of their sd_", "", _SPREAD) for name, unit in ROOT_COVARIANCES.items()),
-)  # fmt: skip
+    *(
+        (
+            f"sd_t{axis}_mm",
+            "float64",
+            "mm",
+            f"standard deviation of t{axis}_mm, in the root's own frame",
+            "",
+            _SPREAD,
+        )
+        for axis in "xyz"
+    ),
+    *(
+        (
+            name,
+            "float64",
+            unit,
+            f"row 'root' only: covariance of the root's {name[4:6]} and {name[7:9]}, in its own "
+            "frame; the variances are the squares of their sd_",
+            "",
+            _SPREAD,
+        )
+        for name, unit in ROOT_COVARIANCES.items()
+    ),
+)
 
 BOUTS = columns(
-    "bouts", *_WHO,
+    "bouts",
+    *_WHO,
     ("action", "string", "", "a word of the ethogram's vocabulary"),
     *_SPAN[:2],
     ("duration_s", "float64", "s", "length of the bout", "stop_s - start_s"),
     *_SPAN[2:],
-    ("score", "float64", "", "how well the bout fits its action, 0 to 1; for rules, the share of its frames that "
-     "satisfy the rule"),
+    (
+        "score",
+        "float64",
+        "",
+        "how well the bout fits its action, 0 to 1; for rules, the share of its frames that "
+        "satisfy the rule",
+    ),
     ("source", "string", "", "who named it: rule, model or human"),
     ("model_hash", "string", "", "hash of the model that named it; empty for a rule"),
-)  # fmt: skip
+)
 
 GAPS = columns(
-    "gaps", *_WHO, *_SPAN,
-    ("n_frames_missing", "int64", "", "frames without a pose, or never delivered by the camera; 0 where only a time "
-     "stamp was moved, 1 where the clock jumped, for how many it were nobody knows"),
-    ("reason", "string", "", "camera_dropped: never recorded, start_frame = stop_frame = the next frame; clock_jumped: "
-     "the camera was stopped, or its clock set, before the frame; stamp_repeated, stamp_out_of_order: this frame's own "
-     "time stamp could not be true and was moved; no_depth: recorded without any depth; tracker_lost: nothing in the "
-     "frame looks like the animal"),
-)  # fmt: skip
+    "gaps",
+    *_WHO,
+    *_SPAN,
+    (
+        "n_frames_missing",
+        "int64",
+        "",
+        "frames without a pose, or never delivered by the camera; 0 where only a time "
+        "stamp was moved, 1 where the clock jumped, for how many it were nobody knows",
+    ),
+    (
+        "reason",
+        "string",
+        "",
+        "camera_dropped: never recorded, start_frame = stop_frame = the next frame; clock_jumped: "
+        "the camera was stopped, or its clock set, before the frame; stamp_repeated, stamp_out_of_order: this frame's own "
+        "time stamp could not be true and was moved; no_depth: recorded without any depth; tracker_lost: nothing in the "
+        "frame looks like the animal",
+    ),
+)
 
 FLIPS = columns(
-    "flips", *_WHO, *_SPAN,
-    ("p_flip", "float64", "", "probability that head and tail were exchanged: where applied, in what the single frames "
-     "said, else in the tables", "mean over the span", "tracker"),
+    "flips",
+    *_WHO,
+    *_SPAN,
+    (
+        "p_flip",
+        "float64",
+        "",
+        "probability that head and tail were exchanged: where applied, in what the single frames "
+        "said, else in the tables",
+        "mean over the span",
+        "tracker",
+    ),
     ("applied", "bool", "", "whether the exchange was undone in the tables"),
     ("source", "string", "", "who found it: model or human"),
     ("undone_at", "string", "", "when a human took the correction back, ISO 8601; empty otherwise"),
-)  # fmt: skip
+)
 
 SESSIONS = columns(
-    "sessions", *_WHO,
-    ("subject_id", "string", "", "the animal across the study; empty when the recording does not say"),
+    "sessions",
+    *_WHO,
+    (
+        "subject_id",
+        "string",
+        "",
+        "the animal across the study; empty when the recording does not say",
+    ),
     ("group", "string", "", "experimental group; empty until stated"),
     ("cage", "string", "", "home cage or tank; empty until stated"),
     ("sex", "string", "", "sex; empty until stated"),
     ("batch", "string", "", "batch of the experiment; empty until stated"),
-    ("session_start_time", "string", "", "when the recording began, ISO 8601 with zone; empty when unknown"),
+    (
+        "session_start_time",
+        "string",
+        "",
+        "when the recording began, ISO 8601 with zone; empty when unknown",
+    ),
     ("n_frames", "int64", "", "recorded frames"),
     ("n_frames_observed", "int64", "", "recorded frames with a pose"),
-    ("observed_s", "float64", "s", "time with a pose",
-     "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt"),
+    (
+        "observed_s",
+        "float64",
+        "s",
+        "time with a pose",
+        "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt",
+    ),
     ("fps_median", "float64", "1/s", "frames per second", "1 / median dt"),
     ("calibration_hash", "string", "", "hash of the camera's numbers and its place in the arena"),
     ("software_version", "string", "", "version of liex_lab"),
-)  # fmt: skip
+)
 
 TABLES: dict[str, tuple[Column, ...]] = {
     rows[0].table: rows for rows in (FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS)
@@ -195,11 +434,15 @@ TABLES: dict[str, tuple[Column, ...]] = {
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
     """The content of columns.json: every column of `TABLES`, then those of other rooms, each as a plain dict."""
-    entries = [column for rows in TABLES.values() for column in rows] + [column for rows in extra for column in rows]
+    entries = [column for rows in TABLES.values() for column in rows] + [
+        column for rows in extra for column in rows
+    ]
     seen: dict[tuple[str, str], Column] = {}
     for column in entries:
         if seen.setdefault((column.table, column.name), column) != column:
-            raise SessionError(f"column {column.table}.{column.name} is described twice and differently; keep one")
+            raise SessionError(
+                f"column {column.table}.{column.name} is described twice and differently; keep one"
+            )
     return [asdict(column) for column in seen.values()]
 
 
@@ -207,13 +450,20 @@ def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Sc
     """The Arrow schema of a table, with `metadata` as JSON under the key `liex_lab`."""
     import pyarrow as pa
 
-    kinds = {"string": pa.string(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}
+    kinds = {
+        "string": pa.string(),
+        "float64": pa.float64(),
+        "int64": pa.int64(),
+        "bool": pa.bool_(),
+    }
     fields = [pa.field(column.name, kinds[column.dtype]) for column in schema]
     described = {**metadata, "columns": {column.name: asdict(column) for column in schema}}
     return pa.schema(fields, metadata={"liex_lab": json.dumps(described, sort_keys=True)})
 
 
-def write_table(path: Path, schema: Sequence[Column], blocks: Iterable[Block], metadata: Mapping[str, Any]) -> int:
+def write_table(
+    path: Path, schema: Sequence[Column], blocks: Iterable[Block], metadata: Mapping[str, Any]
+) -> int:
     """Write a parquet table block by block (row groups of about `ROWS_PER_GROUP` rows) and return its rows.
 
     Equal blocks give equal bytes: zstd, strings as dictionaries, no time stamps.
@@ -223,7 +473,9 @@ def write_table(path: Path, schema: Sequence[Column], blocks: Iterable[Block], m
     arrow = arrow_schema(schema, metadata)
     texts = [column.name for column in schema if column.dtype == "string"]
     n_rows = 0
-    with pq.ParquetWriter(path, arrow, compression="zstd", use_dictionary=texts, write_statistics=True) as writer:
+    with pq.ParquetWriter(
+        path, arrow, compression="zstd", use_dictionary=texts, write_statistics=True
+    ) as writer:
         for block in blocks:
             batch = _arrow_block(block, schema, arrow)
             n_rows += batch.num_rows
@@ -239,7 +491,9 @@ def _arrow_block(block: Block, schema: Sequence[Column], arrow: pa.Schema) -> pa
 
     check_described(block, schema)
     n = max((len(v) for v in block.values() if _is_array(v)), default=1)
-    return pa.Table.from_arrays([_arrow_column(block[f.name], f.type, n) for f in arrow], schema=arrow)
+    return pa.Table.from_arrays(
+        [_arrow_column(block[f.name], f.type, n) for f in arrow], schema=arrow
+    )
 
 
 def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:
@@ -263,7 +517,9 @@ def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
     import pyarrow as pa
 
     if isinstance(value, Words):
-        return pa.DictionaryArray.from_arrays(value.codes.astype(np.int32), list(value.words)).cast(kind)
+        return pa.DictionaryArray.from_arrays(value.codes.astype(np.int32), list(value.words)).cast(
+            kind
+        )
     if not _is_array(value):
         return pa.repeat(pa.scalar(value, kind), n)
     if kind == pa.string():
@@ -289,7 +545,11 @@ def harmless(value: Any) -> Any:
 
 def as_it_was(value: Any) -> Any:
     """What `harmless` was given."""
-    return value[1:] if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA else value
+    return (
+        value[1:]
+        if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA
+        else value
+    )
 
 
 def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:

@@ -35,7 +35,9 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
 
 
 @njit(cache=True)
-def extend(t, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent):
+def extend(
+    t, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent
+):
     """Add frame t to the chain: fill cost[t] (H,) and parent[t] (H, 2), and put its hypotheses among the `live` ones.
 
     live (B, 2): frame and hypothesis of the n_live best chains' last links; idle (n + 1,): what it has cost up to each
@@ -51,8 +53,16 @@ def extend(t, live, n_live, times, joints, error, emission, idle, levels, length
             so_far = cost[a, g] + idle[t] - idle[a + 1]
             if so_far >= best and parent[t, h, 0] != NONE:
                 continue
-            leap = leap_cost(joints[a, g], joints[t, h], error[a, g], error[t, h], times[t] - times[a], length, levels,
-                             ceiling)  # fmt: skip
+            leap = leap_cost(
+                joints[a, g],
+                joints[t, h],
+                error[a, g],
+                error[t, h],
+                times[t] - times[a],
+                length,
+                levels,
+                ceiling,
+            )
             if so_far + leap < best:
                 best, parent[t, h, 0], parent[t, h, 1] = so_far + leap, a, g
         cost[t, h] = best + emission[t, h]
@@ -83,10 +93,39 @@ def _keep_best(t, live, n_live, idle, cost, n_hypotheses):
 
 
 @njit(cache=True)
-def extend_all(start, stop, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent):
+def extend_all(
+    start,
+    stop,
+    live,
+    n_live,
+    times,
+    joints,
+    error,
+    emission,
+    idle,
+    levels,
+    length,
+    ceiling,
+    cost,
+    parent,
+):
     """`extend` for frames start to stop."""
     for t in range(start, stop):
-        n_live = extend(t, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent)
+        n_live = extend(
+            t,
+            live,
+            n_live,
+            times,
+            joints,
+            error,
+            emission,
+            idle,
+            levels,
+            length,
+            ceiling,
+            cost,
+            parent,
+        )
     return n_live
 
 
@@ -109,15 +148,25 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
     stay, leap = np.empty((n, 2)), np.empty((n, 2))
     for t in range(1, n):
         dt = times[t] - times[t - 1]
-        stay[t, 0] = leap_cost(one[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling)
-        stay[t, 1] = leap_cost(two[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling)
-        leap[t, 0] = leap_cost(one[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling)
-        leap[t, 1] = leap_cost(two[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling)
+        stay[t, 0] = leap_cost(
+            one[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
+        )
+        stay[t, 1] = leap_cost(
+            two[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling
+        )
+        leap[t, 0] = leap_cost(
+            one[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling
+        )
+        leap[t, 1] = leap_cost(
+            two[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
+        )
     first, second = np.zeros(n), np.zeros(n)  # logarithms of what the past says of each way
     second[0] = -evidence[0]
     for t in range(1, n):
         first[t] = np.logaddexp(first[t - 1] - stay[t, 0], second[t - 1] - leap[t, 1])
-        second[t] = np.logaddexp(first[t - 1] - leap[t, 0], second[t - 1] - stay[t, 1]) - evidence[t]
+        second[t] = (
+            np.logaddexp(first[t - 1] - leap[t, 0], second[t - 1] - stay[t, 1]) - evidence[t]
+        )
         top = max(first[t], second[t])
         first[t] -= top
         second[t] -= top
@@ -126,7 +175,10 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
         doubt[t] = 1.0 / (1.0 + np.exp(min(first[t] + a - second[t] - b, 700.0)))
         if t > 0:
             later = b - evidence[t]
-            a, b = (np.logaddexp(a - stay[t, 0], later - leap[t, 0]), np.logaddexp(a - leap[t, 1], later - stay[t, 1]))
+            a, b = (
+                np.logaddexp(a - stay[t, 0], later - leap[t, 0]),
+                np.logaddexp(a - leap[t, 1], later - stay[t, 1]),
+            )
             top = max(a, b)
             a -= top
             b -= top

@@ -127,7 +127,11 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
         _invert(s, inverse[:3, :3], work)
         for i in range(6):
             for k in range(3):
-                gain[i, k] = m[t, i, 0] * inverse[0, k] + m[t, i, 1] * inverse[1, k] + m[t, i, 2] * inverse[2, k]
+                gain[i, k] = (
+                    m[t, i, 0] * inverse[0, k]
+                    + m[t, i, 1] * inverse[1, k]
+                    + m[t, i, 2] * inverse[2, k]
+                )
         for i in range(6):
             for k in range(3):
                 state[t, i] += gain[i, k] * (y[t, k] - ahead[t, k])
@@ -164,14 +168,22 @@ def _go_on(state, p, dt, drive, fade, ahead, m):
 @njit(cache=True)
 def _way_back(times, fade, start, state, p, ahead, m):
     """Turn filtered states (n, 6) and covariances (n, 6, 6) into smoothed ones."""
-    inverse, work, forth, back = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    inverse, work, forth, back = (
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+    )
     change = np.zeros((6, 6))
     for t in range(times.size - 2, start - 1, -1):
         keep = np.exp(-(times[t + 1] - times[t]) / fade)
         go = fade * (1.0 - keep)
         for i in range(6):
             for k in range(3):
-                forth[i, k], forth[i, 3 + k] = p[t, i, k] + go * p[t, i, 3 + k], keep * p[t, i, 3 + k]
+                forth[i, k], forth[i, 3 + k] = (
+                    p[t, i, k] + go * p[t, i, 3 + k],
+                    keep * p[t, i, 3 + k],
+                )
         _invert(m[t + 1], inverse, work)
         _times(forth, inverse, back)
         for i in range(6):

@@ -109,34 +109,118 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
             for i in range(3):
                 for k in range(3):
                     for a in range(3):
-                        r[t, i, k] += frame[t, i, a] * frame[t, k, a] * variance[t] * moves.place_error[a] ** 2
+                        r[t, i, k] += (
+                            frame[t, i, a]
+                            * frame[t, k, a]
+                            * variance[t]
+                            * moves.place_error[a] ** 2
+                        )
     out, drive = np.empty((n, 3)), moves.place_drive * body.length_mm**2
     run_place(times, middle, r, used, start, drive, moves.place_fade, out, spread.middle)
     keep, go, forward = np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2))
     back, filtered, predicted = np.zeros((3, n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
     smoothed, rate, value = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n)
     for a in range(3):
-        _gains_of(times, variance, moves.turn[a], body.length_mm, start, keep[a], go[a], forward[a], back[a], filtered,
-                  predicted, smoothed, spread.turn[:, a])  # fmt: skip
-    run_rotations(seen.rotation, used, start, keep, go, forward, back, made.rotation, np.zeros((n, 3)))
+        _gains_of(
+            times,
+            variance,
+            moves.turn[a],
+            body.length_mm,
+            start,
+            keep[a],
+            go[a],
+            forward[a],
+            back[a],
+            filtered,
+            predicted,
+            smoothed,
+            spread.turn[:, a],
+        )
+    run_rotations(
+        seen.rotation, used, start, keep, go, forward, back, made.rotation, np.zeros((n, 3))
+    )
     for a in range(3):
-        _gains_of(times, variance, moves.bend[a], body.length_mm, start, keep[a], go[a], forward[a], back[a], filtered,
-                  predicted, smoothed, spread.bend[:, a])  # fmt: skip
+        _gains_of(
+            times,
+            variance,
+            moves.bend[a],
+            body.length_mm,
+            start,
+            keep[a],
+            go[a],
+            forward[a],
+            back[a],
+            filtered,
+            predicted,
+            smoothed,
+            spread.bend[:, a],
+        )
     for i in range(m):
         j, a = body.free[i]
-        run_vector(seen.angles[:, j, a].copy(), used, start, keep[a], go[a], forward[a], back[a], value, rate)
+        run_vector(
+            seen.angles[:, j, a].copy(),
+            used,
+            start,
+            keep[a],
+            go[a],
+            forward[a],
+            back[a],
+            value,
+            rate,
+        )
         made.angles[:, j, a] = value
-    _gains_of(times, variance, moves.size, body.length_mm, start, keep[0], go[0], forward[0], back[0], filtered,
-              predicted, smoothed, rate)  # fmt: skip
-    run_vector(seen.log_scale, used, start, keep[0], go[0], forward[0], back[0], made.log_scale, rate)
+    _gains_of(
+        times,
+        variance,
+        moves.size,
+        body.length_mm,
+        start,
+        keep[0],
+        go[0],
+        forward[0],
+        back[0],
+        filtered,
+        predicted,
+        smoothed,
+        rate,
+    )
+    run_vector(
+        seen.log_scale, used, start, keep[0], go[0], forward[0], back[0], made.log_scale, rate
+    )
     _place(body, out, made)
 
 
 @njit(cache=True)
-def _gains_of(times, variance, moves, length, start, keep, go, forward, back, filtered, predicted, smoothed, left):
+def _gains_of(
+    times,
+    variance,
+    moves,
+    length,
+    start,
+    keep,
+    go,
+    forward,
+    back,
+    filtered,
+    predicted,
+    smoothed,
+    left,
+):
     """The gains of a group with this error, drive and fade, and the variance (n,) that is left."""
-    gains(times, (moves[0] / length) ** 2 * variance, moves[1], moves[2], start, keep, go, forward, back, filtered,
-          predicted, smoothed)  # fmt: skip
+    gains(
+        times,
+        (moves[0] / length) ** 2 * variance,
+        moves[1],
+        moves[2],
+        start,
+        keep,
+        go,
+        forward,
+        back,
+        filtered,
+        predicted,
+        smoothed,
+    )
     for t in range(times.size):
         left[t] = smoothed[max(t, start), 0, 0]
 
@@ -146,8 +230,17 @@ def _place(body, middle, made):
     """Put the poses where their joints' middles (n, 3) are."""
     n_joints = body.parents.size
     made.place[:] = 0.0
-    place_joints(body.parents, body.offsets, body.rest, body.moves, made.rotation, made.place, made.angles,
-                 np.exp(made.log_scale), made.joints)  # fmt: skip
+    place_joints(
+        body.parents,
+        body.offsets,
+        body.rest,
+        body.moves,
+        made.rotation,
+        made.place,
+        made.angles,
+        np.exp(made.log_scale),
+        made.joints,
+    )
     for t in range(middle.shape[0]):
         for k in range(3):
             mean = 0.0

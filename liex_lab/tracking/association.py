@@ -59,9 +59,12 @@ class Chain:
         return seen.joints(self._joints, room)
 
     def path(
-        self, seen: Observations, told: NDArray[np.int64] | None = None, joints: NDArray[np.float32] | None = None,
+        self,
+        seen: Observations,
+        told: NDArray[np.int64] | None = None,
+        joints: NDArray[np.float32] | None = None,
         room: Room = np.empty,
-    ) -> NDArray[np.int64]:  # fmt: skip
+    ) -> NDArray[np.int64]:
         """(n,) the hypothesis of each frame that lies on the curve, or NONE.
 
         told (m,): of the first m frames it is known already; joints: those of `joints`, where they are at hand; room:
@@ -71,15 +74,29 @@ class Chain:
         emission = self._emission(seen, room)
         if told is not None:
             emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
-        idle = np.concatenate([[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))])
+        idle = np.concatenate(
+            [[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))]
+        )
         cost, parent = room((n, h), float), room((n, h, 2), np.int64)
         live = np.zeros((_BEAM, 2), np.int64)
         joints, seconds, n_live = self.joints(seen) if joints is None else joints, seen.seconds, 0
         for rows in blocks(n, _BLOCK):
             n_live = kernels.extend_all(
-                rows.start, rows.stop, live, n_live, seconds, joints, seen.error_mm, emission, idle,
-                self._levels, self._length, self._tuning.ceiling, cost, parent,
-            )  # fmt: skip
+                rows.start,
+                rows.stop,
+                live,
+                n_live,
+                seconds,
+                joints,
+                seen.error_mm,
+                emission,
+                idle,
+                self._levels,
+                self._length,
+                self._tuning.ceiling,
+                cost,
+                parent,
+            )
             let_go(joints, emission, cost, parent)
         path = np.full(n, NONE, np.int64)
         if n_live:
@@ -90,14 +107,19 @@ class Chain:
         """What each hypothesis (n, H) costs by itself."""
         cost = room(seen.score.shape, float)
         for rows in blocks(len(cost), _BLOCK):
-            cost[rows] = np.minimum(seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most)
+            cost[rows] = np.minimum(
+                seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most
+            )
             let_go(cost)
         return cost
 
     def doubt(
-        self, seen: Observations, path: NDArray[np.int64], joints: NDArray[np.float32] | None = None,
+        self,
+        seen: Observations,
+        path: NDArray[np.int64],
+        joints: NDArray[np.float32] | None = None,
         room: Room = np.empty,
-    ) -> Array:  # fmt: skip
+    ) -> Array:
         """(n,) probability that head and tail are exchanged on this path: forward and backward through two states.
 
         What a frame says is the difference between its hypothesis and the same thing turned round; between frames, how
@@ -121,7 +143,16 @@ class Chain:
             let_go(joints, one, two)
         error = seen.error_mm[used, path[used]].astype(float)
         at_used = np.empty(len(used))
-        kernels.two_ways(seen.seconds[used], one, two, error, evidence[used], self._levels, self._length,
-                         self._tuning.ceiling, at_used)  # fmt: skip
+        kernels.two_ways(
+            seen.seconds[used],
+            one,
+            two,
+            error,
+            evidence[used],
+            self._levels,
+            self._length,
+            self._tuning.ceiling,
+            at_used,
+        )
         doubt[:] = np.interp(rows, used, at_used)
         return doubt

@@ -47,7 +47,10 @@ class Tuning:
 
     def to_toml(self, name: str) -> str:
         """Its table in TOML."""
-        lines = [f"[{name}.chain]", *(f"{key} = {_text(value)}" for key, value in asdict(self.chain).items())]
+        lines = [
+            f"[{name}.chain]",
+            *(f"{key} = {_text(value)}" for key, value in asdict(self.chain).items()),
+        ]
         lines += ["", f"[{name}.motion]"]
         for key, value in asdict(self.motion).items():
             rows = [list(row.values()) for row in value] if key in ("turn", "bend") else value
@@ -60,10 +63,18 @@ def tunings_with(name: str, tuning: Tuning) -> str:
     """The file `tunings.toml` with an animal's table replaced, or added to it."""
     text = TUNINGS.read_text(encoding="utf-8")
     head = text[: text.index("\n[")]
-    known = {animal: Tuning.from_table(table) for animal, table in tomllib.loads(text).items()} | {name: tuning}
-    return "\n".join([head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())])
+    known = {animal: Tuning.from_table(table) for animal, table in tomllib.loads(text).items()} | {
+        name: tuning
+    }
+    return "\n".join(
+        [head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())]
+    )
 
 
 def _text(value: Any) -> str:
     """A number, or lists of them, in TOML."""
-    return f"[{', '.join(map(_text, value))}]" if isinstance(value, list | tuple) else repr(float(f"{value:.4g}"))
+    return (
+        f"[{', '.join(map(_text, value))}]"
+        if isinstance(value, list | tuple)
+        else repr(float(f"{value:.4g}"))
+    )

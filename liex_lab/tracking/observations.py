@@ -17,7 +17,9 @@ from liex_lab.runtime.memory import Room, let_go
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
 
-N_HYPOTHESES = 4  # of two things in the frame one way round and the other: hypothesis h ^ 1 is h turned round
+N_HYPOTHESES = (
+    4  # of two things in the frame one way round and the other: hypothesis h ^ 1 is h turned round
+)
 
 
 @dataclass(frozen=True)
@@ -54,9 +56,20 @@ class Observations:
             return np.full((n, h, *shape), np.nan, np.float32)
 
         return Observations(
-            skeleton, np.asarray(times_ns, np.int64), nothing(3), nothing(3), nothing(d), nothing(), nothing(),
-            nothing(), nothing(), np.zeros((n, h), np.int32), nothing(3), nothing(2), np.ones(n, np.bool_),
-        )  # fmt: skip
+            skeleton,
+            np.asarray(times_ns, np.int64),
+            nothing(3),
+            nothing(3),
+            nothing(d),
+            nothing(),
+            nothing(),
+            nothing(),
+            nothing(),
+            np.zeros((n, h), np.int32),
+            nothing(3),
+            nothing(2),
+            np.ones(n, np.bool_),
+        )
 
     def put_pose(self, h: int, pose: Pose) -> None:
         """Poses (n) in the arena frame as hypothesis h, NaN where there is none."""
@@ -68,7 +81,10 @@ class Observations:
     @staticmethod
     def join(parts: Sequence[Observations]) -> Observations:
         """Those of consecutive frames."""
-        return Observations(parts[0].skeleton, *(np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS))
+        return Observations(
+            parts[0].skeleton,
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS),
+        )
 
     def __getitem__(self, frames: slice) -> Observations:
         return Observations(self.skeleton, *(getattr(self, name)[frames] for name in COLUMNS))
@@ -92,7 +108,9 @@ class Observations:
 
     def pose(self, path: NDArray[np.int64]) -> Pose:
         """The poses (n) of the hypotheses `path` (n,); NaN where it is negative or there is none."""
-        turn, place, free, scale = (self.along(v, path) for v in (self.turn, self.place, self.angles, self.scale))
+        turn, place, free, scale = (
+            self.along(v, path) for v in (self.turn, self.place, self.angles, self.scale)
+        )
         angles = np.zeros((len(path), self.skeleton.n_joints, 3))
         angles[:, 1:][:, self.skeleton.axes[1:]] = free
         return Pose(SE3(so3.exp(turn), place), angles, scale)
@@ -123,9 +141,16 @@ def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
     """Joint positions (n, J, 3) mm of poses (n); as `Pose.joints`, quicker."""
     out = np.empty((len(pose.scale), skeleton.n_joints, 3))
     place_joints(
-        skeleton.parents, skeleton.offsets, skeleton.rest, skeleton.axes.any(axis=1), pose.root.rotation,
-        pose.root.translation, pose.angles, np.asarray(pose.scale, float), out,
-    )  # fmt: skip
+        skeleton.parents,
+        skeleton.offsets,
+        skeleton.rest,
+        skeleton.axes.any(axis=1),
+        pose.root.rotation,
+        pose.root.translation,
+        pose.angles,
+        np.asarray(pose.scale, float),
+        out,
+    )
     return out
 
 

@@ -43,7 +43,7 @@ class FreeEnds:
     @staticmethod
     def fit(
         skeleton: Skeleton, scene: Foreground, pose: Pose, crops: Crops, depths: NDArray[np.float32]
-    ) -> FreeEnds:  # fmt: skip
+    ) -> FreeEnds:
         """From poses (n), camera frame, of frames (n, H, W) mm; crops: cut along the optical axis."""
         ends = FreeEnds(skeleton, scene)
         sight = ends._sight(pose, crops, depths)
@@ -58,11 +58,17 @@ class FreeEnds:
         sight = self._sight(pose, crops, depths)
         shown, covered, aside, begins, ends = sight.T
         most = _SLIDE * np.clip(1.0 - shown, 0.0, 1.0)
-        way = np.where(aside > 0, np.clip(begins - self.begins, 0.0, most), np.clip(ends - self.ends, -most, 0.0))
+        way = np.where(
+            aside > 0,
+            np.clip(begins - self.begins, 0.0, most),
+            np.clip(ends - self.ends, -most, 0.0),
+        )
         way[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
         joints = joints_of(self.skeleton, pose)
         along = joints[:, self.skeleton.tip] - joints[:, 0]
-        return replace(pose, root=SE3(pose.root.rotation, pose.root.translation + way[:, None] * along))
+        return replace(
+            pose, root=SE3(pose.root.rotation, pose.root.translation + way[:, None] * along)
+        )
 
     def _sight(self, pose: Pose, crops: Crops, depths: NDArray[np.float32]) -> Array:
         """What is seen (n, 5) of each animal, see `_look`, its area over the usual one."""
@@ -90,7 +96,9 @@ def _look(heights, origin, step, distance, depths, ends, before, out):
         for r in range(size):
             for c in range(size):
                 v, u = origin[i, 1] + step[i] * r, origin[i, 0] + step[i] * c
-                if heights[i, r, c] <= 0 or not (0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]):
+                if heights[i, r, c] <= 0 or not (
+                    0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]
+                ):
                     continue
                 z = distance[i] - heights[i, r, c] / 16.0
                 if depth[v, u] > 0 and abs(depth[v, u] - z) > 0.5 * before:

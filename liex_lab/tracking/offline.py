@@ -51,9 +51,12 @@ class Subject:
 
 
 def track_whole(
-    subject: Subject, seen: Observations, corrections: Sequence[Flip] = (), tuning: Tuning | None = None,
+    subject: Subject,
+    seen: Observations,
+    corrections: Sequence[Flip] = (),
+    tuning: Tuning | None = None,
     room: Room = np.empty,
-) -> Tracked:  # fmt: skip
+) -> Tracked:
     """The track of a recording from what was seen in all of its frames; corrections: what a human says of flips.
 
     tuning: None takes the animal's own. room: where the track is to lie; of everything else no more than a block of
@@ -75,7 +78,9 @@ def track_whole(
         around = slice(first, last)
         pose = seen[around].pose(path[around])
         _reverse(subject.skeleton, pose, turned[around])
-        curve = smooth(subject.skeleton, seconds[around], pose, error[around], subject.length_mm, tuning.motion)
+        curve = smooth(
+            subject.skeleton, seconds[around], pose, error[around], subject.length_mm, tuning.motion
+        )
         curve = curve[rows.start - first : rows.stop - first]
         _write(subject, track[rows], curve, tuning)
         used[rows] = curve.used
@@ -97,10 +102,14 @@ def track_whole(
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
     for rows in blocks(len(seen), _BLOCK):
-        _settle(subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows])
+        _settle(
+            subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows]
+        )
         _rest(track, seen)
     flips = _flips(seen, track)
-    return Tracked(track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))))
+    return Tracked(
+        track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
+    )
 
 
 def _rest(track: Track, seen: Observations) -> None:
@@ -110,7 +119,7 @@ def _rest(track: Track, seen: Observations) -> None:
 
 def _turn_round(
     seen: Observations, path: NDArray[np.int64], doubt: Array, corrections: Sequence[Flip]
-) -> NDArray[np.int64]:  # fmt: skip
+) -> NDArray[np.int64]:
     """Exchange head and tail in the spans that a human says, of which there is no doubt then: in the path where a frame
     has that hypothesis. Returns how often (n,) the pose itself is to be turned round elsewhere.
     """
@@ -133,13 +142,21 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
     """Turn poses (n) round so many times (n,) each, in place."""
     for t in np.repeat(np.arange(len(turned)), turned):
         other = reversed_pose(skeleton, pose[t : t + 1])
-        pose.root.rotation[t], pose.root.translation[t] = other.root.rotation[0], other.root.translation[0]
+        pose.root.rotation[t], pose.root.translation[t] = (
+            other.root.rotation[0],
+            other.root.translation[0],
+        )
         pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
 
 
 def _admit(
-    subject: Subject, seen: Observations, path: NDArray[np.int64], error: Array, track: Track, usual_px: float
-) -> None:  # fmt: skip
+    subject: Subject,
+    seen: Observations,
+    path: NDArray[np.int64],
+    error: Array,
+    track: Track,
+    usual_px: float,
+) -> None:
     """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames that were passed by.
 
     It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an animal how it lies.
@@ -161,9 +178,15 @@ def _admit(
 
 
 def to_track(
-    subject: Subject, seen: Observations, path: NDArray[np.int64], curve: Curve, doubt: Array, ahead: bool = False,
-    told: slice = slice(None), tuning: Tuning | None = None,
-) -> Track:  # fmt: skip
+    subject: Subject,
+    seen: Observations,
+    path: NDArray[np.int64],
+    curve: Curve,
+    doubt: Array,
+    ahead: bool = False,
+    told: slice = slice(None),
+    tuning: Tuning | None = None,
+) -> Track:
     """A curve as rows of a track: measured, bridged over a short time, or missing.
 
     ahead: the curve also goes on for a short time after the last measurement; told: only these rows.
@@ -185,7 +208,9 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None
     track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
     stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
     away = stretch_of(stretch, curve.joints)
-    track.sd_mm[:] = np.hypot((curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away)
+    track.sd_mm[:] = np.hypot(
+        (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
+    )
     track.predicted_error_mm[:] = np.hypot(curve.error_mm, ERROR_PER_SD * away.mean(axis=1))
     honest = np.array(motion.honest_root)
     track.cov_root[:] = covariance_of_root(curve) * (honest[:, None] * honest)
@@ -194,21 +219,37 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None
 
 
 def _settle(
-    subject: Subject, track: Track, seen: Observations, path: NDArray[np.int64], doubt: Array,
-    measured: NDArray[np.bool_], bridged: NDArray[np.bool_],
-) -> None:  # fmt: skip
+    subject: Subject,
+    track: Track,
+    seen: Observations,
+    path: NDArray[np.int64],
+    doubt: Array,
+    measured: NDArray[np.bool_],
+    bridged: NDArray[np.bool_],
+) -> None:
     """Keep of the curve in the rows (n) of a track what was measured or is bridged, and add what was seen."""
     there = measured | bridged
     for column in (
-        track.joints_mm, track.predicted_error_mm, track.root_rotation, track.root_mm, track.angles_rad, track.scale,
-        track.sd_mm, track.cov_root, track.sd_angles_rad,
-    ):  # fmt: skip
+        track.joints_mm,
+        track.predicted_error_mm,
+        track.root_rotation,
+        track.root_mm,
+        track.angles_rad,
+        track.scale,
+        track.sd_mm,
+        track.cov_root,
+        track.sd_angles_rad,
+    ):
         column[~there] = np.nan
-    track.uv_px[there] = subject.camera.project(subject.T_arena_camera.inverse() @ track.joints_mm[there])
+    track.uv_px[there] = subject.camera.project(
+        subject.T_arena_camera.inverse() @ track.joints_mm[there]
+    )
     track.p_flip[there] = doubt[there]
     _add_sight(track, seen, path, measured)
     track.bridged[:] = bridged
-    track.flag[measured] = np.where(track.predicted_error_mm > subject.doubtful_mm, "doubtful", "")[measured]
+    track.flag[measured] = np.where(track.predicted_error_mm > subject.doubtful_mm, "doubtful", "")[
+        measured
+    ]
     track.flag[~measured & ~seen.has_depth] = "no_depth"
 
 
@@ -238,11 +279,16 @@ def stretch_of(stretch_sd: float, joints: Array) -> Array:
 ERROR_PER_SD = 1.4
 
 
-def _add_sight(track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]) -> None:
+def _add_sight(
+    track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
+) -> None:
     """What was seen of the animal where it was measured."""
     rows, taken = np.flatnonzero(measured), path[measured]
     track.n_foreground_px[rows] = seen.n_px[rows, taken]
-    track.centroid_mm[rows], track.centroid_px[rows] = seen.centroid_mm[rows, taken], seen.centroid_px[rows, taken]
+    track.centroid_mm[rows], track.centroid_px[rows] = (
+        seen.centroid_mm[rows, taken],
+        seen.centroid_px[rows, taken],
+    )
     track.residual_mm[rows] = seen.residual_mm[rows, taken]
 
 
@@ -251,7 +297,9 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     path = np.where(seen.known[:, 0], 0, NONE)
     pose, error = seen.pose(path), seen.along(seen.error_mm, path)
     moves = Tuning.of(subject.skeleton.name).motion.packed
-    turn, bend = (group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend))
+    turn, bend = (
+        group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend)
+    )
     middle = (moves.place_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
     curve = Curve(pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0)
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
@@ -259,7 +307,7 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
 
 def short_gaps(
     seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """(n,) True in frames between two measured ones of which the nearer is no farther than half of bridge_s, so that a
     gap no longer than bridge_s is bridged whole; ahead: and so long after the last one.
     """

@@ -30,7 +30,9 @@ class OnlineTracker:
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)
-        self._joints: NDArray[np.float32] | None = None  # of the window's hypotheses, those that the chain goes by
+        self._joints: NDArray[np.float32] | None = (
+            None  # of the window's hypotheses, those that the chain goes by
+        )
 
     def add(self, seen: Observations) -> Track | None:
         """The rows that can be told once the next frames are known, None where there are none yet."""
@@ -67,6 +69,10 @@ class OnlineTracker:
             first = 0
         seen, path, doubt, told = seen[first:], path[first:], doubt[first:], told - first
         pose, error = seen.pose(path), seen.along(seen.error_mm, path)
-        curve = smooth(self._subject.skeleton, seen.seconds, pose, error, self._subject.length_mm, self._motion)
+        curve = smooth(
+            self._subject.skeleton, seen.seconds, pose, error, self._subject.length_mm, self._motion
+        )
         self._told += n
-        return to_track(self._subject, seen, path, curve, doubt, ahead=True, told=slice(told, told + n))
+        return to_track(
+            self._subject, seen, path, curve, doubt, ahead=True, told=slice(told, told + n)
+        )

@@ -62,9 +62,13 @@ class ParticleFilter:
     """
 
     def __init__(
-        self, estimator: PoseEstimator, scene: Foreground, size: float, rng: np.random.Generator,
+        self,
+        estimator: PoseEstimator,
+        scene: Foreground,
+        size: float,
+        rng: np.random.Generator,
         how: Wander | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._estimator, self._scene, self._size, self._rng = estimator, scene, size, rng
         self._how = how or Wander.of(estimator.skeleton.name)
         self._particles: _Particles | None = None
@@ -105,11 +109,13 @@ class ParticleFilter:
     def _begin(self, found: Estimates) -> tuple[Pose, float]:
         k = self._how.n_particles
         pose = found.chosen.pose
-        base = SE3(np.repeat(pose.root.rotation, k, axis=0), np.repeat(pose.root.translation, k, axis=0))
-        self._particles = _Particles(base, np.repeat(pose.scale, k), np.full(k, 1.0 / k))
-        return Pose(SE3(pose.root.rotation[0], pose.root.translation[0]), pose.angles[0], pose.scale[0]), float(
-            found.chosen.error_mm[0]
+        base = SE3(
+            np.repeat(pose.root.rotation, k, axis=0), np.repeat(pose.root.translation, k, axis=0)
         )
+        self._particles = _Particles(base, np.repeat(pose.scale, k), np.full(k, 1.0 / k))
+        return Pose(
+            SE3(pose.root.rotation[0], pose.root.translation[0]), pose.angles[0], pose.scale[0]
+        ), float(found.chosen.error_mm[0])
 
     def _select(self) -> None:
         """Draw particles from the cumulative weights; all weigh the same afterwards."""
@@ -118,7 +124,9 @@ class ParticleFilter:
         total = np.cumsum(p.weight)
         drawn = np.searchsorted(total, self._rng.random(k) * total[-1])
         self._particles = _Particles(
-            SE3(p.base.rotation[drawn], p.base.translation[drawn]), p.scale[drawn], np.full(k, 1.0 / k)
+            SE3(p.base.rotation[drawn], p.base.translation[drawn]),
+            p.scale[drawn],
+            np.full(k, 1.0 / k),
         )
 
     def _propagate(self, dt: float) -> None:
@@ -140,16 +148,26 @@ class ParticleFilter:
         cascade, model = self._estimator.model.cascade, self._estimator.model
         k = len(self._particles.scale)
         candidates = Candidates.start(
-            cascade.skeleton, np.zeros(k, np.int32), base.rotation, base.translation, self._particles.scale,
+            cascade.skeleton,
+            np.zeros(k, np.int32),
+            base.rotation,
+            base.translation,
+            self._particles.scale,
             np.full(k, self._size),
-        )  # fmt: skip
+        )
         for joint, rounds in zip(cascade.skeleton.solved[1:], cascade.forests[1:], strict=True):
             cascade.place(candidates, joint)
             for forest in rounds:
-                cascade.apply(candidates, joint, predict(forest, cascade.samples(images, candidates, [joint])))
+                cascade.apply(
+                    candidates, joint, predict(forest, cascade.samples(images, candidates, [joint]))
+                )
         cascade.place_ends(candidates)
         everything = cascade.samples(images, candidates, list(range(cascade.skeleton.n_joints)))
-        return candidates.rotations, candidates.positions, predict(model.metric, everything)[:, 0].astype(float)
+        return (
+            candidates.rotations,
+            candidates.positions,
+            predict(model.metric, everything)[:, 0].astype(float),
+        )
 
     def _average(self, rotations: Array, positions: Array) -> Pose:
         """Eq. 14 about the average itself, for the base on SE(3) and for each other joint on its axes."""

@@ -31,7 +31,9 @@ class WindowTracker:
     def find_size(self, windows: Windows) -> float:
         """The animal's length over the home length, measured in some windows as over a recording's sample."""
         model, size = self.estimator.model, 1.0
-        uncorrected = replace(self, estimator=replace(self.estimator, model=replace(model, corrector=None)))
+        uncorrected = replace(
+            self, estimator=replace(self.estimator, model=replace(model, corrector=None))
+        )
         for _ in range(_SIZE_PASSES if model.method.session_size else 0):
             best = uncorrected.estimator.best_of(*uncorrected._cut(windows, size), size)
             seen = np.flatnonzero(best.found)
@@ -41,16 +43,23 @@ class WindowTracker:
             size = float(np.median(best.chosen.told_scale[sure]))
         return size
 
-    def observe(self, parts: Iterable[Windows], times_ns: NDArray[np.int64], size: float) -> Observations:
+    def observe(
+        self, parts: Iterable[Windows], times_ns: NDArray[np.int64], size: float
+    ) -> Observations:
         """What the frames at these times (n,) say, each by itself, in the arena frame."""
         seen, start = Observations.empty(self.estimator.skeleton, times_ns), 0
         for windows in parts:
             place = windows.floor(0).T_arena_camera
             rows = slice(start, start + len(windows.depth))
             start, some = rows.stop, seen[rows]  # a view: what is put there is put in all of it
-            for h, estimates in enumerate(self.estimator.both_ways(*self._cut(windows, size), size)):
+            for h, estimates in enumerate(
+                self.estimator.both_ways(*self._cut(windows, size), size)
+            ):
                 some.put_pose(h, estimates.chosen.pose.moved(place))
-                some.error_mm[:, h], some.score[:, h] = estimates.chosen.error_mm, estimates.chosen.score
+                some.error_mm[:, h], some.score[:, h] = (
+                    estimates.chosen.error_mm,
+                    estimates.chosen.score,
+                )
                 some.n_px[:, h] = np.where(estimates.found, estimates.crops.n_px, 0)
         return seen
 
@@ -59,7 +68,9 @@ class WindowTracker:
         skeleton, calibration = self.estimator.skeleton, self.estimator.model.calibration
         share = calibration.joint_share or (1.0,) * skeleton.n_joints
         doubtful_mm = calibration.doubtful_mm * size
-        return Subject(skeleton, camera, T_arena_camera, size * skeleton.length, doubtful_mm, BRIDGE_S, share)
+        return Subject(
+            skeleton, camera, T_arena_camera, size * skeleton.length, doubtful_mm, BRIDGE_S, share
+        )
 
     def _cut(self, windows: Windows, size: float) -> tuple[Crops, Array]:
         """The height map of every window and how it was cut."""

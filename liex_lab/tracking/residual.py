@@ -46,7 +46,11 @@ class BodyResidual:
 
     @staticmethod
     def fit(
-        surface: Surface, pose_arena: Pose, crops: Crops, scene: Foreground, camera_view: bool = False
+        surface: Surface,
+        pose_arena: Pose,
+        crops: Crops,
+        scene: Foreground,
+        camera_view: bool = False,
     ) -> BodyResidual:
         """The girth with which the default body explains these frames best."""
         bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
@@ -63,9 +67,13 @@ def render_crops(
     vertices = surface.vertices(pose_arena, girth=girth * pose_arena.scale)
     # a crop of every second pixel is the picture of a camera of half the resolution
     step = crops.step.astype(float)
-    scaled = np.stack([camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step], axis=1)
+    scaled = np.stack(
+        [camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step], axis=1
+    )
     T = scene.floor.T_arena_camera.inverse()
-    T_camera_arena = SE3(np.broadcast_to(T.rotation, (n, 3, 3)).copy(), np.broadcast_to(T.translation, (n, 3)).copy())
+    T_camera_arena = SE3(
+        np.broadcast_to(T.rotation, (n, 3, 3)).copy(), np.broadcast_to(T.translation, (n, 3)).copy()
+    )
     origin = crops.origin / step[:, None]
     return render_meshes(vertices, surface.faces, T_camera_arena, scaled, origin, (CROP, CROP))
 
@@ -82,7 +90,9 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
             for c in range(size):
                 if rendered[i, r, c] > 0 and heights[i, r, c] > 0:
                     u = origin[i, 0] + step[i] * c
-                    observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (plane[0] * u + plane[1] * v + plane[2])
+                    observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (
+                        plane[0] * u + plane[1] * v + plane[2]
+                    )
                     off[n] = abs(rendered[i, r, c] - observed)
                     n += 1
         out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan

@@ -70,9 +70,16 @@ class Motion:
 
         level, up = self.place_drive
         return kernels.Moves(
-            np.array(self.place_error), np.array([level, level, up]), self.place_fade, rows(*self.turn),
-            rows(*self.bend), rows(self.size)[0], self.freedom, self.reject, self.lasting,
-        )  # fmt: skip
+            np.array(self.place_error),
+            np.array([level, level, up]),
+            self.place_fade,
+            rows(*self.turn),
+            rows(*self.bend),
+            rows(self.size)[0],
+            self.freedom,
+            self.reject,
+            self.lasting,
+        )
 
 
 @dataclass(frozen=True)
@@ -109,8 +116,13 @@ _ROWS = ("joints", "error_mm", "cov_middle_mm2", "sd_turn", "sd_bend", "used")
 
 
 def smooth(
-    skeleton: Skeleton, seconds: Array, pose: Pose, error_mm: Array, length_mm: float, motion: Motion
-) -> Curve:  # fmt: skip
+    skeleton: Skeleton,
+    seconds: Array,
+    pose: Pose,
+    error_mm: Array,
+    length_mm: float,
+    motion: Motion,
+) -> Curve:
     """The curve through measured poses (n), NaN where none is, with predicted errors error_mm (n,) at times (n,) s.
 
     Errors have heavy tails: measurements far off the curve weigh less (iterated weights of a t distribution) and those
@@ -120,8 +132,13 @@ def smooth(
     n = len(seconds)
     if not known.any():
         return Curve.unknown(n, skeleton.n_joints)
-    seen = kernels.Poses(pose.root.rotation, pose.root.translation, pose.angles, np.log(pose.scale),
-                         joints_of(skeleton, pose))  # fmt: skip
+    seen = kernels.Poses(
+        pose.root.rotation,
+        pose.root.translation,
+        pose.angles,
+        np.log(pose.scale),
+        joints_of(skeleton, pose),
+    )
     made = kernels.Poses(*(np.zeros(values.shape) for values in seen))
     spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     used = np.zeros(n, np.bool_)
@@ -134,15 +151,25 @@ def body_of(skeleton: Skeleton, length_mm: float) -> kernels.Body:
     """A skeleton for the kernels."""
     free = np.argwhere(skeleton.axes)
     return kernels.Body(
-        skeleton.parents, skeleton.offsets, skeleton.rest, np.asarray(skeleton.axes.any(axis=1)), free[free[:, 0] > 0],
-        float(length_mm), skeleton.tip,
-    )  # fmt: skip
+        skeleton.parents,
+        skeleton.offsets,
+        skeleton.rest,
+        np.asarray(skeleton.axes.any(axis=1)),
+        free[free[:, 0] > 0],
+        float(length_mm),
+        skeleton.tip,
+    )
 
 
 def _curve(
-    seconds: Array, error_mm: Array, length_mm: float, motion: Motion, made: kernels.Poses, spread: kernels.Spread,
+    seconds: Array,
+    error_mm: Array,
+    length_mm: float,
+    motion: Motion,
+    made: kernels.Poses,
+    spread: kernels.Spread,
     used: NDArray[np.bool_],
-) -> Curve:  # fmt: skip
+) -> Curve:
     """What the kernels made, and how far off it may be: what the filter leaves, and what lasts over many frames."""
     lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
     middle = np.trace(spread.middle, axis1=1, axis2=2)
@@ -158,7 +185,8 @@ def _curve(
     pose = Pose(SE3(made.rotation, made.place), made.angles, np.exp(made.log_scale))
     error = np.sqrt(lasting**2 + relative)
     honest = np.interp(
-        np.log(error / length_mm), *np.array([(np.log(said), factor) for said, factor in motion.honest]).T
+        np.log(error / length_mm),
+        *np.array([(np.log(said), factor) for said, factor in motion.honest]).T,
     )
     each = honest[:, None]
     cov_middle *= each[:, None] ** 2

@@ -60,7 +60,12 @@ class Track:
     flag: NDArray[np.str_]
 
     @staticmethod
-    def empty(skeleton: Skeleton, times_ns: NDArray[np.int64], flag: str = "not_found", room: Room = np.empty) -> Track:
+    def empty(
+        skeleton: Skeleton,
+        times_ns: NDArray[np.int64],
+        flag: str = "not_found",
+        room: Room = np.empty,
+    ) -> Track:
         """A track of these times in which nothing has been measured yet; room: where its columns are to lie."""
         n, j = len(times_ns), skeleton.n_joints
 
@@ -74,10 +79,26 @@ class Track:
             return column(np.nan, np.float64, *shape)
 
         return Track(
-            skeleton, np.asarray(times_ns, np.int64), unknown(j, 3), unknown(j, 2), unknown(j), unknown(3, 3),
-            unknown(3), unknown(6, 6), unknown(j, 3), unknown(j, 3), unknown(), unknown(), unknown(),
-            column(0, np.int64), unknown(3), unknown(2), unknown(), column(False, np.bool_), column(flag, "<U12"),
-        )  # fmt: skip
+            skeleton,
+            np.asarray(times_ns, np.int64),
+            unknown(j, 3),
+            unknown(j, 2),
+            unknown(j),
+            unknown(3, 3),
+            unknown(3),
+            unknown(6, 6),
+            unknown(j, 3),
+            unknown(j, 3),
+            unknown(),
+            unknown(),
+            unknown(),
+            column(0, np.int64),
+            unknown(3),
+            unknown(2),
+            unknown(),
+            column(False, np.bool_),
+            column(flag, "<U12"),
+        )
 
     @staticmethod
     def join(parts: list[Track]) -> Track:

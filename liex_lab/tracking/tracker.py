@@ -65,21 +65,31 @@ class FrameTracker:
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
         estimates = estimator.estimate(sample, scene, size)
         if not estimates.found.any():
-            raise EstimationError("no animal was found in the sampled frames; check the depth unit and the plan")
+            raise EstimationError(
+                "no animal was found in the sampled frames; check the depth unit and the plan"
+            )
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
         crops, used = estimates.crops, estimates.found
         camera_view = estimator.model.method.camera_view
-        body = BodyResidual.fit(Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view)
+        body = BodyResidual.fit(
+            Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
+        )
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
         off = body.of(pose[used], crops[used], scene)
         off = off[np.isfinite(off)]
         blur = float(np.median(off)) / (home * size) if len(off) else 0.0
         spread = float(np.log(estimator.sizes_told(estimates)).std())
         ends = None
-        if camera_view and estimator.skeleton.is_chain:  # one that stands on the floor is seen from above: it may rear
-            ends = FreeEnds.fit(estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], sample[used])
+        if (
+            camera_view and estimator.skeleton.is_chain
+        ):  # one that stands on the floor is seen from above: it may rear
+            ends = FreeEnds.fit(
+                estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], sample[used]
+            )
         origin = "plan" if spine_mm else "recording"
-        return FrameTracker(estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends)
+        return FrameTracker(
+            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends
+        )
 
     @property
     def spine_mm(self) -> float:
@@ -91,8 +101,16 @@ class FrameTracker:
         """Whom the track is of."""
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
-        return Subject(skeleton, self.scene.camera, self.scene.floor.T_arena_camera, self.spine_mm, self.doubtful_mm,
-                       self.bridge_s, share, self.stretch_sd)  # fmt: skip
+        return Subject(
+            skeleton,
+            self.scene.camera,
+            self.scene.floor.T_arena_camera,
+            self.spine_mm,
+            self.doubtful_mm,
+            self.bridge_s,
+            share,
+            self.stretch_sd,
+        )
 
     @property
     def stretch_sd(self) -> float:
@@ -106,7 +124,9 @@ class FrameTracker:
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
         seen.has_depth[:] = (depths > 0).any(axis=(1, 2))
-        with threads(len(frames) > 1):  # kernels share frames out: of one, the other cores would only wait
+        with threads(
+            len(frames) > 1
+        ):  # kernels share frames out: of one, the other cores would only wait
             for h, estimates in enumerate(self.estimator.hypotheses(depths, self.scene, self.size)):
                 self._put(seen, h, estimates, depths)
         return seen
@@ -119,15 +139,23 @@ class FrameTracker:
         """The same from what was seen of them."""
         return single_frames(self.subject, seen)
 
-    def track(self, seen: Observations, corrections: Sequence[Flip] = (), room: Room = np.empty) -> Tracked:
+    def track(
+        self, seen: Observations, corrections: Sequence[Flip] = (), room: Room = np.empty
+    ) -> Tracked:
         """The track of a whole recording; room: where it is to lie."""
         return track_whole(self.subject, seen, corrections, room=room)
 
-    def _put(self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]) -> None:
+    def _put(
+        self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
+    ) -> None:
         """What the estimator says as hypothesis h, and what is seen of the thing that it is of."""
         found = np.flatnonzero(estimates.found)
         chosen, crops = estimates.chosen, estimates.crops
-        in_camera = chosen.pose if self.free_ends is None else self.free_ends.slid(chosen.pose, crops, depths)
+        in_camera = (
+            chosen.pose
+            if self.free_ends is None
+            else self.free_ends.slid(chosen.pose, crops, depths)
+        )
         pose = in_camera.moved(self.scene.floor.T_arena_camera)
         seen.put_pose(h, pose)
         seen.error_mm[:, h], seen.score[:, h] = chosen.error_mm, chosen.score

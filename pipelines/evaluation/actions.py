@@ -57,15 +57,22 @@ PROTOCOL = (
 
 
 def evaluate_actions(
-    animal: str = "fish", *, model: str | Path | None = None, pose_model: str | Path | None = None,
-    minutes: float = 30.0, draw: Callable[[dict[str, Any]], object] | None = None, progress: Progress = silent,
-) -> dict[str, Any]:  # fmt: skip
+    animal: str = "fish",
+    *,
+    model: str | Path | None = None,
+    pose_model: str | Path | None = None,
+    minutes: float = 30.0,
+    draw: Callable[[dict[str, Any]], object] | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
     """The figures of `liex evaluate actions`. model: an action model other than the bundled one or, where there is
     none, one trained now; pose_model: that measures the frames, other than the animal's own; minutes: of uncut
     test recordings; draw: is given the result, for a picture.
     """
     if animal not in RATE_HZ:
-        raise LiexError(f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of these")
+        raise LiexError(
+            f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of these"
+        )
     estimator = estimator_of(animal, "default", progress, pose_model)
     recogniser = _recogniser(animal, model, pose_model, progress)
     learners = by_usual_camera(training_recordings(animal))
@@ -77,22 +84,35 @@ def evaluate_actions(
     progress(0, None, "tracking and naming")
     tracks = [one.tracked() for one in recordings]
     if animal == "fish":
-        train, test = (acted_tracks(cut_sequences(animal, side), estimator, progress) for side in (False, True))
+        train, test = (
+            acted_tracks(cut_sequences(animal, side), estimator, progress) for side in (False, True)
+        )
     else:
         train, test = cut_out(learned), cut_out(tracks)
     timeline, by_fps, lost = _timelines(recogniser, recordings, tracks, fast, RATE_HZ[animal])
     result = {
-        "animal": animal, **sequence_scores(train, test, recogniser), "timeline": timeline, "by_fps": by_fps,
+        "animal": animal,
+        **sequence_scores(train, test, recogniser),
+        "timeline": timeline,
+        "by_fps": by_fps,
         "lost_by_fps": lost,
         "speed_only_macro_f1": speed_only(learned, tracks, recogniser),
-        "track_error_mm": track_error_mm(tracks), "one_hour": one_hour(recogniser, tracks[0]),
-        "unresolved": {f"{rate:g}": recogniser.unresolved((np.arange(9) / rate * 1e9).astype(np.int64))
-                       for rate in (*_SLOWER_HZ, RATE_HZ[animal])},
+        "track_error_mm": track_error_mm(tracks),
+        "one_hour": one_hour(recogniser, tracks[0]),
+        "unresolved": {
+            f"{rate:g}": recogniser.unresolved((np.arange(9) / rate * 1e9).astype(np.int64))
+            for rate in (*_SLOWER_HZ, RATE_HZ[animal])
+        },
         "protocol": PROTOCOL.format(
-            n_train=len(train), n_test=len(test), seeds=_SEEDS, minutes=_minutes(tracks), animals=len(tracks),
-            fast=FAST_HZ, fast_minutes=sum(one.seen.seconds[-1] for one in fast) / 60.0,
+            n_train=len(train),
+            n_test=len(test),
+            seeds=_SEEDS,
+            minutes=_minutes(tracks),
+            animals=len(tracks),
+            fast=FAST_HZ,
+            fast_minutes=sum(one.seen.seconds[-1] for one in fast) / 60.0,
         ),
-    }  # fmt: skip
+    }
     if draw is not None:
         draw(result)
     return result
@@ -107,19 +127,27 @@ def sequence_scores(
     true, n = [str(one.words[0]) for one in test], len(test)
     words = sorted(set(true))
     found = paper_names(train, test)
-    shares = {kind: float(np.mean([_share(true, names) for names in all_of])) for kind, all_of in found.items()}
+    shares = {
+        kind: float(np.mean([_share(true, names) for names in all_of]))
+        for kind, all_of in found.items()
+    }
     own = [recogniser.name(one.track, one.wall_mm) for one in test]
     shares["default"] = _share(true, own)
     return {
-        "tangent_accuracy": shares["tangent"], "joint_accuracy": shares["joints"],
+        "tangent_accuracy": shares["tangent"],
+        "joint_accuracy": shares["joints"],
         "default_accuracy": shares["default"],
         "accuracy_interval95": {kind: interval95(share * n, n) for kind, share in shares.items()},
-        "accuracy_by_seed": {kind: [_share(true, names) for names in all_of] for kind, all_of in found.items()},
-        "confusion": {
-            "words": words, "tangent": confusion(true, found["tangent"][0], words),
-            "joints": confusion(true, found["joints"][0], words), "default": confusion(true, own, words),
+        "accuracy_by_seed": {
+            kind: [_share(true, names) for names in all_of] for kind, all_of in found.items()
         },
-    }  # fmt: skip
+        "confusion": {
+            "words": words,
+            "tangent": confusion(true, found["tangent"][0], words),
+            "joints": confusion(true, found["joints"][0], words),
+            "default": confusion(true, own, words),
+        },
+    }
 
 
 def _recogniser(
@@ -131,7 +159,9 @@ def _recogniser(
     if model is not None or animal in bundled_action_models():
         return load_action_model(model or animal)
     out = cache_folder() / f"{animal}-actions"
-    return load_action_model(train_actions(out, animal=animal, pose_model=pose_model, progress=progress)[0])
+    return load_action_model(
+        train_actions(out, animal=animal, pose_model=pose_model, progress=progress)[0]
+    )
 
 
 def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
@@ -146,41 +176,68 @@ def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     return found
 
 
-def paper_names(train: Sequence[LabelledTrack], test: Sequence[LabelledTrack]) -> dict[str, list[list[str]]]:
+def paper_names(
+    train: Sequence[LabelledTrack], test: Sequence[LabelledTrack]
+) -> dict[str, list[list[str]]]:
     """Per descriptor, the words that the forests of every seed give the test sequences."""
     from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
 
     words, found = [str(one.words[0]) for one in train], {}
     for kind in DESCRIPTORS:
         rows, asked = (describe(kind, [one.track for one in some]) for some in (train, test))
-        found[kind] = [SequenceForest.learn(kind, rows, words, seed).name(asked) for seed in range(_SEEDS)]
+        found[kind] = [
+            SequenceForest.learn(kind, rows, words, seed).name(asked) for seed in range(_SEEDS)
+        ]
     return found
 
 
 def _timelines(
-    recogniser: TimelineModel, recordings: Sequence[Acted], tracks: Sequence[LabelledTrack], fast: Sequence[Acted],
+    recogniser: TimelineModel,
+    recordings: Sequence[Acted],
+    tracks: Sequence[LabelledTrack],
+    fast: Sequence[Acted],
     rate_hz: float,
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:  # fmt: skip
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Scores on uncut recordings, the two main ones at other frame rates, and what is lost at each."""
     usual = _scores(recogniser, tracks)
-    alike = _scores(recogniser, [one[: int(np.searchsorted(one.track.times_ns, other.seen.times_ns[-1], "right"))]
-                                 for one, other in zip(tracks, fast, strict=True)])  # fmt: skip
-    at = {rate: _scores(recogniser, [one.tracked(rate) for one in recordings])
-          for rate in _SLOWER_HZ if rate < rate_hz}  # fmt: skip
+    alike = _scores(
+        recogniser,
+        [
+            one[: int(np.searchsorted(one.track.times_ns, other.seen.times_ns[-1], "right"))]
+            for one, other in zip(tracks, fast, strict=True)
+        ],
+    )
+    at = {
+        rate: _scores(recogniser, [one.tracked(rate) for one in recordings])
+        for rate in _SLOWER_HZ
+        if rate < rate_hz
+    }
     at[FAST_HZ] = _scores(recogniser, [one.tracked() for one in fast])
-    by_fps = {f"{rate:g}": {name: row[name] for name in _MAIN} for rate, row in sorted({**at, rate_hz: usual}.items())}
-    lost = {f"{rate:g}": {name: (alike if rate == FAST_HZ else usual)[name] - row[name] for name in _MAIN}
-            for rate, row in at.items()}  # fmt: skip
+    by_fps = {
+        f"{rate:g}": {name: row[name] for name in _MAIN}
+        for rate, row in sorted({**at, rate_hz: usual}.items())
+    }
+    lost = {
+        f"{rate:g}": {
+            name: (alike if rate == FAST_HZ else usual)[name] - row[name] for name in _MAIN
+        }
+        for rate, row in at.items()
+    }
     return usual, by_fps, lost
 
 
 def track_error_mm(tracks: Sequence[LabelledTrack]) -> float:
     """Mean distance of the tracked joints from the true ones."""
-    off = [np.linalg.norm(one.track.joints_mm - np.asarray(one.truth), axis=-1)[one.track.observed] for one in tracks]
+    off = [
+        np.linalg.norm(one.track.joints_mm - np.asarray(one.truth), axis=-1)[one.track.observed]
+        for one in tracks
+    ]
     return float(np.concatenate(off).mean())
 
 
-def one_hour(recogniser: TimelineModel, one: LabelledTrack, hour_s: float = 3600.0) -> dict[str, float]:
+def one_hour(
+    recogniser: TimelineModel, one: LabelledTrack, hour_s: float = 3600.0
+) -> dict[str, float]:
     """Seconds for features and recognition of an hour's track: this one, over and over."""
     usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
     n = round(hour_s / usual)
@@ -190,8 +247,12 @@ def one_hour(recogniser: TimelineModel, one: LabelledTrack, hour_s: float = 3600
     recogniser.recognise(one.track, one.wall_mm)  # compiles
     began, worked = time.perf_counter(), time.process_time()
     recogniser.recognise(hour, wall)
-    return {"frames": n, "seconds": time.perf_counter() - began, "core_seconds": time.process_time() - worked,
-            "cores": float(os.cpu_count() or 1)}  # fmt: skip
+    return {
+        "frames": n,
+        "seconds": time.perf_counter() - began,
+        "core_seconds": time.process_time() - worked,
+        "cores": float(os.cpu_count() or 1),
+    }
 
 
 def _minutes(tracks: Sequence[LabelledTrack]) -> float:
@@ -202,20 +263,29 @@ def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[
     from liex_lab.actions.scores import timeline_scores
 
     return timeline_scores(
-        ((one, recogniser.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns)) for one in tracks),
+        (
+            (one, recogniser.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns))
+            for one in tracks
+        ),
         recogniser.words,
     )
 
 
-def speed_only(train: Sequence[LabelledTrack], test: Sequence[LabelledTrack], recogniser: TimelineModel) -> float:
+def speed_only(
+    train: Sequence[LabelledTrack], test: Sequence[LabelledTrack], recogniser: TimelineModel
+) -> float:
     """Macro F1 of a decision tree that knows nothing but the speed of the moment."""
     from sklearn.metrics import f1_score
     from sklearn.tree import DecisionTreeClassifier
 
     (x, y), (asked, true) = (_speeds(some, recogniser.clock_hz) for some in (train, test))
-    tree = DecisionTreeClassifier(max_depth=8, class_weight="balanced", min_samples_leaf=50, random_state=0).fit(x, y)
+    tree = DecisionTreeClassifier(
+        max_depth=8, class_weight="balanced", min_samples_leaf=50, random_state=0
+    ).fit(x, y)
     named = [word for word in recogniser.words if word]
-    return float(f1_score(true, tree.predict(asked), labels=named, average="macro", zero_division=0.0))
+    return float(
+        f1_score(true, tree.predict(asked), labels=named, average="macro", zero_division=0.0)
+    )
 
 
 def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, NDArray[np.str_]]:

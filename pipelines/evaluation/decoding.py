@@ -28,7 +28,12 @@ _N_REPEATS = 5
 _HOUR = 30 * 3600  # frames
 _STEP_NS = 33_333_333
 _SMALL = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
-_ONE_CORE = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_ONE_CORE = (
+    "OMP_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
 _READ = "from liex_lab.pipelines.evaluate_recordings import read_aloud; read_aloud()"
 _PROTOCOL = (
     "rendered pictures of a mouse with a PrimeSense camera's noise ({width} x {height}, {n} frames), written by "
@@ -68,7 +73,11 @@ class _MoseqWriter(RecordingWriter):
 # pictures in a folder are 18,000 files, and the other fifty would be like them.
 _FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] = {
     "mcap_zstd_raw": ("r.mcap", McapDepthWriter, 1),
-    "mcap_zstd_png": ("r.mcap", lambda path, camera: McapDepthWriter(path, camera, packing="png"), 1),
+    "mcap_zstd_png": (
+        "r.mcap",
+        lambda path, camera: McapDepthWriter(path, camera, packing="png"),
+        1,
+    ),
     "png_folder": ("r", PictureFolderWriter, 6),
     "moseq_dat": ("r", _MoseqWriter, 1),
     "oni_16zt": ("r.oni", OniRecordingWriter, 1),
@@ -76,11 +85,19 @@ _FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] 
 
 
 def evaluate_recordings(
-    *, n_frames: int = _N_FRAMES, n_hour: int = _HOUR, n_repeats: int = _N_REPEATS, progress: Progress = silent
+    *,
+    n_frames: int = _N_FRAMES,
+    n_hour: int = _HOUR,
+    n_repeats: int = _N_REPEATS,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Frames per second on one core and peak memory of every format that is written; see the protocol in it."""
     camera, pictures = _rendered(progress)
-    small = np.random.default_rng(7).integers(690, 711, (16, _SMALL.height, _SMALL.width)).astype(np.float32)
+    small = (
+        np.random.default_rng(7)
+        .integers(690, 711, (16, _SMALL.height, _SMALL.width))
+        .astype(np.float32)
+    )
     rate: dict[str, float] = {}
     opening: dict[str, float] = {}
     peak: dict[str, float] = {}
@@ -90,7 +107,11 @@ def evaluate_recordings(
         full = _measure(file, writer, camera, pictures, n_frames, n_repeats)
         short = _measure(file, writer, _SMALL, small, n_frames, 1)
         long = _measure(file, writer, _SMALL, small, n_hour // share, 1)
-        rate[name], opening[name], peak[name] = full["frames_per_s"], full["open_ms_per_frame"], full["peak_mb"]
+        rate[name], opening[name], peak[name] = (
+            full["frames_per_s"],
+            full["open_ms_per_frame"],
+            full["peak_mb"],
+        )
         hour[name] = full["peak_mb"] + max(0.0, long["peak_mb"] - short["peak_mb"]) * share
     return {
         "frames_per_s_1core": rate,
@@ -101,7 +122,7 @@ def evaluate_recordings(
         "protocol": _PROTOCOL.format(
             width=camera.width, height=camera.height, n=n_frames, repeats=n_repeats, hour=n_hour
         ),
-    }  # fmt: skip
+    }
 
 
 def _rendered(progress: Progress) -> tuple[Camera, NDArray[np.float32]]:
@@ -117,9 +138,13 @@ def _rendered(progress: Progress) -> tuple[Camera, NDArray[np.float32]]:
 
 
 def _measure(
-    file: str, writer: Callable[[Path, Camera], RecordingWriter], camera: Camera, pictures: NDArray[np.float32],
-    n_frames: int, n_repeats: int,
-) -> dict[str, float]:  # fmt: skip
+    file: str,
+    writer: Callable[[Path, Camera], RecordingWriter],
+    camera: Camera,
+    pictures: NDArray[np.float32],
+    n_frames: int,
+    n_repeats: int,
+) -> dict[str, float]:
     """Write the pictures over and over up to `n_frames`, and read them in a process of its own."""
     with tempfile.TemporaryDirectory(prefix="liex-") as folder:
         path = Path(folder) / file
@@ -130,7 +155,9 @@ def _measure(
         command = [sys.executable, "-c", _READ, str(path), str(n_repeats)]
         ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if ran.returncode:
-            raise LiexError(f"reading {file} in a process of its own failed ({ran.stderr.strip()[-300:]}); report this")
+            raise LiexError(
+                f"reading {file} in a process of its own failed ({ran.stderr.strip()[-300:]}); report this"
+            )
         numbers: dict[str, float] = json.loads(ran.stdout)
         return numbers
 

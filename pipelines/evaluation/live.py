@@ -28,7 +28,11 @@ _WARM, _WARM_SPEED = 60, 1000.0  # frames followed beforehand, and how many time
 
 
 def evaluate_live(
-    animal: str = "fish", *, n_frames: int = 1500, learn_frames: int = 90, progress: Progress = silent
+    animal: str = "fish",
+    *,
+    n_frames: int = 1500,
+    learn_frames: int = 90,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Latencies over n frames; `liex evaluate live`."""
     filmed = world_of(Skeleton.load(animal)).motion(_SEED, min(_KEPT, n_frames))
@@ -38,11 +42,16 @@ def evaluate_live(
         progress(frame.index + 1, len(filmed), "rendering frames")
     step_ns = int(np.median(np.diff(filmed.times_ns)))
     again = Recording(
-        name=f"live-{animal}", format="synthetic", camera=filmed.camera,
-        times_ns=step_ns * np.arange(n_frames, dtype=np.int64), read=lambda index: kept[_to_and_fro(index, len(kept))],
-    )  # fmt: skip
+        name=f"live-{animal}",
+        format="synthetic",
+        camera=filmed.camera,
+        times_ns=step_ns * np.arange(n_frames, dtype=np.int64),
+        read=lambda index: kept[_to_and_fro(index, len(kept))],
+    )
     plan = plan_of(animal)
-    follow_live(replayed(again[: learn_frames + _WARM], _WARM_SPEED), plan, learn_frames=learn_frames)
+    follow_live(
+        replayed(again[: learn_frames + _WARM], _WARM_SPEED), plan, learn_frames=learn_frames
+    )
     numbers, _ = follow_live(replayed(again), plan, learn_frames=learn_frames, progress=progress)
     return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers, "protocol": LIVE_PROTOCOL}
 

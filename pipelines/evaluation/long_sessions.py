@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 FPS = 30
 _SHORT = "synthetic:walk?seed=5&frames=300&sensor=primesense-qvga"
-_COARSER = 8  # the pictures that are written: they go straight to disk, so their size does not matter here
+_COARSER = (
+    8  # the pictures that are written: they go straight to disk, so their size does not matter here
+)
 _CHUNK = 256  # frames
 
 Stage = Callable[[str], None]
@@ -39,15 +41,21 @@ def looped(short: Recording, n_frames: int) -> Recording:
     depth = [short.frame(row).depth for row in range(len(short))]
     there = _to_and_fro(len(depth), n_frames)
     long = Recording(
-        name="long", format="synthetic", camera=short.camera, times_ns=_times(n_frames),
+        name="long",
+        format="synthetic",
+        camera=short.camera,
+        times_ns=_times(n_frames),
         read=lambda row: depth[there[row]],
-    )  # fmt: skip
+    )
     long.take_digest("0" * 64)
     return long
 
 
 def write_long(
-    minutes: float, out: str | Path, report: ReportMaker | None = None, told: Stage = lambda what: None
+    minutes: float,
+    out: str | Path,
+    report: ReportMaker | None = None,
+    told: Stage = lambda what: None,
 ) -> dict[str, Any]:
     """A session of so many minutes from the frames of a short recording, over and over; returns its cost.
 
@@ -62,7 +70,9 @@ def write_long(
     give_back()
     told("began")
     began = time.perf_counter()
-    with SessionWriter(Path(out) / "long.liex", replace(short.origin, n_frames=n), report=report) as writer:
+    with SessionWriter(
+        Path(out) / "long.liex", replace(short.origin, n_frames=n), report=report
+    ) as writer:
         for frames, part in _parts(short, n):
             writer.add(frames, seen=part)
         told("written")
@@ -109,7 +119,9 @@ def _parts(short: _Short, n: int) -> Iterator[tuple[list[DepthFrame], Observatio
     for start in range(0, n, _CHUNK):
         rows, times = there[start : start + _CHUNK], times_ns[start : start + _CHUNK]
         columns = {name: getattr(short.seen, name)[rows] for name in COLUMNS} | {"times_ns": times}
-        frames = [DepthFrame(start + k, int(times[k]), short.depth[row]) for k, row in enumerate(rows)]
+        frames = [
+            DepthFrame(start + k, int(times[k]), short.depth[row]) for k, row in enumerate(rows)
+        ]
         yield frames, Observations(short.seen.skeleton, **columns)
 
 

@@ -20,7 +20,9 @@ _PUBLISHED = {
 }
 
 
-def evaluate_nyu(reference: str | Path, *, model: str | None = None, progress: Progress = silent) -> dict[str, Any]:
+def evaluate_nyu(
+    reference: str | Path, *, model: str | None = None, progress: Progress = silent
+) -> dict[str, Any]:
     """Errors by the NYU protocol, with both root protocols, of the published answers in a folder and of our own on the
     frames that lie there.
 
@@ -32,10 +34,17 @@ def evaluate_nyu(reference: str | Path, *, model: str | None = None, progress: P
 
     folder = Path(reference)
     labels = NyuReference.load(folder)
-    rows = {name: {"method": _PUBLISHED.get(name, name), **nyu_errors(points, labels.truth)}
-            for name, points in labels.answers.items()}  # fmt: skip
-    return {"reference": str(folder), "n_labelled": len(labels.truth), "published": rows,
-            "ours": _ours(folder, labels.truth, model, progress), "protocol": NYU_PROTOCOL}  # fmt: skip
+    rows = {
+        name: {"method": _PUBLISHED.get(name, name), **nyu_errors(points, labels.truth)}
+        for name, points in labels.answers.items()
+    }
+    return {
+        "reference": str(folder),
+        "n_labelled": len(labels.truth),
+        "published": rows,
+        "ours": _ours(folder, labels.truth, model, progress),
+        "protocol": NYU_PROTOCOL,
+    }
 
 
 def in_short(result: dict[str, Any]) -> dict[str, str]:
@@ -80,7 +89,9 @@ def _ours(folder: Path, truth: np.ndarray, model: str | None, progress: Progress
         return {"n_frames": 0, "note": str(error)}
     points = np.full((len(numbers), *truth.shape[1:]), np.nan)
     with build_recording(folder, plan) as recording:
-        scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+        scene, sample = build_scene(
+            recording, plan, estimator.skeleton, plan.foreground.n_background_frames
+        )
         size = estimator.find_size(sample, scene)
         weights = points_of_joints(estimator.skeleton)
         for frames in recording.chunks(_CHUNK):
@@ -88,5 +99,8 @@ def _ours(folder: Path, truth: np.ndarray, model: str | None, progress: Progress
             joints = estimator.estimate(depths, scene, size).chosen.pose.joints(estimator.skeleton)
             points[[frame.index for frame in frames]] = weights @ joints
             progress(frames[-1].index + 1, len(recording), "measuring hands")
-    return {"method": "liex_lab, default", "spine_mm": size * estimator.skeleton.length,
-            **nyu_errors(points, truth[numbers - 1])}  # fmt: skip
+    return {
+        "method": "liex_lab, default",
+        "spine_mm": size * estimator.skeleton.length,
+        **nyu_errors(points, truth[numbers - 1]),
+    }

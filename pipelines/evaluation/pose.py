@@ -80,29 +80,42 @@ def measure(
     if isinstance(found, Guesses):
         return found.joints, np.full(len(frames), np.nan), np.full(2, np.nan)
     calibration = cast("PoseEstimator", subject).model.calibration
-    return found.chosen.pose.joints(subject.skeleton), found.chosen.error_mm, np.array(calibration.quantiles)
+    return (
+        found.chosen.pose.joints(subject.skeleton),
+        found.chosen.error_mm,
+        np.array(calibration.quantiles),
+    )
 
 
 def errors_of(
-    subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording], plan: Plan,
+    subjects: Mapping[str, PoseEstimator | Baseline],
+    sessions: Sequence[TrueRecording],
+    plan: Plan,
     progress: Progress,
-) -> dict[str, PoseErrors]:  # fmt: skip
+) -> dict[str, PoseErrors]:
     """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
     from ..build import build_scene
 
     parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
-        scene, frames = build_scene(recording, plan, next(iter(subjects.values())).skeleton, len(recording))
+        scene, frames = build_scene(
+            recording, plan, next(iter(subjects.values())).skeleton, len(recording)
+        )
         for name, subject in subjects.items():
             joints, predicted_mm, quantiles = measure(subject, frames, scene)
             tip = subject.skeleton.tip
-            parts[name].append(PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles))
+            parts[name].append(
+                PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles)
+            )
     return {name: PoseErrors.join(some) for name, some in parts.items()}
 
 
 def pose_errors(
-    subject: PoseEstimator | Baseline, sessions: Sequence[TrueRecording], plan: Plan, progress: Progress
+    subject: PoseEstimator | Baseline,
+    sessions: Sequence[TrueRecording],
+    plan: Plan,
+    progress: Progress,
 ) -> PoseErrors:
     """`errors_of` one subject."""
     return errors_of({"": subject}, sessions, plan, progress)[""]
@@ -129,8 +142,14 @@ def evaluate_pose(
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
     errors = pose_errors(subject, sessions, plan_of(animal), progress)
     how = f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, {world.protocol}"
-    return {"animal": animal, "split": split, "variant": variant, "n_frames": len(errors.error_mm),
-            **errors.summary(), "protocol": how + POSE_PROTOCOL}  # fmt: skip
+    return {
+        "animal": animal,
+        "split": split,
+        "variant": variant,
+        "n_frames": len(errors.error_mm),
+        **errors.summary(),
+        "protocol": how + POSE_PROTOCOL,
+    }
 
 
 def sizes_of(animal: str) -> tuple[float, ...]:
@@ -153,12 +172,19 @@ def evaluate_sizes(
     """Mean joint error in per cent of the spine for animals of several sizes, the size estimated and not given."""
     rows = {}
     for spine in spines_mm or sizes_of(animal):
-        result = evaluate_pose(animal, "clean", "default", n_frames=n_frames, spine_mm=spine, progress=progress)
+        result = evaluate_pose(
+            animal, "clean", "default", n_frames=n_frames, spine_mm=spine, progress=progress
+        )
         rows[f"{spine:g}"] = 100.0 * result["mean_joint_error_mm"] / spine
     best = min(rows.values())
-    return {"animal": animal, "n_frames": result["n_frames"], "error_percent_of_spine": rows,
-            "ratio_to_best": {name: value / best for name, value in rows.items()},
-            "worst_ratio": max(rows.values()) / best, "protocol": result["protocol"]}  # fmt: skip
+    return {
+        "animal": animal,
+        "n_frames": result["n_frames"],
+        "error_percent_of_spine": rows,
+        "ratio_to_best": {name: value / best for name, value in rows.items()},
+        "worst_ratio": max(rows.values()) / best,
+        "protocol": result["protocol"],
+    }
 
 
 def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:
@@ -176,14 +202,19 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
     try:
         table = pd.read_csv(reference)
     except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise LiexError(f"{reference} should be a table with one row a frame, as CSV, but: {error}") from None
+        raise LiexError(
+            f"{reference} should be a table with one row a frame, as CSV, but: {error}"
+        ) from None
     needed = {"frame", "centroid_x_px", "centroid_y_px", "angle_rad"}
     if not needed <= set(table.columns):
-        raise LiexError(f"{reference} should have the columns {', '.join(sorted(needed))}; it lacks some of them")
+        raise LiexError(
+            f"{reference} should have the columns {', '.join(sorted(needed))}; it lacks some of them"
+        )
     poses, frames = opened.poses, opened.frames
     names = opened.metadata["animal"]["joints"]
     u, v = (
-        poses.pivot(index="frame_index", columns="joint", values=name)[names].to_numpy() for name in ("u_px", "v_px")
+        poses.pivot(index="frame_index", columns="joint", values=name)[names].to_numpy()
+        for name in ("u_px", "v_px")
     )
     rows = table["frame"].to_numpy(int)
     used = (rows >= 0) & (rows < len(u))
@@ -191,7 +222,9 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
         used &= table["reliable"].to_numpy() == 1
     table, rows = table[used], rows[used]
     if not len(rows):
-        raise LiexError(f"{reference} has no reliable row for any frame of {session}; its column frame counts from 0")
+        raise LiexError(
+            f"{reference} has no reliable row for any frame of {session}; its column frame counts from 0"
+        )
     camera = opened.metadata["camera"]
     mm_per_px = camera["floor_distance_mm"] / np.sqrt(camera["fx"] * camera["fy"])
     known = table[["centroid_x_px", "centroid_y_px"]].to_numpy()
@@ -206,7 +239,9 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
         "n_frames": len(frames),
         "n_compared": int(len(rows)),
         "n_lost": int((~np.isfinite(u[:, 0])).sum()),
-        "n_lost_without_flag": int((~np.isfinite(u[:, 0]) & (frames["flag"].to_numpy() == "")).sum()),
+        "n_lost_without_flag": int(
+            (~np.isfinite(u[:, 0]) & (frames["flag"].to_numpy() == "")).sum()
+        ),
         "spine_mm": opened.metadata["animal"].get("spine_mm"),
         "centroid_median_px": off,
         "centroid_median_mm": off * mm_per_px,

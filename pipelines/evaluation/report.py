@@ -33,7 +33,9 @@ print(json.dumps({"code": code, "seconds": time.perf_counter() - began, "peak_me
 """
 
 
-def evaluate_report(session: str | Path, minutes: float = 60.0, *, progress: Progress = silent) -> dict[str, Any]:
+def evaluate_report(
+    session: str | Path, minutes: float = 60.0, *, progress: Progress = silent
+) -> dict[str, Any]:
     """Time and peak memory of `liex report` on a session that repeats this one until it is `minutes` long.
 
     Every table is made from the repeated track, as a run of that length would; the report is written by a process of
@@ -46,15 +48,25 @@ def evaluate_report(session: str | Path, minutes: float = 60.0, *, progress: Pro
         folder = Path(scratch) / "long.liex"
         n_frames, seconds = repeat_session(Session.open(session, raw=True), folder, 60.0 * minutes)
         progress(0, None, "writing its report")
-        ran = subprocess.run([sys.executable, "-c", _MEASURE, str(folder)], capture_output=True, text=True, check=False)
+        ran = subprocess.run(
+            [sys.executable, "-c", _MEASURE, str(folder)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if ran.returncode or json.loads(ran.stdout)["code"]:
-            raise SessionError(f"the report of the long session could not be written: {ran.stderr.strip()[-500:]}")
+            raise SessionError(
+                f"the report of the long session could not be written: {ran.stderr.strip()[-500:]}"
+            )
         found = json.loads(ran.stdout)
         size = (folder / "report.html").stat().st_size
     return {
-        "frames": n_frames, "minutes": round(seconds / 60.0, 2), "seconds": round(found["seconds"], 2),
-        "peak_memory_mb": round(found["peak_memory_mb"], 1), "report_mb": round(size / 1e6, 2),
-    }  # fmt: skip
+        "frames": n_frames,
+        "minutes": round(seconds / 60.0, 2),
+        "seconds": round(found["seconds"], 2),
+        "peak_memory_mb": round(found["peak_memory_mb"], 1),
+        "report_mb": round(size / 1e6, 2),
+    }
 
 
 def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int, float]:
@@ -72,10 +84,20 @@ def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int,
     n_rounds = max(1, int(np.ceil(seconds * 1e9 / round_ns)))
     track = _repeated(track_of(session), n_rounds, round_ns)
     origin = provenance_of(session, track.skeleton)
-    rows = Rows(track, np.arange(track.n_frames), origin.name, origin.individual, (), origin.arena, origin.zones)
+    rows = Rows(
+        track,
+        np.arange(track.n_frames),
+        origin.name,
+        origin.individual,
+        (),
+        origin.arena,
+        origin.zones,
+    )
     results, (rules, around) = Results(origin, rows), stated_by(session)
     bouts = _repeated_bouts(session.bouts, n_rounds, round_ns * 1e-9, len(time_s))
-    behaviour = measure_rows(rows, rules, around, bouts=bouts, actions=session.metadata.get("actions") or {})
+    behaviour = measure_rows(
+        rows, rules, around, bouts=bouts, actions=session.metadata.get("actions") or {}
+    )
     folder.mkdir()
     results.write_track(folder)
     results.write_measured(folder, behaviour.tables, behaviour.vocabulary.columns)
@@ -96,11 +118,15 @@ def _repeated(track: Track, n_rounds: int, round_ns: int) -> Track:
             continue
         values = getattr(track, column.name)
         columns.append(np.concatenate([values] * n_rounds))
-    columns[0] = columns[0] + np.repeat(np.arange(n_rounds, dtype=np.int64) * round_ns, track.n_frames)
+    columns[0] = columns[0] + np.repeat(
+        np.arange(n_rounds, dtype=np.int64) * round_ns, track.n_frames
+    )
     return type(track)(track.skeleton, *columns)
 
 
-def _repeated_bouts(bouts: pd.DataFrame, n_rounds: int, round_s: float, n_frames: int) -> pd.DataFrame:
+def _repeated_bouts(
+    bouts: pd.DataFrame, n_rounds: int, round_s: float, n_frames: int
+) -> pd.DataFrame:
     """The bouts of every round."""
     import pandas as pd
 

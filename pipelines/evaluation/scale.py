@@ -29,7 +29,11 @@ from .long_sessions import looped
 RunSession = Callable[..., Path]
 _VIRTUAL = "synthetic:walk?seed={seed}&frames=150&sensor=primesense"
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
-_CREWS = {"1": (1, 1), "2": (2, 2), "1, free": (1, 2)}  # name -> processes, and the cores of all of them
+_CREWS = {
+    "1": (1, 1),
+    "2": (2, 2),
+    "1, free": (1, 2),
+}  # name -> processes, and the cores of all of them
 _N_SIMULATED = 2000  # sessions
 _FPS = 30
 ASSUMPTIONS = (
@@ -52,7 +56,10 @@ DEFINITIONS = {
 
 
 def evaluate_scale(
-    run: RunSession, n_frames: int = 3000, minutes: tuple[float, ...] = (1.0, 10.0), progress: Progress = silent
+    run: RunSession,
+    n_frames: int = 3000,
+    minutes: tuple[float, ...] = (1.0, 10.0),
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure one session's stages, two workers against one, memory by length, and simulate many workers.
 
@@ -76,10 +83,15 @@ def evaluate_scale(
     hour = [seconds * 3600 * _FPS / n_frames for seconds in workers["seconds_each"]]
     simulated = simulate(hour, workers["scheduler_s_per_session"])
     return {
-        **stages, **looking, **workers["study"],
-        "memory_mb_by_length": memory, "simulated_sessions_per_hour": simulated, "assumptions": ASSUMPTIONS,
-        "definitions": DEFINITIONS, "n_frames": n_frames,
-    }  # fmt: skip
+        **stages,
+        **looking,
+        **workers["study"],
+        "memory_mb_by_length": memory,
+        "simulated_sessions_per_hour": simulated,
+        "assumptions": ASSUMPTIONS,
+        "definitions": DEFINITIONS,
+        "n_frames": n_frames,
+    }
 
 
 def _recording(folder: Path, seed: int, n_frames: int) -> Path:
@@ -108,16 +120,19 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
     bound = _decode_and_write(session, recording, plan, folder / "bound.liex")
     whole = spent["prepare"] + spent["total"]  # beginning to look, and everything after it
     return {
-        "frames_per_s": n / whole, "frames_per_s_once_begun": n / spent["total"], "prepare_s": spent["prepare"],
+        "frames_per_s": n / whole,
+        "frames_per_s_once_begun": n / spent["total"],
+        "prepare_s": spent["prepare"],
         "ms_per_frame": {
-            name: 1e3 * value / n for name, value in {**bound, **spent}.items()
+            name: 1e3 * value / n
+            for name, value in {**bound, **spent}.items()
             if name not in ("opening", "bound", "prepare")
         },
         "times_decode_and_write": whole / (bound["opening"] + bound["bound"]),
         "times_decode_and_write_without_opening": whole / bound["bound"],
         "times_decode_and_write_once_begun": spent["total"] / bound["bound"],
         "peak_memory_mb": session.metadata["peak_memory_mb"],
-    }  # fmt: skip
+    }
 
 
 class _Timed:
@@ -130,7 +145,9 @@ class _Timed:
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """See `Crew`."""
         for done in self._crew.each(do, works):
-            self.came.append((time.perf_counter(), done.stop - done.start if isinstance(done, Stretch) else 0))
+            self.came.append(
+                (time.perf_counter(), done.stop - done.start if isinstance(done, Stretch) else 0)
+            )
             yield done
 
 
@@ -141,15 +158,26 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
     plan, found = Plan.load("mouse"), {}
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
-        whole = Stretch(str(recording), plan, tracker, build_provenance(opened, plan, tracker), folder, 0, len(opened))
+        whole = Stretch(
+            str(recording),
+            plan,
+            tracker,
+            build_provenance(opened, plan, tracker),
+            folder,
+            0,
+            len(opened),
+        )
     for name, (count, n_cores) in _CREWS.items():
         crew = _Timed(Processes(count, threads=1))
         with _on_cores(n_cores):
             look_side_by_side(crew, whole, folder / f"stretches {name}.liex", silent)
         (begun, _), later = crew.came[count - 1], crew.came[count:]
         found[name] = sum(n for _, n in later) / (later[-1][0] - begun)
-    return {"looking_frames_per_s": found, "looking_two_processes_over_one": found["2"] / found["1"],
-            "looking_two_processes_over_one_free": found["2"] / found["1, free"]}  # fmt: skip
+    return {
+        "looking_frames_per_s": found,
+        "looking_two_processes_over_one": found["2"] / found["1"],
+        "looking_two_processes_over_one_free": found["2"] / found["1, free"],
+    }
 
 
 @contextmanager
@@ -184,12 +212,25 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
         from liex_lab.recordings.rvl import to_millimetres
 
         place.mkdir()
-        origin = Provenance("bound", Skeleton.load("mouse"), opened.camera, session.T_arena_camera, 1000.0, "0",
-                            n_frames=len(opened))  # fmt: skip
-        replay, messages = ReplayWriter(place / "session.rrd", origin), McapWriter(place / "session.mcap", origin)
+        origin = Provenance(
+            "bound",
+            Skeleton.load("mouse"),
+            opened.camera,
+            session.T_arena_camera,
+            1000.0,
+            "0",
+            n_frames=len(opened),
+        )
+        replay, messages = (
+            ReplayWriter(place / "session.rrd", origin),
+            McapWriter(place / "session.mcap", origin),
+        )
         began = time.perf_counter()
         for frames in opened.chunks(CHUNK):
-            depth, times = [to_millimetres(frame.depth) for frame in frames], [frame.time_ns for frame in frames]
+            depth, times = (
+                [to_millimetres(frame.depth) for frame in frames],
+                [frame.time_ns for frame in frames],
+            )
             replay.add([frame.index for frame in frames], times, depth)
             messages.add(times, depth)
         replay.flushed()
@@ -205,9 +246,12 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
 
     table = {
         "animals": [{"id": path.stem} for path in recordings],
-        "sessions": [{"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
-                     for path in recordings for k in range(2)],
-    }  # fmt: skip
+        "sessions": [
+            {"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
+            for path in recordings
+            for k in range(2)
+        ],
+    }
     wall: dict[str, float] = {}
     each: dict[str, list[float]] = {}
     for k, (name, (count, n_cores)) in enumerate(_CREWS.items()):
@@ -221,10 +265,12 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
     n = len(table["sessions"])
     study_told = {
         "sessions_per_hour": {name: 3600 * n / seconds for name, seconds in wall.items()},
-        "two_workers_over_one": wall["1"] / wall["2"], "two_workers_over_one_free": wall["1, free"] / wall["2"],
-    }  # fmt: skip
+        "two_workers_over_one": wall["1"] / wall["2"],
+        "two_workers_over_one_free": wall["1, free"] / wall["2"],
+    }
     return {
-        "study": study_told, "seconds_each": each["1"],
+        "study": study_told,
+        "seconds_each": each["1"],
         "scheduler_s_per_session": max(wall["1"] - sum(each["1"]), 0.0) / n,
     }
 
@@ -260,6 +306,8 @@ def _memory(minutes: float, folder: Path) -> float:
     """Peak memory, MB, of a process that tracks and writes so many minutes of 30 frames a second."""
     done = subprocess.run(
         [sys.executable, "-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return float(json.loads(done.stdout.splitlines()[-1])["peak_memory_mb"])

@@ -73,7 +73,9 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         progress(2, 5, "timing the others")
         ratios = {name: two / _frames_per_s(rival, footage, True) for name, rival in rivals.items()}
         paper = cast("PoseEstimator", rivals["paper"])
-        ratios["paper_one_by_one"] = two * best_seconds(partial(_one_by_one, paper, footage)) / N_FRAMES
+        ratios["paper_one_by_one"] = (
+            two * best_seconds(partial(_one_by_one, paper, footage)) / N_FRAMES
+        )
         progress(3, 5, "timing the stages")
         stages = _stages(default, footage)
         progress(4, 5, "timing what makes a frame dearer")
@@ -105,10 +107,14 @@ def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
     from ..build import build_scene, plan_of
 
     sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
-    recording = max(sessions, key=lambda session: session.width)  # of the sensors, the one with the most pixels
+    recording = max(
+        sessions, key=lambda session: session.width
+    )  # of the sensors, the one with the most pixels
     plan = plan_of(animal)
     scene, sample = build_scene(recording, plan, estimator.skeleton, 96)
-    frames = recording.depths(0, min(len(recording), N_FRAMES))  # whole ones, which those of the sample need not be
+    frames = recording.depths(
+        0, min(len(recording), N_FRAMES)
+    )  # whole ones, which those of the sample need not be
     frames = frames[np.arange(N_FRAMES) % len(frames)]
     return _Footage(recording.name, frames, scene, estimator.find_size(sample, scene))
 
@@ -145,12 +151,23 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
     images = ImageSet(crops.heights, footage.scene.looks(crops, method.camera_view), crops.moments)
     n, k = len(crops.heights), method.n_candidates
     rotation, position, scale = start_poses(
-        crops.moments, draw_starts(np.random.default_rng(0), 1, k), np.ones((n, k)), skeleton.length,
-        base_at_front(skeleton), method.axis_start, method.camera_view, method.home_turn,
-    )  # fmt: skip
+        crops.moments,
+        draw_starts(np.random.default_rng(0), 1, k),
+        np.ones((n, k)),
+        skeleton.length,
+        base_at_front(skeleton),
+        method.axis_start,
+        method.camera_view,
+        method.home_turn,
+    )
     image = np.repeat(np.arange(n, dtype=np.int32), k)
     poses = Candidates.start(
-        skeleton, image, rotation.reshape(-1, 3, 3), position.reshape(-1, 3), scale.ravel(), np.ones(n * k)
+        skeleton,
+        image,
+        rotation.reshape(-1, 3, 3),
+        position.reshape(-1, 3),
+        scale.ravel(),
+        np.ones(n * k),
     )
     for _ in cascade.steps(images, poses):
         pass
@@ -172,10 +189,12 @@ def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
     rotations, positions, _, scores = default.candidates(crops, looks, size)
     images = ImageSet(crops.heights, looks, crops.moments)
     return {
-        "foreground": _ms(lambda: scene.extract(frames, size, False, default.model.method.camera_view)),
+        "foreground": _ms(
+            lambda: scene.extract(frames, size, False, default.model.method.camera_view)
+        ),
         "candidates": _ms(lambda: default.candidates(crops, looks, size, False)),
         "choice": _ms(lambda: default.pick(images, size, rotations, positions, scores, False)),
-    }  # fmt: skip
+    }
 
 
 def _costs(default: PoseEstimator, footage: _Footage) -> dict[str, dict[str, float]]:
@@ -191,8 +210,13 @@ def _costs(default: PoseEstimator, footage: _Footage) -> dict[str, dict[str, flo
     joints = sorted({1, (n_joints + 1) // 2, n_joints})
     return {
         "joints": {str(n): candidates(replace(default, n_joints=n)) for n in joints},
-        "candidates": {str(n): candidates(replace(default, n_candidates=n, unpruned=True)) for n in _CANDIDATES},
-        "pixels": {f"{f.scene.camera.width} x {f.scene.camera.height}": _ms(partial(_cut, f)) for f in _sizes(footage)},
+        "candidates": {
+            str(n): candidates(replace(default, n_candidates=n, unpruned=True)) for n in _CANDIDATES
+        },
+        "pixels": {
+            f"{f.scene.camera.width} x {f.scene.camera.height}": _ms(partial(_cut, f))
+            for f in _sizes(footage)
+        },
     }
 
 

@@ -41,14 +41,19 @@ class StudyPlan:
         treated = np.arange(n_animals) % 2 == 1 if self.within else cage >= self.n_cages
         sd = np.hypot(self.sd_cage, self.sd_animal)
         mean = rng.normal(0, self.sd_cage, (n_cages, n_studies))[cage]
-        mean += rng.normal(0, self.sd_animal, (n_animals, n_studies)) + self.effect * sd * treated[:, None]
+        mean += (
+            rng.normal(0, self.sd_animal, (n_animals, n_studies))
+            + self.effect * sd * treated[:, None]
+        )
         animal = np.repeat(np.arange(n_animals), self.n_sessions)
         values = mean[animal] + rng.normal(0, self.sd_session, (len(animal), n_studies))
-        who = pd.DataFrame({
-            "subject_id": [f"m{k:03d}" for k in animal],
-            "cage": [f"c{k:02d}" if self.caged else "" for k in cage[animal]],
-            "group": np.where(treated[animal], "treated", "control"),
-        })  # fmt: skip
+        who = pd.DataFrame(
+            {
+                "subject_id": [f"m{k:03d}" for k in animal],
+                "cage": [f"c{k:02d}" if self.caged else "" for k in cage[animal]],
+                "group": np.where(treated[animal], "treated", "control"),
+            }
+        )
         return who.join(pd.DataFrame(values, columns=[f"study_{k}" for k in range(n_studies)]))
 
 
@@ -70,11 +75,19 @@ def evaluate_statistics(
     effect: in standard deviations between animals. Beside it what a t test would do that takes every session for a
     unit; the interval's coverage of the true difference; and how often the mixed model was used.
     """
-    found: dict[str, Any] = {"alpha": ALPHA, "n_studies": n_studies, "effect_size": effect, "seed": seed}
+    found: dict[str, Any] = {
+        "alpha": ALPHA,
+        "n_studies": n_studies,
+        "effect_size": effect,
+        "seed": seed,
+    }
     for k, plan in enumerate(PLANS):
         progress(k, len(PLANS), plan.name)
         rng = np.random.default_rng([seed, k])
-        found[plan.name] = {**error_rates(plan, n_studies, rng), "power": power(plan, effect, n_studies // 4 + 1, rng)}
+        found[plan.name] = {
+            **error_rates(plan, n_studies, rng),
+            "power": power(plan, effect, n_studies // 4 + 1, rng),
+        }
     return found
 
 
@@ -86,7 +99,10 @@ def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> di
     for n in _portions(n_studies):
         studies = plan.draw(rng, n)
         tests.append(_compared(studies, rng))
-        values, treated = studies.filter(like="study_").to_numpy(), (studies["group"] == "treated").to_numpy()
+        values, treated = (
+            studies.filter(like="study_").to_numpy(),
+            (studies["group"] == "treated").to_numpy(),
+        )
         naive.append(ttest_ind(values[treated], values[~treated]).pvalue <= ALPHA)
     table = pd.concat(tests)
     return {
@@ -100,7 +116,9 @@ def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> di
 def power(plan: StudyPlan, effect: float, n_studies: int, rng: np.random.Generator) -> float:
     """Share of studies with this effect in which it is found."""
     real = replace(plan, effect=effect)
-    return _share(pd.concat([_compared(real.draw(rng, n), rng) for n in _portions(n_studies)])["p"] <= ALPHA)
+    return _share(
+        pd.concat([_compared(real.draw(rng, n), rng) for n in _portions(n_studies)])["p"] <= ALPHA
+    )
 
 
 def _compared(studies: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:

@@ -70,25 +70,41 @@ def evaluate_tracking(
         measured.append(follow_sequence(recording, estimator, plan, rows, progress))
     events = [m.sequence.events for m in measured]
     length = float(np.mean([m.sequence.spine_mm for m in measured]))
-    table = {name: figures([m.rows[name] for m in measured], [m.rows["single"] for m in measured], events, length)
-             for name in measured[0].rows if name in rows}  # fmt: skip
+    table = {
+        name: figures(
+            [m.rows[name] for m in measured], [m.rows["single"] for m in measured], events, length
+        )
+        for name in measured[0].rows
+        if name in rows
+    }
     result = {
-        "animal": animal, "sequence": sequence, "n_frames": sum(len(m.sequence) for m in measured), "rows": table,
-        "speed": measured[0].speed, "online_lag_frames": ONLINE_LAG, "protocol": TRACKING_PROTOCOL,
-    }  # fmt: skip
+        "animal": animal,
+        "sequence": sequence,
+        "n_frames": sum(len(m.sequence) for m in measured),
+        "rows": table,
+        "speed": measured[0].speed,
+        "online_lag_frames": ONLINE_LAG,
+        "protocol": TRACKING_PROTOCOL,
+    }
     if draw is not None:
         draw(measured[0].sequence, measured[0].rows)
     return result
 
 
 def follow_sequence(
-    recording: TestSequence, estimator: PoseEstimator, plan: Plan, rows: Sequence[str], progress: Progress = silent
+    recording: TestSequence,
+    estimator: PoseEstimator,
+    plan: Plan,
+    rows: Sequence[str],
+    progress: Progress = silent,
 ) -> Measured:
     """Every row's way through a sequence; scene, size and animal are found by the product, nothing is handed over."""
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.tracker import FrameTracker
 
-    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+    scene, sample = build_scene(
+        recording, plan, estimator.skeleton, plan.foreground.n_background_frames
+    )
     tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
     parts: list[Observations] = []
     seconds = dict.fromkeys(("single", "observe", "algorithm3"), 0.0)
@@ -110,7 +126,9 @@ def follow_sequence(
     T = recording.T_arena_camera @ scene.floor.T_arena_camera.inverse()
 
     def put(name: str, track: Track, spent: float) -> None:
-        found[name] = Followed(T @ track.joints_mm, recording.joints_arena, track.sd_mm, n / spent, tip)
+        found[name] = Followed(
+            T @ track.joints_mm, recording.joints_arena, track.sd_mm, n / spent, tip
+        )
 
     began = time.perf_counter()
     single = tracker.follow_again(seen)
@@ -127,10 +145,17 @@ def follow_sequence(
         progress(0, n, f"Algorithm 3 on {recording.name}")
         began = time.perf_counter()
         joints, sd = _algorithm3(tracker, recording, plan.seed)
-        found["algorithm3"] = Followed(recording.T_arena_camera @ joints, recording.joints_arena, sd,
-                                       n / (time.perf_counter() - began), tip)  # fmt: skip
+        found["algorithm3"] = Followed(
+            recording.T_arena_camera @ joints,
+            recording.joints_arena,
+            sd,
+            n / (time.perf_counter() - began),
+            tip,
+        )
     progress(0, n, "timing the tracker")
-    return Measured(recording, {name: found[name] for name in ROWS if name in found}, _speed(tracker, recording))
+    return Measured(
+        recording, {name: found[name] for name in ROWS if name in found}, _speed(tracker, recording)
+    )
 
 
 def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
@@ -169,7 +194,9 @@ def _algorithm3(tracker: FrameTracker, recording: TestSequence, seed: int) -> tu
     from liex_lab.tracking.particles import ParticleFilter
 
     skeleton = tracker.estimator.skeleton
-    filter = ParticleFilter(tracker.estimator, tracker.scene, tracker.size, np.random.default_rng(seed))
+    filter = ParticleFilter(
+        tracker.estimator, tracker.scene, tracker.size, np.random.default_rng(seed)
+    )
     joints = np.full((len(recording), skeleton.n_joints, 3), np.nan)
     sd = np.full(joints.shape[:2], np.nan)
     share = np.array(tracker.subject.joint_share) / np.sqrt(3.0)

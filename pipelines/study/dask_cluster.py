@@ -32,7 +32,9 @@ TOPIC = "liex-progress"
 _DEATHS = 3  # of workers, before a session is held to be what kills them
 _TOLD_EVERY_S = 0.5
 
-Told = Callable[[str, int, int | None, str], None]  # session, pieces done, pieces in all, what is being done
+Told = Callable[
+    [str, int, int | None, str], None
+]  # session, pieces done, pieces in all, what is being done
 Finished = Callable[[dict[str, Any]], None]  # what `measure_one` returns
 
 
@@ -69,16 +71,30 @@ def n_shared(n: int, n_workers: int) -> int:
 
 
 def _results(
-    client: Client, planned: dict[str, PlannedSession], run: RunSession, finished: Finished, shared: int
+    client: Client,
+    planned: dict[str, PlannedSession],
+    run: RunSession,
+    finished: Finished,
+    shared: int,
 ) -> Iterator[dict[str, Any]]:
     from distributed import as_completed
 
     run_id = f"{os.getpid()}-{time.monotonic_ns()}"
     submitted = [
-        client.submit(_on_worker, session, run, run_id, k >= len(planned) - shared, key=f"{id}-{run_id}", pure=False)
+        client.submit(
+            _on_worker,
+            session,
+            run,
+            run_id,
+            k >= len(planned) - shared,
+            key=f"{id}-{run_id}",
+            pure=False,
+        )
         for k, (id, session) in enumerate(planned.items())
     ]
-    sessions = {future.key: session for future, session in zip(submitted, planned.values(), strict=True)}
+    sessions = {
+        future.key: session for future, session in zip(submitted, planned.values(), strict=True)
+    }
     completed = as_completed(submitted, loop=client.loop)
     del submitted
     for future in completed:
@@ -102,7 +118,9 @@ def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
     return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
 
 
-def _on_worker(session: PlannedSession, run: RunSession, run_id: str, shared: bool) -> dict[str, Any]:
+def _on_worker(
+    session: PlannedSession, run: RunSession, run_id: str, shared: bool
+) -> dict[str, Any]:
     """The task: one session, its progress sent to whoever started the study. shared: by all workers."""
     from distributed import get_worker
 
@@ -141,10 +159,15 @@ def _client(
     from distributed import Client
 
     # one session at a worker at a time: what waits there is held to have killed it, too
-    settings = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.scheduler.worker-saturation": 1.0,
-                "distributed.logging.distributed": "critical", "distributed.worker.memory.terminate": False,
-                # a machine that is busy or was put to sleep is not a dead one
-                "distributed.scheduler.worker-ttl": "3600s", "distributed.comm.timeouts.connect": "120s"}  # fmt: skip
+    settings = {
+        "distributed.scheduler.allowed-failures": _DEATHS,
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.logging.distributed": "critical",
+        "distributed.worker.memory.terminate": False,
+        # a machine that is busy or was put to sleep is not a dead one
+        "distributed.scheduler.worker-ttl": "3600s",
+        "distributed.comm.timeouts.connect": "120s",
+    }
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         if scheduler is not None:
@@ -157,7 +180,11 @@ def _client(
                 ) from None
             return
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="liex-"))
-        cluster = slurm_cluster(slurm, scratch) if slurm else local_cluster(n_tasks, workers, threads, scratch)
+        cluster = (
+            slurm_cluster(slurm, scratch)
+            if slurm
+            else local_cluster(n_tasks, workers, threads, scratch)
+        )
         stack.enter_context(cluster)
         if slurm:
             cluster.scale(min(slurm.jobs, n_tasks))  # a job is one worker
@@ -171,11 +198,20 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
     cores = n_cores()
     count = max(1, min(workers or (cores + 1) // 2, n_tasks))
     return LocalCluster(
-        n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
-        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # any port: another study's may have the usual one
-        memory_limit=0, local_directory=scratch, silence_logs=50, security=Security.temporary(),
+        n_workers=count,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs={
+            "dashboard_address": "127.0.0.1:0"
+        },  # any port: another study's may have the usual one
+        memory_limit=0,
+        local_directory=scratch,
+        silence_logs=50,
+        security=Security.temporary(),
         env=worker_environment(threads or max(1, cores // count)),
-    )  # fmt: skip
+    )
 
 
 def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
@@ -191,18 +227,31 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
     shared = Path(table.shared_folder).expanduser()
     shared.mkdir(mode=0o700, parents=True, exist_ok=True)
     return SLURMCluster(
-        **slurm_options(table, scratch), scheduler_options={"dashboard_address": None},
-        security=Security.temporary(), shared_temp_directory=str(shared), silence_logs=50,
-    )  # fmt: skip
+        **slurm_options(table, scratch),
+        scheduler_options={"dashboard_address": None},
+        security=Security.temporary(),
+        shared_temp_directory=str(shared),
+        silence_logs=50,
+    )
 
 
 def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
     """The options of one job: one worker that measures one session at a time on all of the job's cores."""
-    exports = [f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()]
+    exports = [
+        f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()
+    ]
     return {
-        "queue": table.partition, "account": table.account, "cores": 1, "processes": 1, "memory": table.memory,
-        "job_cpu": table.cores_per_job, "walltime": table.walltime, "interface": table.interface,
-        "job_script_prologue": [*table.prologue, *exports], "job_extra_directives": list(table.directives),
-        "local_directory": table.local_folder or scratch, "log_directory": table.log_folder,
+        "queue": table.partition,
+        "account": table.account,
+        "cores": 1,
+        "processes": 1,
+        "memory": table.memory,
+        "job_cpu": table.cores_per_job,
+        "walltime": table.walltime,
+        "interface": table.interface,
+        "job_script_prologue": [*table.prologue, *exports],
+        "job_extra_directives": list(table.directives),
+        "local_directory": table.local_folder or scratch,
+        "log_directory": table.log_folder,
         "worker_extra_args": ["--no-dashboard"],
-    }  # fmt: skip
+    }

@@ -12,7 +12,13 @@ from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
 from liex_lab.sessions.failure import write_whole
 
 _FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".avi", ".mkv")
-_FOLDERS = ("camera.toml", "raytrix.toml", "depth.dat", "depth.avi", "depth.mkv")  # what marks a folder as a recording
+_FOLDERS = (
+    "camera.toml",
+    "raytrix.toml",
+    "depth.dat",
+    "depth.avi",
+    "depth.mkv",
+)  # what marks a folder as a recording
 _SKIPPED = {"derivatives", "thumbnails"}
 _HEADER = """\
 # A study of liex_lab: which animals, in which groups, recorded in which sessions. Correct what is wrong here, then
@@ -31,14 +37,18 @@ def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
     """
     root = Path(folder)
     if not root.is_dir():
-        raise StudyError(f"a study begins in a folder with recordings, but {root} is none; check the path")
+        raise StudyError(
+            f"a study begins in a folder with recordings, but {root} is none; check the path"
+        )
     file = root / STUDY_FILE
     if file.exists() and not overwrite:
         raise StudyError(f"{file} exists already; change it by hand, or say --overwrite")
     raw = root / RAW if (root / RAW).is_dir() else root
     found = find_recordings(raw)
     if not found:
-        raise StudyError(f"no recording was found below {raw}; a study needs at least one, see `liex run --help`")
+        raise StudyError(
+            f"no recording was found below {raw}; a study needs at least one, see `liex run --help`"
+        )
     named = name_sessions(found, raw)
     text = _text(root, named)
     write_whole(file, text)
@@ -52,15 +62,22 @@ def find_recordings(folder: Path) -> list[Path]:
     for inside, folders, names in os.walk(folder):
         here = Path(inside)
         folders[:] = sorted(
-            name for name in folders
-            if name[0] != "." and name not in _SKIPPED and not name.endswith((".liex", ".part"))
+            name
+            for name in folders
+            if name[0] != "."
+            and name not in _SKIPPED
+            and not name.endswith((".liex", ".part"))
             and not (here / name / "session.json").exists()
-        )  # fmt: skip
+        )
         if here != folder and any(name in names for name in _FOLDERS):
             found.append(here)
             folders.clear()
             continue
-        found += [here / name for name in sorted(names) if name.lower().endswith(_FILES) and name[0] != "."]
+        found += [
+            here / name
+            for name in sorted(names)
+            if name.lower().endswith(_FILES) and name[0] != "."
+        ]
     return found
 
 
@@ -100,14 +117,32 @@ def _pairs(text: str) -> str:
 
 def _text(root: Path, named: list[tuple[str, str, Path]]) -> str:
     """The study file."""
-    lines = [_HEADER.format(file=STUDY_FILE, raw=RAW), f"name = {_quoted(root.resolve().name or 'study')}"]
-    lines += ['plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in this folder',
-              f'results = "{DERIVED}"', "", "[set]", ""]  # fmt: skip
+    lines = [
+        _HEADER.format(file=STUDY_FILE, raw=RAW),
+        f"name = {_quoted(root.resolve().name or 'study')}",
+    ]
+    lines += [
+        'plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in this folder',
+        f'results = "{DERIVED}"',
+        "",
+        "[set]",
+        "",
+    ]
     for animal in dict.fromkeys(animal for animal, _, _ in named):
-        lines += ["[[animals]]", f"id = {_quoted(animal)}", 'group = ""                     # cage, sex, batch too', ""]
+        lines += [
+            "[[animals]]",
+            f"id = {_quoted(animal)}",
+            'group = ""                     # cage, sex, batch too',
+            "",
+        ]
     for animal, session, path in named:
-        lines += ["[[sessions]]", f"animal = {_quoted(animal)}", f"session = {_quoted(session)}",
-                  f"recording = {_quoted(path.relative_to(root).as_posix())}", ""]  # fmt: skip
+        lines += [
+            "[[sessions]]",
+            f"animal = {_quoted(animal)}",
+            f"session = {_quoted(session)}",
+            f"recording = {_quoted(path.relative_to(root).as_posix())}",
+            "",
+        ]
     return "\n".join(lines).rstrip() + "\n"
 
 

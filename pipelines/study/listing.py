@@ -22,7 +22,9 @@ def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]
         study = Study.load(path)
         return study.name, lambda: [_of_study(one) for one in standings(Study.load(study.path))]
     if not path.is_dir():
-        raise StudyError(f"there is no study {path}; name a study's .toml file, or a folder with sessions in it")
+        raise StudyError(
+            f"there is no study {path}; name a study's .toml file, or a folder with sessions in it"
+        )
     find_sessions([path])  # says what is missing where there is none
     return path.resolve().name, lambda: _of_folder(path)
 
@@ -41,14 +43,23 @@ def _of_folder(path: Path) -> list[Entry]:
     for file in sorted(path.rglob(FAILED_FILE)):
         failure = read_failure(file.parent) or {}
         name = file.parent.relative_to(path).as_posix()
-        entries.append(Entry(name, "failed", str(failure.get("reason", "")), str(failure.get("remedy", ""))))
+        entries.append(
+            Entry(name, "failed", str(failure.get("reason", "")), str(failure.get("remedy", "")))
+        )
     names = [entry.key for entry in entries]
     return [
-        entry if names.count(entry.key) == 1 or entry.folder is None
-        else Entry(entry.folder.relative_to(path.resolve()).as_posix(), entry.state, entry.reason, "", entry.folder,
-                   entry.who)
+        entry
+        if names.count(entry.key) == 1 or entry.folder is None
+        else Entry(
+            entry.folder.relative_to(path.resolve()).as_posix(),
+            entry.state,
+            entry.reason,
+            "",
+            entry.folder,
+            entry.who,
+        )
         for entry in entries
-    ]  # fmt: skip
+    ]
 
 
 def _measured(folder: Path) -> Entry:

@@ -22,14 +22,25 @@ class RunSession(Protocol):
     """What measures a recording: `liex_lab.api.run_session`, which knows the views as well."""
 
     def __call__(
-        self, recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], crew: Crew | None,
+        self,
+        recording: str,
+        plan: Plan,
+        *,
+        folder: Path,
+        overwrite: bool,
+        notes: dict[str, Any],
+        crew: Crew | None,
         progress: Progress,
     ) -> Path:
         """Write the session folder `folder`."""
 
 
 def measure_one(
-    session: PlannedSession, run: RunSession, progress: Progress = silent, run_id: str = "", crew: Crew | None = None
+    session: PlannedSession,
+    run: RunSession,
+    progress: Progress = silent,
+    run_id: str = "",
+    crew: Crew | None = None,
 ) -> dict[str, Any]:
     """Measure a session; returns how it went: id, state 'done' or 'failed', seconds, and the failure.
 
@@ -48,15 +59,29 @@ def measure_one(
     failure = None
     try:
         if not session.recording_exists:
-            raise RecordingError(f"there is no recording {session.recording}; correct its path, or copy it there")
+            raise RecordingError(
+                f"there is no recording {session.recording}; correct its path, or copy it there"
+            )
         stamp = input_stamp(session.recording)
-        run(session.recording, session.plan, folder=session.folder, overwrite=True,
-            notes={"input": {"stamp": stamp}, "run_id": run_id}, crew=crew, progress=watch)  # fmt: skip
+        run(
+            session.recording,
+            session.plan,
+            folder=session.folder,
+            overwrite=True,
+            notes={"input": {"stamp": stamp}, "run_id": run_id},
+            crew=crew,
+            progress=watch,
+        )
     except Exception as error:
         failure = describe_failure(error, stage, frame) | {"run_id": run_id}
         quarantine(session, failure)
     seconds = round(time.perf_counter() - began, 3)
-    return {"id": session.id, "state": "failed" if failure else "done", "seconds": seconds, "failure": failure}
+    return {
+        "id": session.id,
+        "state": "failed" if failure else "done",
+        "seconds": seconds,
+        "failure": failure,
+    }
 
 
 def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
@@ -74,7 +99,11 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
 
 def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
     """Leave failed.json in the session's place, with what was to be done, so that a change of it is noticed."""
-    known = {"session_id": session.id, **failure, "plan": session.plan.model_dump(exclude_none=True)}
+    known = {
+        "session_id": session.id,
+        **failure,
+        "plan": session.plan.model_dump(exclude_none=True),
+    }
     known["input"] = {"stamp": input_stamp(session.recording)}
     set_aside(session.folder)
     write_failure(session.folder, known)

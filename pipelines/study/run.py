@@ -33,13 +33,18 @@ def run_study(
 ) -> list[Standing]:
     """Measure what is to be done; returns where every session stands then. See `liex_lab.api.run_study`."""
     if scheduler and slurm:
-        raise StudyError("the workers are found either with --scheduler or with --slurm; leave one of them out")
+        raise StudyError(
+            "the workers are found either with --scheduler or with --slurm; leave one of them out"
+        )
     table = SlurmTable.load(slurm) if slurm else None
     before = standings(study, retry=retry, only=only, again=again)
     if dry_run:
         return before
     study.cohort_folder.mkdir(parents=True, exist_ok=True)
-    with locked(study.cohort_folder / ".lock", f"the study {study.name} is being measured by another process"):
+    with locked(
+        study.cohort_folder / ".lock",
+        f"the study {study.name} is being measured by another process",
+    ):
         todo = [one for one in before if one.to_do]
         if todo:
             _measure(todo, run, board, workers=workers, scheduler=scheduler, slurm=table)
@@ -49,7 +54,10 @@ def run_study(
 
 
 def _measure(
-    todo: list[Standing], run: RunSession, board: Callable[[int], AbstractContextManager[Board]], **where: Any
+    todo: list[Standing],
+    run: RunSession,
+    board: Callable[[int], AbstractContextManager[Board]],
+    **where: Any,
 ) -> None:
     from .dask_cluster import measure_cohort
 
@@ -57,7 +65,11 @@ def _measure(
 
         def finished(result: dict[str, Any]) -> None:
             failure = result["failure"]
-            sentence = f"failed: {failure['reason']}" if failure else f"is done, in {result['seconds']:.0f} s"
+            sentence = (
+                f"failed: {failure['reason']}"
+                if failure
+                else f"is done, in {result['seconds']:.0f} s"
+            )
             shown.ended(result["id"], sentence, failed=failure is not None)
 
         measure_cohort(todo, run, told=shown.told, finished=finished, **where)

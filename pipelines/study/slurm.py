@@ -39,7 +39,9 @@ class SlurmTable(BaseModel):
         """The table in a TOML file; 'slurm' is the bundled one."""
         file = plans_folder() / "slurm.toml" if str(path) == "slurm" else Path(path)
         if not file.is_file():
-            raise StudyError(f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy")
+            raise StudyError(
+                f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy"
+            )
         try:
             table: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
             return SlurmTable.model_validate(table)
@@ -48,4 +50,6 @@ class SlurmTable(BaseModel):
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise StudyError(f"{file}: {where}: {first['msg']}; compare it with the bundled slurm.toml") from None
+            raise StudyError(
+                f"{file}: {where}: {first['msg']}; compare it with the bundled slurm.toml"
+            ) from None

@@ -16,7 +16,14 @@ from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
 from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version
 
-_SAYS = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}  # files beside a recording that say what is in it
+_SAYS = {
+    ".toml",
+    ".txt",
+    ".csv",
+    ".json",
+    ".yaml",
+    ".yml",
+}  # files beside a recording that say what is in it
 State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
 
 
@@ -35,12 +42,16 @@ class Standing:
         return self.state in ("new", "begun", "changed")
 
 
-def standings(study: Study, *, retry: bool = False, only: Sequence[str] = (), again: bool = False) -> list[Standing]:
+def standings(
+    study: Study, *, retry: bool = False, only: Sequence[str] = (), again: bool = False
+) -> list[Standing]:
     """Where every session stands. retry: failed ones are to be done; only: ids, the others are left out; again: all."""
     known = [session.id for session in study.sessions]
     for id in only:
         if id not in known:
-            raise LiexError(f"the study {study.name} has no session {id}; it has {', '.join(known[:8]) or 'none'}")
+            raise LiexError(
+                f"the study {study.name} has no session {id}; it has {', '.join(known[:8]) or 'none'}"
+            )
     found = [standing(session) for session in study.sessions if not only or session.id in only]
     return [_asked_again(one, retry, again) for one in found]
 
@@ -66,10 +77,20 @@ def standing(session: PlannedSession) -> Standing:
         return Standing(session, "changed" if why else "done", why)
     failure = read_failure(session.folder)
     if failure is not None:
-        why = "" if "input" not in failure else next(filter(None, (check() for check in _checks(session, failure))), "")
-        return Standing(session, "changed" if why else "failed", why or str(failure["reason"]), failure)
+        why = (
+            ""
+            if "input" not in failure
+            else next(filter(None, (check() for check in _checks(session, failure))), "")
+        )
+        return Standing(
+            session, "changed" if why else "failed", why or str(failure["reason"]), failure
+        )
     begun = session.folder.with_name(f"{session.folder.name}.part").is_dir()
-    return Standing(session, "begun", "it was interrupted and goes on") if begun else Standing(session, "new", "new")
+    return (
+        Standing(session, "begun", "it was interrupted and goes on")
+        if begun
+        else Standing(session, "new", "new")
+    )
 
 
 def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Callable[[], str]]:
@@ -87,13 +108,19 @@ def _version_changed(document: dict[str, Any]) -> str:
     if then != now:
         return f"version changed: {then or 'unknown'}, now {now}"
     schema = document.get("schema_version", SCHEMA_VERSION)
-    return f"version changed: session schema {schema}, now {SCHEMA_VERSION}" if schema != SCHEMA_VERSION else ""
+    return (
+        f"version changed: session schema {schema}, now {SCHEMA_VERSION}"
+        if schema != SCHEMA_VERSION
+        else ""
+    )
 
 
 def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
     then, now = Plan.from_table(stored).model_dump(), plan.model_dump()
     differing = [
-        f"{section}.{key} = {now[section][key]}" if isinstance(now[section], dict) else f"{section} = {now[section]}"
+        f"{section}.{key} = {now[section][key]}"
+        if isinstance(now[section], dict)
+        else f"{section} = {now[section]}"
         for section in now
         for key in (now[section] if isinstance(now[section], dict) else [""])
         if (now[section][key] != then[section][key] if key else now[section] != then[section])
@@ -107,7 +134,9 @@ def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:
 
     if not stored:
         return ""
-    return "" if sha256(find_model(plan.estimation.model)) == stored.get("sha256") else "model changed"
+    return (
+        "" if sha256(find_model(plan.estimation.model)) == stored.get("sha256") else "model changed"
+    )
 
 
 def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:

@@ -21,12 +21,21 @@ STUDY_SESSIONS = columns(
     ("cage", "string", "", "home cage or tank"),
     ("sex", "string", "", "sex"),
     ("batch", "string", "", "batch of the experiment"),
-    ("state", "string", "",
-     "done; failed: see reason and remedy; excluded: by the study file; new, begun or changed: to be done"),
+    (
+        "state",
+        "string",
+        "",
+        "done; failed: see reason and remedy; excluded: by the study file; new, begun or changed: to be done",
+    ),
     ("reason", "string", "", "why it failed, is excluded or is to be done"),
     ("remedy", "string", "", "what to do about it"),
     ("stage", "string", "", "what was being done when it failed"),
-    ("frame", "int64", "", "frames that had been measured when it failed; -1 where none was or it did not fail"),
+    (
+        "frame",
+        "int64",
+        "",
+        "frames that had been measured when it failed; -1 where none was or it did not fail",
+    ),
     ("n_frames", "int64", "", "recorded frames; 0 where it is not done"),
     ("n_frames_observed", "int64", "", "recorded frames with a pose"),
     ("observed_s", "float64", "s", "time with a pose"),
@@ -34,7 +43,7 @@ STUDY_SESSIONS = columns(
     ("peak_memory_mb", "float64", "MB", "the most memory the run held"),
     ("recording", "string", "", "the recording, from the study's folder"),
     ("folder", "string", "", "the session's folder, from the study's folder"),
-)  # fmt: skip
+)
 TABLE = "study"
 
 
@@ -57,7 +66,9 @@ def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
     writer.writerows([harmless(row[name]) for name in names] for row in rows)
     write_whole(folder / f"{TABLE}.csv", text.getvalue())
     entries = [entry for entry in dictionary(STUDY_SESSIONS) if entry["table"] == TABLE]
-    write_whole(folder / f"{TABLE}_columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
+    write_whole(
+        folder / f"{TABLE}_columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n"
+    )
     return folder / f"{TABLE}.csv"
 
 
@@ -71,15 +82,22 @@ def _row(study: Study, one: Standing) -> dict[str, Any]:
     document = _document(session.folder) if one.state == "done" else {}
     frames = document.get("frames", {})
     return {
-        "session_id": session.id, "subject_id": session.animal.id,
+        "session_id": session.id,
+        "subject_id": session.animal.id,
         **{name: getattr(session.animal, name) for name in ("group", "cage", "sex", "batch")},
-        "state": one.state, "reason": one.reason, "remedy": str(failure.get("remedy", "")),
-        "stage": str(failure.get("stage") or ""), "frame": _count(failure.get("frame"), -1),
-        "n_frames": _count(frames.get("n_frames"), 0), "n_frames_observed": _count(frames.get("n_observed"), 0),
-        "observed_s": _number(frames.get("observed_s")), "frames_per_s": _number(document.get("frames_per_s")),
+        "state": one.state,
+        "reason": one.reason,
+        "remedy": str(failure.get("remedy", "")),
+        "stage": str(failure.get("stage") or ""),
+        "frame": _count(failure.get("frame"), -1),
+        "n_frames": _count(frames.get("n_frames"), 0),
+        "n_frames_observed": _count(frames.get("n_observed"), 0),
+        "observed_s": _number(frames.get("observed_s")),
+        "frames_per_s": _number(document.get("frames_per_s")),
         "peak_memory_mb": _number(document.get("peak_memory_mb")),
-        "recording": _below(study, session.recording), "folder": _below(study, str(session.folder)),
-    }  # fmt: skip
+        "recording": _below(study, session.recording),
+        "folder": _below(study, str(session.folder)),
+    }
 
 
 def _document(folder: Path) -> dict[str, Any]:

@@ -24,35 +24,43 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SEED = 6
-_SLOWER_HZ = (15.0, 30.0)  # of the generated recordings a model learns from, some as slower cameras see them
+_SLOWER_HZ = (
+    15.0,
+    30.0,
+)  # of the generated recordings a model learns from, some as slower cameras see them
 
 
 def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
     """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
-    from .agent_data import (
-        RATE_HZ,
-        WORDS,
-        by_usual_camera,
-        cut_sequences,
-        training_recordings,
-    )
+    from .agent_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
     from .agent_tracks import acted, acted_tracks
 
     if animal not in WORDS:
-        raise LiexError(f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions")
+        raise LiexError(
+            f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions"
+        )
     recordings = acted(training_recordings(animal), estimator, progress)
     usual = by_usual_camera(recordings)
-    slower = [one.tracked(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]]
-    cuts = acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
+    slower = [
+        one.tracked(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]
+    ]
+    cuts = (
+        acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
+    )
     return [*(one.tracked() for one in recordings), *slower], cuts
 
 
 def train_actions(
-    out: str | Path, *, animal: str = "mouse", sessions: Sequence[str | Path] = (), labels: Sequence[str | Path] = (),
-    pose_model: str | Path | None = None, progress: Progress = silent,
-) -> tuple[Path, dict[str, Any]]:  # fmt: skip
+    out: str | Path,
+    *,
+    animal: str = "mouse",
+    sessions: Sequence[str | Path] = (),
+    labels: Sequence[str | Path] = (),
+    pose_model: str | Path | None = None,
+    progress: Progress = silent,
+) -> tuple[Path, dict[str, Any]]:
     """A recogniser learned from labelled sessions, or, without any, from generated recordings of an animal.
 
     labels: tables of bouts or BORIS's projects or exports; without any, the sessions' own bouts whose source is human.
@@ -66,21 +74,31 @@ def train_actions(
         tracks = labelled_sessions(sessions, labels)
         report = leave_one_animal_out(tracks, seed=_SEED, progress=progress)
         model = learn(tracks, seed=_SEED, progress=progress)
-        model = with_card(model, made_by="liex train actions", labels="people's", n_recordings=len(tracks))
+        model = with_card(
+            model, made_by="liex train actions", labels="people's", n_recordings=len(tracks)
+        )
         return save_action_model(model, out), report
     from ..evaluation.pose import estimator_of
 
     estimator = estimator_of(animal, "default", progress, pose_model)
     tracks, cuts = learning_set(animal, estimator, progress)
-    model = learn(tracks, seed=_SEED, definitions=DEFINITIONS.get(animal), sequences=cuts, progress=progress)
+    model = learn(
+        tracks, seed=_SEED, definitions=DEFINITIONS.get(animal), sequences=cuts, progress=progress
+    )
     model = with_card(
-        model, made_by="liex train actions", labels="those of generated recordings; no recording of an animal was used",
-        n_recordings=len(tracks), n_sequences=len(cuts), pose_model=estimator.model.digest(),
-    )  # fmt: skip
+        model,
+        made_by="liex train actions",
+        labels="those of generated recordings; no recording of an animal was used",
+        n_recordings=len(tracks),
+        n_sequences=len(cuts),
+        pose_model=estimator.model.digest(),
+    )
     return save_action_model(model, out), {}
 
 
-def labelled_sessions(sessions: Sequence[str | Path], labels: Sequence[str | Path]) -> list[LabelledTrack]:
+def labelled_sessions(
+    sessions: Sequence[str | Path], labels: Sequence[str | Path]
+) -> list[LabelledTrack]:
     """The tracks of sessions with the words that people gave them."""
     import pandas as pd
 
@@ -107,7 +125,9 @@ def labelled_sessions(sessions: Sequence[str | Path], labels: Sequence[str | Pat
                 "them in BORIS (`liex export --to boris`)"
             )
         about = session.table("sessions").iloc[0]
-        tracks.append(LabelledTrack(track, words, str(about["subject_id"]) or session.name, wall_of(session)))
+        tracks.append(
+            LabelledTrack(track, words, str(about["subject_id"]) or session.name, wall_of(session))
+        )
     return tracks
 
 
@@ -130,7 +150,9 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
     return read_labels(source)
 
 
-def suggest(session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5) -> pd.DataFrame:
+def suggest(
+    session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5
+) -> pd.DataFrame:
     """The stretches of a session most worth labelling next: where the recogniser is least sure, one per kind of doubt
     first. Columns start_s, stop_s, guess, or_else, uncertainty (0 to 1).
     """
@@ -145,7 +167,9 @@ def suggest(session: str | Path, *, model: str | Path | None = None, n: int = 10
     return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
 
 
-def _session_and_model(session: str | Path, model: str | Path | None) -> tuple[Session, TimelineModel]:
+def _session_and_model(
+    session: str | Path, model: str | Path | None
+) -> tuple[Session, TimelineModel]:
     from liex_lab.actions.storage import load_action_model
     from liex_lab.sessions import Session
 
@@ -153,5 +177,7 @@ def _session_and_model(session: str | Path, model: str | Path | None) -> tuple[S
     skeleton = str(opened.metadata["animal"]["name"])
     recogniser = load_action_model(model or skeleton)
     if recogniser.skeleton != skeleton:
-        raise LiexError(f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use another")
+        raise LiexError(
+            f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use another"
+        )
     return opened, recogniser

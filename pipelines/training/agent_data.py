@@ -32,7 +32,13 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
     individuals, n = (_TEST_FISH, N_TEST) if test else (_TRAIN_FISH, N_TRAIN)
     words = WORDS[animal]
     return [
-        Scenario(animal, individuals[k % len(individuals)], 1000 + k, RATE_HZ[animal], word=words[k % len(words)])
+        Scenario(
+            animal,
+            individuals[k % len(individuals)],
+            1000 + k,
+            RATE_HZ[animal],
+            word=words[k % len(words)],
+        )
         for k in range(n)
     ]
 
@@ -40,7 +46,9 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 def training_recordings(animal: str) -> list[Scenario]:
     """Uncut recordings to learn from, a fish's last ones by a faster camera."""
     usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
-    return usual + [Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())]
+    return usual + [
+        Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())
+    ]
 
 
 def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
@@ -54,8 +62,14 @@ def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
     """
     n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
     seconds = 60.0 * minutes / n
-    usual = [Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET[:n]]
-    return [replace(one, rate_hz=FAST_HZ, filmed_s=_FAST_SHARE * seconds) for one in usual] if fast else usual
+    usual = [
+        Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET[:n]
+    ]
+    return (
+        [replace(one, rate_hz=FAST_HZ, filmed_s=_FAST_SHARE * seconds) for one in usual]
+        if fast
+        else usual
+    )
 
 
 test_recordings.__test__ = False  # type: ignore[attr-defined]  # its name is not a test's

@@ -83,9 +83,13 @@ class Acted:
         nearest to its times to go by; 0 all.
         """
         rows = np.arange(len(self.words)) if not rate_hz else thinned(self.seen.times_ns, rate_hz)
-        seen = Observations(self.seen.skeleton, *(getattr(self.seen, name)[rows] for name in COLUMNS))
+        seen = Observations(
+            self.seen.skeleton, *(getattr(self.seen, name)[rows] for name in COLUMNS)
+        )
         track = track_whole(self.subject, seen).track
-        one = LabelledTrack(track, self.words[rows], self.animal, self.wall_mm[rows], self.truth[rows].astype(float))
+        one = LabelledTrack(
+            track, self.words[rows], self.animal, self.wall_mm[rows], self.truth[rows].astype(float)
+        )
         return one[one.words == self.cut] if self.cut else one
 
 
@@ -104,7 +108,9 @@ def acted_tracks(
     return [one.tracked() for one in acted(scenarios, estimator, progress)]
 
 
-def acted(scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent) -> list[Acted]:
+def acted(
+    scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
+) -> list[Acted]:
     """All scenarios, kept from earlier or measured now. Cut-outs of one individual share its size and one file."""
     found: dict[int, Acted] = {}
     made_by = estimator.model.digest()
@@ -119,14 +125,18 @@ def acted(scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Pro
             sizes: dict[int, float] = {}
             measured: list[Acted] = []
             for one in group:
-                progress(len(found) + len(measured), len(scenarios), "acting, rendering and measuring")
+                progress(
+                    len(found) + len(measured), len(scenarios), "acting, rendering and measuring"
+                )
                 measured.append(act(one, estimator, sizes))
             _save(path, measured)
         found |= dict(zip(rows, _load(path, estimator, group), strict=True))
     return [found[k] for k in range(len(scenarios))]
 
 
-def act(scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | None = None) -> Acted:
+def act(
+    scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | None = None
+) -> Acted:
     """One scenario acted, rendered and measured; sizes: of individuals that have been measured already."""
     stage = {"fish": _fish, "mouse": _mouse}[scenario.animal]
     rng = np.random.default_rng([scenario.individual, scenario.seed])
@@ -141,19 +151,48 @@ def act(scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | 
     if scenario.individual not in sizes:
         sizes[scenario.individual] = tracker.find_size(sample)
     size = sizes[scenario.individual]
-    n = len(rows) if not scenario.filmed_s else int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
-    parts = film(rng, habits, camera, shape, pose[:n], girth[:n], None if walls is None else walls[:n], window_px)
+    n = (
+        len(rows)
+        if not scenario.filmed_s
+        else int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
+    )
+    parts = film(
+        rng,
+        habits,
+        camera,
+        shape,
+        pose[:n],
+        girth[:n],
+        None if walls is None else walls[:n],
+        window_px,
+    )
     times = np.round(rows[:n] * STEP_S * 1e9).astype(np.int64)
     seen = tracker.observe(parts, times, size)
     whole = Camera(*camera.intrinsics, *(int(x) for x in camera.picture))
     subject = tracker.subject(whole, sample.floor(0).T_arena_camera, size)
     wall = np.full(n, np.nan) if room is None else room[:n]
-    return Acted(seen, subject, motion.word[rows[:n]], f"{scenario.animal}-{scenario.individual}", wall,
-                 pose[:n].joints(habits.skeleton).astype(np.float32), scenario.word)  # fmt: skip
+    return Acted(
+        seen,
+        subject,
+        motion.word[rows[:n]],
+        f"{scenario.animal}-{scenario.individual}",
+        wall,
+        pose[:n].joints(habits.skeleton).astype(np.float32),
+        scenario.word,
+    )
 
 
-_Staged = tuple[Motion, NDArray[np.int64], Pose, Array, Array | None, FishHabits | MouseHabits, Camerawork, BodyShape,
-                Array | None]  # fmt: skip
+_Staged = tuple[
+    Motion,
+    NDArray[np.int64],
+    Pose,
+    Array,
+    Array | None,
+    FishHabits | MouseHabits,
+    Camerawork,
+    BodyShape,
+    Array | None,
+]
 
 
 def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
@@ -186,9 +225,20 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     sensor = habits.sensors[int(rng.integers(len(habits.sensors)))]
     camera = Camerawork.draw(rng, habits, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
     room = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
-    known = scenario.novel or rng.random() < 0.75  # of some to learn from nobody knows where the walls are
-    return (motion, rows, pose, girth, _walls(rng, middle, half), habits, camera, shape,
-            room if known else np.full(len(rows), np.nan))  # fmt: skip
+    known = (
+        scenario.novel or rng.random() < 0.75
+    )  # of some to learn from nobody knows where the walls are
+    return (
+        motion,
+        rows,
+        pose,
+        girth,
+        _walls(rng, middle, half),
+        habits,
+        camera,
+        shape,
+        room if known else np.full(len(rows), np.nan),
+    )
 
 
 def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
@@ -211,15 +261,23 @@ def _generator(animal: str) -> bytes:
 
 def _save(path: Path, group: list[Acted]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    columns: dict[str, Any] = {name: np.concatenate([_of_animal(one.seen, name) for one in group]) for name in COLUMNS}
-    columns |= {name: np.concatenate([getattr(one, name) for one in group]) for name in ("words", "wall_mm", "truth")}
+    columns: dict[str, Any] = {
+        name: np.concatenate([_of_animal(one.seen, name) for one in group]) for name in COLUMNS
+    }
     columns |= {
-        "lengths": np.array([len(one.words) for one in group]), "animals": np.array([one.animal for one in group]),
-        "camera": np.array([[getattr(one.subject.camera, name) for name in _CAMERA] for one in group]),
+        name: np.concatenate([getattr(one, name) for one in group])
+        for name in ("words", "wall_mm", "truth")
+    }
+    columns |= {
+        "lengths": np.array([len(one.words) for one in group]),
+        "animals": np.array([one.animal for one in group]),
+        "camera": np.array(
+            [[getattr(one.subject.camera, name) for name in _CAMERA] for one in group]
+        ),
         "camera_turn": np.stack([one.subject.T_arena_camera.rotation for one in group]),
         "camera_shift": np.stack([one.subject.T_arena_camera.translation for one in group]),
         "sizes": np.array([one.subject.length_mm / one.seen.skeleton.length for one in group]),
-    }  # fmt: skip
+    }
     unfinished = path.with_suffix(".part.npz")
     np.savez(unfinished, **columns)
     unfinished.replace(path)
@@ -239,7 +297,18 @@ def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> li
         part = slice(stop - length, stop)
         seen = Observations(estimator.skeleton, *(data[name][part] for name in COLUMNS))
         camera = Camera(*data["camera"][k, :4], *(int(x) for x in data["camera"][k, 4:]))
-        subject = tracker.subject(camera, SE3(data["camera_turn"][k], data["camera_shift"][k]), float(data["sizes"][k]))
-        found.append(Acted(seen, subject, data["words"][part], str(data["animals"][k]), data["wall_mm"][part],
-                           data["truth"][part], group[k].word))  # fmt: skip
+        subject = tracker.subject(
+            camera, SE3(data["camera_turn"][k], data["camera_shift"][k]), float(data["sizes"][k])
+        )
+        found.append(
+            Acted(
+                seen,
+                subject,
+                data["words"][part],
+                str(data["animals"][k]),
+                data["wall_mm"][part],
+                data["truth"][part],
+                group[k].word,
+            )
+        )
     return found

@@ -35,7 +35,9 @@ class Training:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values: equal ones, equal training."""
-        plain: dict[str, Any] = json.loads(json.dumps({"recipe": vars(self.recipe), "plan": asdict(self.plan)}))
+        plain: dict[str, Any] = json.loads(
+            json.dumps({"recipe": vars(self.recipe), "plan": asdict(self.plan)})
+        )
         return plain
 
 
@@ -53,7 +55,9 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
     from .pose_model import recipe_of
 
     n_images = _N_IMAGES.get(skeleton.name, _N_OTHERS)
-    recipe = replace(recipe_of("paper", skeleton), n_images=n_images, n_calibration=0, degraded_share=_DEGRADED)
+    recipe = replace(
+        recipe_of("paper", skeleton), n_images=n_images, n_calibration=0, degraded_share=_DEGRADED
+    )
     plan = BASELINES[variant]
     if isinstance(plan, CnnPlan):
         plan = replace(plan, epochs=round(_SEEN / n_images))
@@ -83,10 +87,15 @@ def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Pat
     from .pose_model import cache_folder
 
     made_from = json.dumps([package_version("liex_lab"), training.to_dict()], sort_keys=True)
-    return cache_folder() / f"{skeleton.name}-{variant}-{hashlib.sha256(made_from.encode()).hexdigest()[:12]}.npz"
+    return (
+        cache_folder()
+        / f"{skeleton.name}-{variant}-{hashlib.sha256(made_from.encode()).hexdigest()[:12]}.npz"
+    )
 
 
-def train_baseline(variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress) -> None:
+def train_baseline(
+    variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress
+) -> None:
     """Train and write a baseline, and its card."""
     import numba
 
@@ -95,7 +104,9 @@ def train_baseline(variant: str, skeleton: Skeleton, training: Training, path: P
     from .pose_model import rendered_set
 
     recipe = training.recipe
-    data = rendered_set(skeleton, method_of("paper", skeleton), recipe, 0, recipe.n_images, progress)
+    data = rendered_set(
+        skeleton, method_of("paper", skeleton), recipe, 0, recipe.n_images, progress
+    )
     began = time.perf_counter()
 
     def tell(share: float, what: str) -> None:
@@ -103,17 +114,25 @@ def train_baseline(variant: str, skeleton: Skeleton, training: Training, path: P
 
     model = _trained(training, data, skeleton, tell)
     card = {
-        "animal": skeleton.name, "variant": variant, **training.to_dict(), "n_images": len(data.size),
-        "training_s": round(time.perf_counter() - began, 1), "cores": numba.get_num_threads(),
-    }  # fmt: skip
+        "animal": skeleton.name,
+        "variant": variant,
+        **training.to_dict(),
+        "n_images": len(data.size),
+        "training_s": round(time.perf_counter() - began, 1),
+        "cores": numba.get_num_threads(),
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.name}.part-{os.getpid()}")
     unfinished.write_bytes(model.to_bytes())
-    path.with_suffix(".json").write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    path.with_suffix(".json").write_text(
+        json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8"
+    )
     unfinished.replace(path)
 
 
-def _trained(training: Training, data: Any, skeleton: Skeleton, tell: Tell) -> RegressionForest | Cnn:
+def _trained(
+    training: Training, data: Any, skeleton: Skeleton, tell: Tell
+) -> RegressionForest | Cnn:
     rng = np.random.default_rng(training.recipe.seed)
     if isinstance(training.plan, CnnPlan):
         from liex_lab.baselines.cnn import train_cnn

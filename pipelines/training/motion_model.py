@@ -43,7 +43,15 @@ _STEP = 0.5  # sd of the logarithm of a number that is changed
 _BINS, _Z90, _FACTORS, _LEAST = 3, 1.645, (0.3, 3.0), 0.01
 # how fast a session's stretch may grow with what it is told by, see `Motion.stretch`
 _PER_BLUR, _PER_SPREAD = np.arange(0.0, 6.5, 0.5), np.arange(0.0, 3.5, 0.5)
-_FOUND_OTHERWISE = ("ceiling", "lasting", "honest", "stretch", "usual_stretch", "honest_root", "honest_bend")
+_FOUND_OTHERWISE = (
+    "ceiling",
+    "lasting",
+    "honest",
+    "stretch",
+    "usual_stretch",
+    "honest_root",
+    "honest_bend",
+)
 _CHUNK = 32
 
 
@@ -65,13 +73,21 @@ class Seen:
     def errors(self, joints: Array) -> Array:
         """Errors over the animal's length of the frames in view, as `in_view_ratio` counts them."""
         length = self.subject.length_mm
-        return Followed(joints, self.truth, joints[..., 0], 1.0).in_view(self.events, length) / length
+        return (
+            Followed(joints, self.truth, joints[..., 0], 1.0).in_view(self.events, length) / length
+        )
 
 
 def train_tracking(
-    animal: str, out: Path, *, n_tries: int = 0, n_frames: int | None = None, seeds: Sequence[int] = (),
-    workers: int = 0, progress: Progress = silent,
-) -> Path:  # fmt: skip
+    animal: str,
+    out: Path,
+    *,
+    n_tries: int = 0,
+    n_frames: int | None = None,
+    seeds: Sequence[int] = (),
+    workers: int = 0,
+    progress: Progress = silent,
+) -> Path:
     """Write `tunings.toml` with an animal's table found again, byte for byte the same whenever and however it is run.
 
     Chain and motion are those of the file, or the best of n_tries changes of them; how far off the track may be is
@@ -80,7 +96,9 @@ def train_tracking(
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     measured = [
-        measure(animal, kind, seed, n_frames, progress) for kind, usual in SEEDS.items() for seed in seeds or usual
+        measure(animal, kind, seed, n_frames, progress)
+        for kind, usual in SEEDS.items()
+        for seed in seeds or usual
     ]
     tuning = search(measured, Tuning.of(animal), n_tries, np.random.default_rng(0), progress)
     tuning = honest_about_roots(measured, honest_about_joints(measured, tuning))
@@ -88,11 +106,17 @@ def train_tracking(
     return out
 
 
-def measure(animal: str, kind: str, seed: int, n_frames: int | None, progress: Progress = silent) -> Seen:
+def measure(
+    animal: str, kind: str, seed: int, n_frames: int | None, progress: Progress = silent
+) -> Seen:
     """One sequence, frame by frame; scene and size are found by the product."""
     plan, estimator = plan_of(animal), estimator_of(animal, "default", progress)
-    recording = tracking_sequence(world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames)
-    scene, sample = build_scene(recording, plan, estimator.skeleton, plan.foreground.n_background_frames)
+    recording = tracking_sequence(
+        world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
+    )
+    scene, sample = build_scene(
+        recording, plan, estimator.skeleton, plan.foreground.n_background_frames
+    )
     tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
     parts = []
     for frames in recording.chunks(_CHUNK):
@@ -100,12 +124,24 @@ def measure(animal: str, kind: str, seed: int, n_frames: int | None, progress: P
         parts.append(tracker.observe(frames))
     T = scene.floor.T_arena_camera @ recording.T_arena_camera.inverse()
     pose = recording.pose.moved(scene.floor.T_arena_camera)
-    return Seen(kind, Observations.join(parts), tracker.subject, pose, T @ recording.joints_arena, recording.events,
-                tracker.blur, tracker.size_spread)  # fmt: skip
+    return Seen(
+        kind,
+        Observations.join(parts),
+        tracker.subject,
+        pose,
+        T @ recording.joints_arena,
+        recording.events,
+        tracker.blur,
+        tracker.size_spread,
+    )
 
 
 def search(
-    measured: Sequence[Seen], tuning: Tuning, n_tries: int, rng: np.random.Generator, progress: Progress = silent
+    measured: Sequence[Seen],
+    tuning: Tuning,
+    n_tries: int,
+    rng: np.random.Generator,
+    progress: Progress = silent,
 ) -> Tuning:
     """The best of n random changes in a row, each of up to three numbers."""
     alone = {kind: _of_kind(measured, kind, None) for kind in SEEDS}
@@ -128,14 +164,18 @@ def changed(tuning: Tuning, rng: np.random.Generator) -> Tuning:
     values: Any = getattr(tuning, part)
     names = [field.name for field in fields(values) if field.name not in _FOUND_OTHERWISE]
     name = str(rng.choice(names))
-    return replace(tuning, **{part: replace(values, **{name: _scaled(getattr(values, name), factor, rng)})})
+    return replace(
+        tuning, **{part: replace(values, **{name: _scaled(getattr(values, name), factor, rng)})}
+    )
 
 
 def _scaled(value: Any, factor: float, rng: np.random.Generator) -> Any:
     """A number times the factor, or one of several numbers."""
     if isinstance(value, tuple):
         at = int(rng.integers(len(value)))
-        return tuple(_scaled(each, factor, rng) if k == at else each for k, each in enumerate(value))
+        return tuple(
+            _scaled(each, factor, rng) if k == at else each for k, each in enumerate(value)
+        )
     if isinstance(value, float | int):
         return value * factor
     name = str(rng.choice([field.name for field in fields(value)]))
@@ -192,7 +232,9 @@ class _Claim:
 
     def over(self, knots: Knots, stretch: tuple[float, float]) -> Array:
         """Errors (n, J, 3) over their standard deviations."""
-        factor = np.interp(np.log(self.said), *np.array([(np.log(said), factor) for said, factor in knots]).T)
+        factor = np.interp(
+            np.log(self.said), *np.array([(np.log(said), factor) for said, factor in knots]).T
+        )
         sd = np.hypot(factor[:, None] * self.sd, self.stretch_sd(*stretch) * self.away)
         return np.asarray(self.off / sd[..., None])
 
@@ -206,27 +248,40 @@ def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
     best, least = (0.0, 0.0), np.inf
     for stretch in product(_PER_BLUR.tolist(), _PER_SPREAD.tolist()):
         knots = honesty(claims, stretch)
-        apart = float(np.mean([np.log(_nine_in_ten(claim.over(knots, stretch))) ** 2 for claim in claims]))
+        apart = float(
+            np.mean([np.log(_nine_in_ten(claim.over(knots, stretch))) ** 2 for claim in claims])
+        )
         if apart < least:
             best, least = stretch, apart
     usual = float(np.median([claim.stretch_sd(*best) for claim in claims]))
-    return with_motion(tuning, honest=honesty(claims, best), stretch=best, usual_stretch=round(usual, 4))
+    return with_motion(
+        tuning, honest=honesty(claims, best), stretch=best, usual_stretch=round(usual, 4)
+    )
 
 
 def _claim(each: Seen, plain: Tuning) -> _Claim:
     """What the filter says of a sequence by itself."""
-    length, track = each.subject.length_mm, _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain)
+    length, track = (
+        each.subject.length_mm,
+        _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain),
+    )
     there = track.posed
     joints = track.joints_mm[there]
     return _Claim(
-        each.blur, each.size_spread, track.predicted_error_mm[there] / length, track.sd_mm[there] / length,
-        stretch_of(1.0, joints) / length, np.abs(joints - each.truth[there]) / length,
-    )  # fmt: skip
+        each.blur,
+        each.size_spread,
+        track.predicted_error_mm[there] / length,
+        track.sd_mm[there] / length,
+        stretch_of(1.0, joints) / length,
+        np.abs(joints - each.truth[there]) / length,
+    )
 
 
 def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     """How many times larger errors are than the filter says, by what it says, beside a stretch: see `Motion.honest`."""
-    said, sd, off = (np.concatenate([getattr(claim, name) for claim in claims]) for name in ("said", "sd", "off"))
+    said, sd, off = (
+        np.concatenate([getattr(claim, name) for claim in claims]) for name in ("said", "sd", "off")
+    )
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
     knots = []
     for rows in np.array_split(np.argsort(said, kind="stable"), min(_BINS, len(said))):
@@ -255,13 +310,19 @@ def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
         off = SE3(track.root_rotation[there], track.root_mm[there]).inverse() @ SE3(
             true.root.rotation[there], true.root.translation[there]
         )
-        roots.append(np.concatenate([so3.log(off.rotation), off.translation], axis=1) / track.sd_root[there])
+        roots.append(
+            np.concatenate([so3.log(off.rotation), off.translation], axis=1) / track.sd_root[there]
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
-            bends.append((track.angles_rad - true.angles)[there, 1:] / track.sd_angles_rad[there, 1:])
+            bends.append(
+                (track.angles_rad - true.angles)[there, 1:] / track.sd_angles_rad[there, 1:]
+            )
     moves = each.subject.skeleton.axes[1:]
     root = [round(_nine_in_ten(column), 3) for column in np.concatenate(roots).T]
     z = np.concatenate(bends)
-    bend = [round(_nine_in_ten(z[:, moves[:, a], a]), 3) if moves[:, a].any() else 1.0 for a in range(3)]
+    bend = [
+        round(_nine_in_ten(z[:, moves[:, a], a]), 3) if moves[:, a].any() else 1.0 for a in range(3)
+    ]
     return with_motion(tuning, honest_root=tuple(root), honest_bend=tuple(bend))
 
 

@@ -40,14 +40,26 @@ class Recipe:
     n_correction: int = 12_288  # further images, for the last correction
     n_calibration: int = 24_576  # and further ones, for the predicted error
     degraded_share: float = 0.5
-    sizes: tuple[tuple[float, int], ...] = ((0.0, 144), (45.0, 144), (0.0, 144), (80.0, 192), (45.0, 144), (100.0, 232))
+    sizes: tuple[tuple[float, int], ...] = (
+        (0.0, 144),
+        (45.0, 144),
+        (0.0, 144),
+        (80.0, 192),
+        (45.0, 144),
+        (100.0, 232),
+    )
 
 
-_CALIBRATION, _CORRECTION = 1, 2  # numbers of their own random numbers, so that each can be made again by itself
+_CALIBRATION, _CORRECTION = (
+    1,
+    2,
+)  # numbers of their own random numbers, so that each can be made again by itself
 # of the images that an animal's predicted error is calibrated on show bodies that vary as individuals do; intervals for
 # bodies that vary far more, as the others do, are wider than most animals need
 _ORDINARY_SHARE = {"mouse": 0.5}
-_AREAS_MM2 = {"mouse": 1070.0}  # of home-sized animals seen from above, where it is not that of the home pose
+_AREAS_MM2 = {
+    "mouse": 1070.0
+}  # of home-sized animals seen from above, where it is not that of the home pose
 
 RECIPES = {
     "default": Recipe(),
@@ -58,11 +70,20 @@ _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its h
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # of an animal and a variant, where it is not the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
-    ("fish", "default"): Recipe(seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES),
-    ("fish", "paper"): Recipe(
-        seed=31, n_images=6_144, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 272),)
+    ("fish", "default"): Recipe(
+        seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES
     ),
-    ("hand", "default"): Recipe(n_images=20_480, n_correction=0, n_calibration=4_096, sizes=((0.0, 320),)),
+    ("fish", "paper"): Recipe(
+        seed=31,
+        n_images=6_144,
+        n_correction=0,
+        n_calibration=2_048,
+        degraded_share=0.0,
+        sizes=((0.0, 272),),
+    ),
+    ("hand", "default"): Recipe(
+        n_images=20_480, n_correction=0, n_calibration=4_096, sizes=((0.0, 320),)
+    ),
     ("hand", "paper"): Recipe(
         n_images=8_192, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 320),)
     ),
@@ -76,7 +97,10 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
     world = world_of(skeleton)
     if not isinstance(world, GenericWorld):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
-    sizes = tuple((factor * skeleton.length, world.window_px(factor * skeleton.length)) for factor in _OWN_SIZES)
+    sizes = tuple(
+        (factor * skeleton.length, world.window_px(factor * skeleton.length))
+        for factor in _OWN_SIZES
+    )
     images = {name: getattr(_OWN["fish", variant], name) for name in _AMOUNTS}
     return Recipe(**images, sizes=sizes if variant == "default" else sizes[:1])
 
@@ -105,7 +129,9 @@ def train_model(
     skeleton = Skeleton.load(animal)
     recipe = recipe_of(variant, skeleton)
     if n_images is not None:
-        recipe = replace(recipe, n_images=n_images, n_correction=n_images // 4, n_calibration=n_images // 4)
+        recipe = replace(
+            recipe, n_images=n_images, n_correction=n_images // 4, n_calibration=n_images // 4
+        )
     model = make_model(skeleton, method_of(variant, skeleton), recipe, progress)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +139,9 @@ def train_model(
     unfinished = path.with_name(f"{path.name}.part-{os.getpid()}")
     unfinished.write_bytes(content)
     card = {**model.card, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
-    path.with_suffix(".json").write_text(json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    path.with_suffix(".json").write_text(
+        json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8"
+    )
     unfinished.replace(path)
     return path
 
@@ -139,13 +167,18 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     pruner = train_pruner(data, cascade, candidates, rng)
     area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
     card = {
-        "animal": skeleton.name, "variant": method.variant, "made_by": "liex train", "recipe": vars(recipe),
+        "animal": skeleton.name,
+        "variant": method.variant,
+        "made_by": "liex train",
+        "recipe": vars(recipe),
         "images": world_of(skeleton).sources,
-    }  # fmt: skip
+    }
     model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_correction and (method.corrector is not None or method.settle):
         progress(steps - 1, steps, "learning the last correction")
-        unseen = rendered_set(skeleton, method, recipe, recipe.n_images, recipe.n_correction, silent)
+        unseen = rendered_set(
+            skeleton, method, recipe, recipe.n_images, recipe.n_correction, silent
+        )
         own = np.random.default_rng([recipe.seed, _CORRECTION])
         model = with_settler(with_corrector(model, unseen, own), unseen, own)
     if recipe.n_calibration:
@@ -156,14 +189,23 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     if method.tells_facing:
         progress(steps - 1, steps, "learning to tell head from tail")
         first = recipe.n_images + recipe.n_correction + recipe.n_calibration
-        model = with_facing(model, rendered_set(skeleton, method, recipe, first, recipe.n_images, silent), recipe.seed)
+        model = with_facing(
+            model,
+            rendered_set(skeleton, method, recipe, first, recipe.n_images, silent),
+            recipe.seed,
+        )
     return model
 
 
 def rendered_set(
-    skeleton: Skeleton, method: Method, recipe: Recipe, first: int, n: int, progress: Progress,
+    skeleton: Skeleton,
+    method: Method,
+    recipe: Recipe,
+    first: int,
+    n: int,
+    progress: Progress,
     family: str = "augmented",
-) -> TrainingSet:  # fmt: skip
+) -> TrainingSet:
     """N training images from number `first` on, of bodies of a family, cut out by the product's own foreground."""
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.simulation.simulator import world_of
@@ -176,9 +218,14 @@ def rendered_set(
         progress(number - begin, blocks, "rendering training images")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
         (windows,) = world.training_blocks(
-            recipe.seed, 1, first=number, family=family, degraded_share=recipe.degraded_share,
-            spine_mm=spine_mm or None, window_px=window_px,
-        )  # fmt: skip
+            recipe.seed,
+            1,
+            first=number,
+            family=family,
+            degraded_share=recipe.degraded_share,
+            spine_mm=spine_mm or None,
+            window_px=window_px,
+        )
         parts.append(cut_out(skeleton, method, windows))
     return TrainingSet.join(parts)
 
@@ -194,7 +241,9 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
     if not ordinary:
         return varied
     first += recipe.n_calibration - ordinary
-    return TrainingSet.join([varied, rendered_set(skeleton, method, recipe, first, ordinary, silent, "train")])
+    return TrainingSet.join(
+        [varied, rendered_set(skeleton, method, recipe, first, ordinary, silent, "train")]
+    )
 
 
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
@@ -221,11 +270,16 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
         crops, looks = cut.extract(shown, area, least, method.camera_view, n_things=2)
     n = len(size)
     return TrainingSet.join(
-        [with_truth(skeleton, method, windows, crops[thing], looks[thing]) for thing in (slice(n), slice(n, None))]
+        [
+            with_truth(skeleton, method, windows, crops[thing], looks[thing])
+            for thing in (slice(n), slice(n, None))
+        ]
     )
 
 
-def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array) -> TrainingSet:
+def with_truth(
+    skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array
+) -> TrainingSet:
     """Training images of blobs that were cut from the windows, with the truth in their view frames."""
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
@@ -238,13 +292,20 @@ def with_truth(skeleton: Skeleton, method: Method, windows: TrainingWindows, cro
     frames = pose.frames(skeleton)
     joints = frames.translation
     if windows.own_bones:
-        joints = SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None]) @ windows.joints_mm
+        joints = (
+            SE3(T_view_camera.rotation[:, None], T_view_camera.translation[:, None])
+            @ windows.joints_mm
+        )
     middle = joints.mean(axis=1)
     off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
     if method.camera_view:  # what is beside it in depth is another thing as well
-        off = np.maximum(off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2]))
+        off = np.maximum(
+            off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2])
+        )
     animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
-    good = crops.found & (animal | other)  # in between the two have run together, which teaches nothing
+    good = crops.found & (
+        animal | other
+    )  # in between the two have run together, which teaches nothing
     return TrainingSet(
         ImageSet(crops.heights[good], looks[good], crops.moments[good]),
         Truth(frames.rotation[good], joints[good], pose.scale[good]),
@@ -268,8 +329,14 @@ def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path
 
     skeleton = Skeleton.load(animal)
     method, recipe = method_of(variant, skeleton), recipe_of(variant, skeleton)
-    made_from: dict[str, Any] = {"method": method.to_dict(), "recipe": vars(recipe), "skeleton": skeleton.table}
-    key = hashlib.sha256(json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()).hexdigest()[:12]
+    made_from: dict[str, Any] = {
+        "method": method.to_dict(),
+        "recipe": vars(recipe),
+        "skeleton": skeleton.table,
+    }
+    key = hashlib.sha256(
+        json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()
+    ).hexdigest()[:12]
     path = cache_folder() / f"{skeleton.name}-{variant}-{key}.npz"
     return path if path.is_file() else train_model(animal, variant, path, progress=progress)
 

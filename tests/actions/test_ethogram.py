@@ -20,13 +20,18 @@ def test_bouts_made_of_words_give_the_words_back(words: list[str]) -> None:
     times = np.arange(len(words)) * STEP_NS + 7
     ethogram = Ethogram.of_words(words, times)
     assert list(ethogram.words(times)) == words
-    assert all(a.stop_ns <= b.start_ns for a, b in zip(ethogram.bouts, ethogram.bouts[1:], strict=False))
+    assert all(
+        a.stop_ns <= b.start_ns for a, b in zip(ethogram.bouts, ethogram.bouts[1:], strict=False)
+    )
 
 
 def test_a_bout_ends_where_its_stretch_does_one_usual_step_after_its_last_frame() -> None:
     times = np.array([0, 1, 2, 10, 11]) * STEP_NS
     ethogram = Ethogram.of_words(["dive"] * 5, times, part=np.array([0, 0, 0, 1, 1]))
-    assert [(bout.start_ns // STEP_NS, bout.stop_ns // STEP_NS) for bout in ethogram] == [(0, 3), (10, 12)]
+    assert [(bout.start_ns // STEP_NS, bout.stop_ns // STEP_NS) for bout in ethogram] == [
+        (0, 3),
+        (10, 12),
+    ]
 
 
 @pytest.mark.parametrize("bouts", [(Bout(0, 5, "a"), Bout(4, 9, "b")), (Bout(3, 3, "a"),)])

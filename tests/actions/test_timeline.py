@@ -29,7 +29,11 @@ from tests.actions.toy import GO, STAY, going_and_staying
 
 @pytest.fixture(scope="module")
 def model() -> TimelineModel:
-    return learn([going_and_staying(seed) for seed in range(3)], seed=1, definitions={GO: "goes", STAY: "stays"})
+    return learn(
+        [going_and_staying(seed) for seed in range(3)],
+        seed=1,
+        definitions={GO: "goes", STAY: "stays"},
+    )
 
 
 def scores(model: TimelineModel, one: LabelledTrack) -> dict[str, float]:
@@ -38,13 +42,17 @@ def scores(model: TimelineModel, one: LabelledTrack) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("rate_hz", [15.0, 30.0, 100.0])
-def test_it_recognises_what_it_learned_at_30_frames_a_second_at_any_rate(model: TimelineModel, rate_hz: float) -> None:
+def test_it_recognises_what_it_learned_at_30_frames_a_second_at_any_rate(
+    model: TimelineModel, rate_hz: float
+) -> None:
     found = scores(model, going_and_staying(11, rate_hz))
     assert found["macro_f1"] > 0.9
     assert found["segment_f1_50"] > 0.9
 
 
-def test_no_bout_crosses_a_gap_and_every_frame_with_a_pose_has_probabilities(model: TimelineModel) -> None:
+def test_no_bout_crosses_a_gap_and_every_frame_with_a_pose_has_probabilities(
+    model: TimelineModel,
+) -> None:
     one = going_and_staying(12)
     one.track.joints_mm[300:360] = np.nan
     found = model.recognise(one.track)
@@ -56,9 +64,14 @@ def test_no_bout_crosses_a_gap_and_every_frame_with_a_pose_has_probabilities(mod
     assert all(0.0 <= bout.score <= 1.0 for bout in found.ethogram)
 
 
-def test_what_lies_on_disk_on_the_way_is_named_as_in_memory(model: TimelineModel, tmp_path: Path) -> None:
+def test_what_lies_on_disk_on_the_way_is_named_as_in_memory(
+    model: TimelineModel, tmp_path: Path
+) -> None:
     one = going_and_staying(14)
-    in_memory, on_the_disk = model.recognise(one.track), model.recognise(one.track, room=on_disk(tmp_path))
+    in_memory, on_the_disk = (
+        model.recognise(one.track),
+        model.recognise(one.track, room=on_disk(tmp_path)),
+    )
     assert on_the_disk.ethogram == in_memory.ethogram
     np.testing.assert_array_equal(on_the_disk.probability, in_memory.probability)
 
@@ -74,7 +87,9 @@ def test_a_network_says_the_same_bits_on_any_number_of_cores() -> None:
     def layer(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
         return rng.normal(0, 1, (n, m)).astype(np.float32), rng.normal(0, 1, m).astype(np.float32)
 
-    network = Network(np.zeros(140, np.float32), np.ones(140, np.float32), (layer(140, 64), layer(64, 9)))
+    network = Network(
+        np.zeros(140, np.float32), np.ones(140, np.float32), (layer(140, 64), layer(64, 9))
+    )
     features = rng.normal(0, 1, (4000, 140)).astype(np.float32)
     said = []
     for n_threads in (1, 2):
@@ -89,7 +104,9 @@ def test_a_cut_out_sequence_gets_one_word(model: TimelineModel) -> None:
     assert model.name(some_rows(one.track, slice(start + 2, start + 20))) == STAY
 
 
-def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(model: TimelineModel, tmp_path: Path) -> None:
+def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(
+    model: TimelineModel, tmp_path: Path
+) -> None:
     path = save_action_model(model, tmp_path / "own.skops")
     again = load_action_model(path)
     one = going_and_staying(14)
@@ -99,13 +116,20 @@ def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(model: Tim
         assert not [name for name in archive.namelist() if name.endswith((".pkl", ".pickle"))]
 
 
-def test_equal_models_are_equal_bytes_that_skops_reads(model: TimelineModel, tmp_path: Path) -> None:
-    first, second = (save_action_model(m, tmp_path / f"{k}.skops") for k, m in enumerate([model, deepcopy(model)]))
+def test_equal_models_are_equal_bytes_that_skops_reads(
+    model: TimelineModel, tmp_path: Path
+) -> None:
+    first, second = (
+        save_action_model(m, tmp_path / f"{k}.skops")
+        for k, m in enumerate([model, deepcopy(model)])
+    )
     assert first.read_bytes() == second.read_bytes()
     np.testing.assert_array_equal(io.load(first)["networks"][0]["centre"], model.networks[0].centre)
 
 
-def test_a_bout_that_is_never_as_fast_as_its_word_asks_for_gets_another_word(model: TimelineModel) -> None:
+def test_a_bout_that_is_never_as_fast_as_its_word_asks_for_gets_another_word(
+    model: TimelineModel,
+) -> None:
     least = dict(zip(model.words, model.peaks, strict=True))
     assert 2.0 < least[GO] < 3.2  # lengths a second: it goes at 3
     assert least[STAY] == least[""] == 0.0
@@ -149,7 +173,9 @@ def test_labels_of_one_word_only_are_refused() -> None:
         learn([LabelledTrack(one.track, np.full(len(one), GO), "m")])
 
 
-def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(model: TimelineModel) -> None:
+def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(
+    model: TimelineModel,
+) -> None:
     one = going_and_staying(15)
     rows = doubtful_stretches(model.recognise(one.track), one.track.times_ns, 6, 0.5)
     assert rows
@@ -159,17 +185,24 @@ def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(model: 
 
 def test_labels_from_a_table_are_placed_on_frames_half_open(tmp_path: Path) -> None:
     path = tmp_path / "labels.csv"
-    pd.DataFrame({"action": ["dig", "rest"], "start_s": [0.2, 0.5], "stop_s": [0.4, 0.7]}).to_csv(path, index=False)
+    pd.DataFrame({"action": ["dig", "rest"], "start_s": [0.2, 0.5], "stop_s": [0.4, 0.7]}).to_csv(
+        path, index=False
+    )
     words = words_of(read_labels(path), np.linspace(0.0, 0.9, 10))
     assert list(words) == ["", "", "dig", "dig", "", "rest", "rest", "", "", ""]
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
-    [("a,b\n1,2\n", "lacks action"), ("action,start_s,stop_s\nx,2,1\n", "starts before it stops"),
-     ("action,start_s,stop_s\nx,one,2\n", "starts before it stops")],
-)  # fmt: skip
-def test_a_table_that_holds_no_bouts_is_one_sentence(text: str, complaint: str, tmp_path: Path) -> None:
+    [
+        ("a,b\n1,2\n", "lacks action"),
+        ("action,start_s,stop_s\nx,2,1\n", "starts before it stops"),
+        ("action,start_s,stop_s\nx,one,2\n", "starts before it stops"),
+    ],
+)
+def test_a_table_that_holds_no_bouts_is_one_sentence(
+    text: str, complaint: str, tmp_path: Path
+) -> None:
     path = tmp_path / "labels.csv"
     path.write_text(text)
     with pytest.raises(LiexError, match=complaint):

@@ -19,24 +19,34 @@ def straight_track(
     """A straight body that has come way_mm (n,) along its headings."""
     skeleton, n = Skeleton.load(animal), len(times_s)
     heading = np.broadcast_to(np.asarray(heading_rad, float), (n,))
-    steps = np.diff(way_mm, prepend=way_mm[0])[:, None] * np.stack([np.cos(heading), np.sin(heading), 0 * heading], 1)
+    steps = np.diff(way_mm, prepend=way_mm[0])[:, None] * np.stack(
+        [np.cos(heading), np.sin(heading), 0 * heading], 1
+    )
     rotation = so3.exp(np.stack([0 * heading, 0 * heading, heading], axis=1))
     track = Track.empty(skeleton, np.round(times_s * 1e9).astype(np.int64), "")
     place = np.cumsum(steps, axis=0) + np.array([0.0, 0.0, 12.0])
     pose = Pose(SE3(rotation, place), np.zeros((n, skeleton.n_joints, 3)), np.ones(n))
-    track.joints_mm[:], track.root_rotation[:], track.root_mm[:] = pose.joints(skeleton), rotation, place
+    track.joints_mm[:], track.root_rotation[:], track.root_mm[:] = (
+        pose.joints(skeleton),
+        rotation,
+        place,
+    )
     track.angles_rad[:], track.scale[:], track.sd_mm[:] = 0.0, 1.0, 1.0
     track.predicted_error_mm[:] = 2.0
     return track
 
 
-def going_and_staying(seed: int, rate_hz: float = 30.0, seconds: float = 40.0, animal: str = "mouse") -> LabelledTrack:
+def going_and_staying(
+    seed: int, rate_hz: float = 30.0, seconds: float = 40.0, animal: str = "mouse"
+) -> LabelledTrack:
     """It goes at 3 lengths a second for a second or so, then stays as long; labelled, with a little noise."""
     rng = np.random.default_rng(seed)
     clock = np.arange(0.0, seconds, 1.0 / rate_hz)
     edges = np.cumsum(rng.uniform(0.8, 2.0, int(seconds)))
     going = np.searchsorted(edges, clock) % 2 == 0
     length = Skeleton.load(animal).length
-    track = straight_track(animal, clock, np.cumsum(np.where(going, 3.0 * length, 0.0)) / rate_hz, 0.4 * np.sin(clock))
+    track = straight_track(
+        animal, clock, np.cumsum(np.where(going, 3.0 * length, 0.0)) / rate_hz, 0.4 * np.sin(clock)
+    )
     track.joints_mm[:] += rng.normal(0.0, 0.3, track.joints_mm.shape)
     return LabelledTrack(track, np.where(going, GO, STAY), f"{animal}-{seed}")

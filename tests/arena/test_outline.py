@@ -40,7 +40,9 @@ def test_drawn_arenas_are_found_as_they_are() -> None:
         assert arena.kind == {"round": "round", "box": "rectangular"}[stage.kind]
         assert arena.edge == "wall"
         half = [arena.radius_mm] * 2 if arena.half_mm is None else arena.half_mm
-        np.testing.assert_allclose(np.array([arena.centre_mm, half], float), [stage.centre, stage.half], atol=4.0)
+        np.testing.assert_allclose(
+            np.array([arena.centre_mm, half], float), [stage.centre, stage.half], atol=4.0
+        )
         if arena.yaw_rad is not None:
             assert arena.yaw_rad == pytest.approx(stage.yaw, abs=0.01)
     assert min(kinds["round"], kinds["rectangular"]) >= 4
@@ -61,7 +63,10 @@ def test_an_outline_of_no_simple_shape_is_irregular() -> None:
     v, u = np.mgrid[0:240, 0:320]
     triangle = (v > 40) & (v - 40 < 1.4 * (u - 60)) & (v - 40 < 1.4 * (260 - u)) & (v < 200)
     picture = np.where(triangle, 600.0, 480.0).astype(np.float32)
-    assert find_arena(picture, find_floor(np.where(triangle, picture, 0), camera), camera).kind == "irregular"
+    assert (
+        find_arena(picture, find_floor(np.where(triangle, picture, 0), camera), camera).kind
+        == "irregular"
+    )
 
 
 def test_an_open_table_has_no_shape() -> None:
@@ -72,8 +77,15 @@ def test_an_open_table_has_no_shape() -> None:
     assert np.isnan(arena.wall_distance_mm(np.zeros((3, 2)))).all()
 
 
-@given(x=st.floats(-300, 300), y=st.floats(-300, 300), radius=st.floats(50, 500), astray=st.integers(0, 60))
-def test_a_circle_is_found_though_some_points_are_astray(x: float, y: float, radius: float, astray: int) -> None:
+@given(
+    x=st.floats(-300, 300),
+    y=st.floats(-300, 300),
+    radius=st.floats(50, 500),
+    astray=st.integers(0, 60),
+)
+def test_a_circle_is_found_though_some_points_are_astray(
+    x: float, y: float, radius: float, astray: int
+) -> None:
     rng = np.random.default_rng(astray)
     angle = rng.uniform(-2.0, 2.0, 200)
     points = np.array([x, y]) + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -87,8 +99,11 @@ def test_a_circle_is_found_though_some_points_are_astray(x: float, y: float, rad
 def test_a_rectangle_is_found_at_any_angle(yaw: float, a: float, ratio: float) -> None:
     rng = np.random.default_rng(0)
     side, along = np.arange(400) % 4, rng.uniform(-1, 1, 400)
-    local = np.where((side < 2)[:, None], np.stack([along, np.sign(side - 0.5)], -1),
-                     np.stack([np.sign(side - 2.5), along], -1)) * [a, a * ratio]  # fmt: skip
+    local = np.where(
+        (side < 2)[:, None],
+        np.stack([along, np.sign(side - 0.5)], -1),
+        np.stack([np.sign(side - 2.5), along], -1),
+    ) * [a, a * ratio]
     c, s = np.cos(yaw), np.sin(yaw)
     centre, half, found, off = fit_rectangle(local @ np.array([[c, s], [-s, c]]) + [30.0, -20.0])
     np.testing.assert_allclose(centre, [30.0, -20.0], atol=1.0)
@@ -104,14 +119,19 @@ def test_distances_to_the_wall_are_what_a_tape_would_say() -> None:
     turned = Arena("rectangular", (10.0, 0.0), None, (100.0, 50.0), np.pi / 2)
     np.testing.assert_allclose(turned.wall_distance_mm(points[:2]), [40.0, -30.0])
     bowl = Arena("round", (0.0, 30.0), 80.0)
-    np.testing.assert_allclose(bowl.wall_distance_mm(points[:3]), [50.0, 80.0 - np.hypot(90, 30), 65.0])
+    np.testing.assert_allclose(
+        bowl.wall_distance_mm(points[:3]), [50.0, 80.0 - np.hypot(90, 30), 65.0]
+    )
 
 
 @pytest.mark.parametrize(
     "arena",
-    [Arena("round", (1.5, -2.0), 200.0, None, None, 0.5, 1.0, "wall"), Arena("open", seen_share=0.25),
-     Arena("rectangular", (1.5, -2.0), None, (200.0, 100.0), 0.125, 0.5, 0.75, "drop")],
-)  # fmt: skip
+    [
+        Arena("round", (1.5, -2.0), 200.0, None, None, 0.5, 1.0, "wall"),
+        Arena("open", seen_share=0.25),
+        Arena("rectangular", (1.5, -2.0), None, (200.0, 100.0), 0.125, 0.5, 0.75, "drop"),
+    ],
+)
 def test_an_arena_survives_its_own_table(arena: Arena) -> None:
     assert Arena.from_dict(json.loads(json.dumps(arena.to_dict()))) == arena
 

@@ -28,7 +28,9 @@ def zones(folder: Path, text: str, arena: Arena = ROOM) -> tuple[Zone, ...]:
 
 
 def test_circles_and_polygons_hold_what_is_in_them(tmp_path: Path) -> None:
-    found = zones(tmp_path, """
+    found = zones(
+        tmp_path,
+        """
         [[zones]]
         name = "centre"
         circle = { centre = [0, 10.0], radius = 50 }
@@ -36,19 +38,26 @@ def test_circles_and_polygons_hold_what_is_in_them(tmp_path: Path) -> None:
         name = "left_half"
         polygon = [[-200, -200], [0, -200], [0, 200], [-200, 200]]
         unit = "mm"
-    """)  # fmt: skip
+    """,
+    )
     points = np.array([[0.0, 59.0], [-10.0, 10.0], [-100.0, 0.0], [30.0, 60.0], [np.nan, np.nan]])
     assert zone_names(found, points) == ["centre", "centre;left_half", "left_half", "", ""]
     assert [zone.to_dict()["name"] for zone in found] == ["centre", "left_half"]
 
 
 @given(drawn=corners, x=st.floats(-120, 120), y=st.floats(-120, 120))
-def test_a_polygon_holds_a_point_round_which_it_winds(drawn: list[tuple[float, float]], x: float, y: float) -> None:
+def test_a_polygon_holds_a_point_round_which_it_winds(
+    drawn: list[tuple[float, float]], x: float, y: float
+) -> None:
     """An odd number of crossings is an odd winding number, which is told from the angles alone."""
     off = np.array(drawn) - [x, y]
     if np.hypot(*off.T).min() < 1e-6:
         return
-    turn = np.angle(np.exp(1j * np.diff(np.arctan2(off[:, 1], off[:, 0]), append=np.arctan2(off[0, 1], off[0, 0]))))
+    turn = np.angle(
+        np.exp(
+            1j * np.diff(np.arctan2(off[:, 1], off[:, 0]), append=np.arctan2(off[0, 1], off[0, 0]))
+        )
+    )
     if np.abs(np.abs(turn) - np.pi).min() < 1e-6:
         return  # on a side
     winding = round(float(turn.sum()) / (2 * np.pi))
@@ -56,7 +65,9 @@ def test_a_polygon_holds_a_point_round_which_it_winds(drawn: list[tuple[float, f
 
 
 def test_zones_drawn_in_the_picture_lie_on_the_floor(tmp_path: Path) -> None:
-    (square, disc) = zones(tmp_path, """
+    (square, disc) = zones(
+        tmp_path,
+        """
         [[zones]]
         name = "square"
         unit = "px"
@@ -65,11 +76,14 @@ def test_zones_drawn_in_the_picture_lie_on_the_floor(tmp_path: Path) -> None:
         name = "disc"
         unit = "px"
         circle = { centre = [160, 120], radius = 40 }
-    """)  # fmt: skip
+    """,
+    )
     rng = np.random.default_rng(1)
     uv = rng.uniform([0, 0], [319, 239], (500, 2))
     a, b, c = FLOOR.inverse_depth
-    on_floor = (FLOOR.T_arena_camera @ CAMERA.unproject(uv, 1.0 / (a * uv[:, 0] + b * uv[:, 1] + c)))[:, :2]
+    on_floor = (
+        FLOOR.T_arena_camera @ CAMERA.unproject(uv, 1.0 / (a * uv[:, 0] + b * uv[:, 1] + c))
+    )[:, :2]
     in_square = ((uv > [100, 60]) & (uv < [220, 180])).all(axis=1)
     np.testing.assert_array_equal(square.holds(on_floor), in_square)
     off = np.hypot(*(uv - [160, 120]).T)
@@ -78,7 +92,9 @@ def test_zones_drawn_in_the_picture_lie_on_the_floor(tmp_path: Path) -> None:
 
 
 def test_zones_relative_to_the_centre_turn_with_the_arena(tmp_path: Path) -> None:
-    middle, corner = zones(tmp_path, """
+    middle, corner = zones(
+        tmp_path,
+        """
         [[zones]]
         name = "middle"
         relative_to = "centre"
@@ -87,10 +103,13 @@ def test_zones_relative_to_the_centre_turn_with_the_arena(tmp_path: Path) -> Non
         name = "corner"
         relative_to = "centre"
         polygon = [[150, 100], [200, 100], [200, 150], [150, 150]]
-    """)  # fmt: skip
+    """,
+    )
     assert middle.circle_mm == (40.0, -30.0, 50.0)
     assert corner.polygon_mm is not None
-    np.testing.assert_allclose(ROOM.wall_distance_mm(np.array(corner.polygon_mm)), [50, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        ROOM.wall_distance_mm(np.array(corner.polygon_mm)), [50, 0, 0, 0], atol=1e-9
+    )
 
 
 SLIPS = [
@@ -104,14 +123,26 @@ SLIPS = [
     ("[[zones]]\nname = 'left half'\npolygon = []", "letters, digits"),
     ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1]]", "at least three corners"),
     ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1], [2, 2]]", "enclose no area"),
-    ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [9, 9], [9, 0], [0, 8]]", "sides 1 and 3 of the polygon cross"),
+    (
+        "[[zones]]\nname = 'a'\npolygon = [[0, 0], [9, 9], [9, 0], [0, 8]]",
+        "sides 1 and 3 of the polygon cross",
+    ),
     ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 'x'], [2, 2]]", "a pair of numbers"),
     ("[[zones]]\nname = 'a'\ncircle = { centre = [0, 0], radius = 0 }", "positive number, got 0"),
     ("[[zones]]\nname = 'a'\ncircle = { centre = [0, inf], radius = 4 }", "a pair of numbers"),
     ("[[zones]]\nname = 'a'\ncircle = [0, 0, 4]", "a circle is written as"),
-    ("[[zones]]\nname = 'a'\nunit = 'cm'\ncircle = { centre = [0, 0], radius = 4 }", 'unit = "mm" or "px"'),
-    ("[[zones]]\nname = 'a'\nunit = 'px'\ncircle = { centre = [-9e5, 0], radius = 4 }", "above the horizon"),
-    (2 * "[[zones]]\nname = 'a'\ncircle = { centre = [0, 0], radius = 4 }\n", "two zones called 'a'"),
+    (
+        "[[zones]]\nname = 'a'\nunit = 'cm'\ncircle = { centre = [0, 0], radius = 4 }",
+        'unit = "mm" or "px"',
+    ),
+    (
+        "[[zones]]\nname = 'a'\nunit = 'px'\ncircle = { centre = [-9e5, 0], radius = 4 }",
+        "above the horizon",
+    ),
+    (
+        2 * "[[zones]]\nname = 'a'\ncircle = { centre = [0, 0], radius = 4 }\n",
+        "two zones called 'a'",
+    ),
 ]
 
 

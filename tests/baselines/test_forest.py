@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from liex_lab.baselines import _forest as kernels
 from liex_lab.baselines.ablations import PlainMean
 from liex_lab.baselines.baseline import see
-from liex_lab.baselines.forest import ForestPlan, RegressionForest, coordinates, levers, train_forests
+from liex_lab.baselines.forest import (
+    ForestPlan,
+    RegressionForest,
+    coordinates,
+    levers,
+    train_forests,
+)
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
@@ -24,14 +30,18 @@ from tests.estimation.toy import FLOOR, SCENE, Toy, toy_mice, trained, training_
 
 PAPER = METHODS["paper"]
 SMALL = ForestPlan(
-    GrowthPlan(7, 20, 8, 60, 0.5, 0.0, 0.0, 0.63), GrowthPlan(12, 20, 5, 60, 0.5, 0.0, 0.0, 0.63), training_points=8
+    GrowthPlan(7, 20, 8, 60, 0.5, 0.0, 0.0, 0.63),
+    GrowthPlan(12, 20, 5, 60, 0.5, 0.0, 0.0, 0.63),
+    training_points=8,
 )
 
 
 @pytest.fixture(scope="module")
 def grown() -> RegressionForest:
     toy = toy_mice(500, 1)
-    return train_forests(training_set(toy, PAPER), toy.skeleton, SMALL, np.random.default_rng(0), lambda *_: None)
+    return train_forests(
+        training_set(toy, PAPER), toy.skeleton, SMALL, np.random.default_rng(0), lambda *_: None
+    )
 
 
 def true_joints(toy: Toy) -> np.ndarray:
@@ -68,13 +78,25 @@ def test_the_true_coordinates_unfold_to_the_true_pose():
     rng = np.random.default_rng(0)
     places = data.truth.positions[:, 0] + rng.normal(0, 10, (5, 3))
     turn = so3.log(data.truth.rotations[:, 0])[:, 2]
-    headings = np.arctan2(data.truth.rotations[:, 0, 1, 0], data.truth.rotations[:, 0, 0, 0]) + rng.normal(0, 0.5, 5)
+    headings = np.arctan2(
+        data.truth.rotations[:, 0, 1, 0], data.truth.rotations[:, 0, 0, 0]
+    ) + rng.normal(0, 0.5, 5)
     assert np.abs(turn).max() > 1.0  # they look in all directions
     values = coordinates(data, skeleton, np.arange(5, dtype=np.int32), places, headings)
     for k in range(5):
         rotations, positions = np.empty((skeleton.n_joints, 3, 3)), np.empty((skeleton.n_joints, 3))
-        scale = kernels.unfold(values[k], levers(skeleton), places[k], headings[k], skeleton.parents, skeleton.offsets,
-                               skeleton.rest, skeleton.axes, rotations, positions)  # fmt: skip
+        scale = kernels.unfold(
+            values[k],
+            levers(skeleton),
+            places[k],
+            headings[k],
+            skeleton.parents,
+            skeleton.offsets,
+            skeleton.rest,
+            skeleton.axes,
+            rotations,
+            positions,
+        )
         np.testing.assert_allclose(positions, data.truth.positions[k], atol=1e-6)
         assert scale == pytest.approx(data.truth.scale[k])
 
@@ -99,7 +121,9 @@ def test_points_lie_on_the_animal_and_are_spread_over_all_of_it(n_points, phase)
 @given(heading=st.floats(-np.pi, np.pi), n_wrong=st.integers(0, 8))
 def test_the_heading_is_that_of_the_majority(heading, n_wrong):
     rng = np.random.default_rng(n_wrong)
-    angles = np.concatenate([heading + rng.normal(0, 0.1, 20), heading + np.pi + rng.normal(0, 0.1, n_wrong)])
+    angles = np.concatenate(
+        [heading + rng.normal(0, 0.1, 20), heading + np.pi + rng.normal(0, 0.1, n_wrong)]
+    )
     votes = 30 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     assert abs(np.angle(np.exp(1j * (kernels.heading_of(votes) - heading)))) < 0.15
 
@@ -109,24 +133,34 @@ def test_it_measures_mice_that_it_has_not_seen(grown):
     guesses = grown.estimate(toy.depths, SCENE, grown.find_size(toy.depths, SCENE))
     assert guesses.found.all()
     error = np.linalg.norm(guesses.joints - true_joints(toy), axis=-1).mean(axis=1)
-    middle = np.linalg.norm(true_joints(toy) - true_joints(toy).mean(axis=1, keepdims=True), axis=-1).mean()
+    middle = np.linalg.norm(
+        true_joints(toy) - true_joints(toy).mean(axis=1, keepdims=True), axis=-1
+    ).mean()
     assert np.median(error) < 6.0 < middle  # far better than the animal's centre for every joint
     assert (error < 12.0).mean() > 0.75
 
 
 def test_one_core_gives_what_two_give_and_a_second_training_the_same_forest(grown):
     toy = toy_mice(40, 4)
-    one, two = (grown.estimate(toy.depths, SCENE, 1.0, parallel).joints for parallel in (False, True))
+    one, two = (
+        grown.estimate(toy.depths, SCENE, 1.0, parallel).joints for parallel in (False, True)
+    )
     np.testing.assert_array_equal(one, two)
     few = toy_mice(60, 1)
     data = training_set(few, PAPER)
-    a, b = (train_forests(data, few.skeleton, SMALL, np.random.default_rng(3), lambda *_: None) for _ in range(2))
+    a, b = (
+        train_forests(data, few.skeleton, SMALL, np.random.default_rng(3), lambda *_: None)
+        for _ in range(2)
+    )
     assert a.to_bytes() == b.to_bytes()
 
 
 def test_bones_keep_their_proportions(grown):
     toy = toy_mice(20, 4)
-    joints, home = grown.estimate(toy.depths, SCENE, 1.0).joints, np.linalg.norm(toy.skeleton.offsets[1:], axis=-1)
+    joints, home = (
+        grown.estimate(toy.depths, SCENE, 1.0).joints,
+        np.linalg.norm(toy.skeleton.offsets[1:], axis=-1),
+    )
     bones = np.linalg.norm(np.diff(joints, axis=1), axis=-1) / home
     np.testing.assert_allclose(bones, bones[:, :1] * np.ones(4), rtol=1e-6)
 
@@ -160,9 +194,13 @@ def test_the_plain_mean_is_the_mean_of_all_candidates():
     _, positions, _, _ = estimator.candidates(crops, looks, 1.0)
     guesses = PlainMean(estimator).estimate(toy.depths, SCENE, 1.0)
     np.testing.assert_allclose(
-        guesses.joints, (positions.mean(axis=1) - [0, 0, 1] * looks[:, None, 13:14]) * [1, -1, -1], atol=1e-9
+        guesses.joints,
+        (positions.mean(axis=1) - [0, 0, 1] * looks[:, None, 13:14]) * [1, -1, -1],
+        atol=1e-9,
     )
     one = replace(estimator, n_candidates=1)
     alone = PlainMean(one).estimate(toy.depths, SCENE, 1.0).joints
     chosen = one.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(toy.skeleton)
-    np.testing.assert_allclose(alone, chosen, atol=1e-6)  # of one candidate there is nothing to choose
+    np.testing.assert_allclose(
+        alone, chosen, atol=1e-6
+    )  # of one candidate there is nothing to choose

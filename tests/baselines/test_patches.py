@@ -40,7 +40,9 @@ def patch_by_hand(heights: np.ndarray, look: np.ndarray) -> np.ndarray:
     middle = np.array([(rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2])
     mean = heights[heights > 0].mean() / 16
     half_mm = 0.5 * side * look[16] * (look[13] - mean) / np.sqrt(look[0] * look[1])
-    shade = np.where(heights > 0, np.clip(127.5 + 127.5 * (heights / 16 - mean) / half_mm, 1, 255), 0)
+    shade = np.where(
+        heights > 0, np.clip(127.5 + 127.5 * (heights / 16 - mean) / half_mm, 1, 255), 0
+    )
     padded = np.pad(shade, 100)
     out = np.empty((PATCH, PATCH))
     for i in range(PATCH):
@@ -77,7 +79,9 @@ def test_the_animal_fills_its_patch_and_its_middle_is_grey(data):
     for patch in patches:
         rows, columns = np.nonzero(patch > 0)
         assert max(np.ptp(rows), np.ptp(columns)) == pytest.approx(PATCH / 1.1, abs=12)
-        assert np.median(patch[patch > 0]) == pytest.approx(127.5, abs=20)  # its outline fades into the background
+        assert np.median(patch[patch > 0]) == pytest.approx(
+            127.5, abs=20
+        )  # its outline fades into the background
 
 
 def test_a_camera_of_twice_the_resolution_sees_the_same_patch_and_the_same_joints():
@@ -87,15 +91,22 @@ def test_a_camera_of_twice_the_resolution_sees_the_same_patch_and_the_same_joint
     finer[:, 14:17] *= 2
     joints = np.random.default_rng(0).uniform([-50, -50, 500], [50, 50, 700], (2, 4, 3))
     one, two = frames_of(heights, looks), frames_of(heights, finer)
-    np.testing.assert_allclose(patches_of(heights, looks, one), patches_of(heights, finer, two), atol=1e-3)
-    np.testing.assert_allclose(targets_of(joints, looks, one), targets_of(joints, finer, two), atol=1e-5)
+    np.testing.assert_allclose(
+        patches_of(heights, looks, one), patches_of(heights, finer, two), atol=1e-3
+    )
+    np.testing.assert_allclose(
+        targets_of(joints, looks, one), targets_of(joints, finer, two), atol=1e-5
+    )
 
 
 def test_a_joint_in_the_middle_of_the_square_at_the_mean_depth_is_zero_and_nearer_is_positive():
     heights, looks = drawn(2)
     frames = frames_of(heights, looks)
     z = frames[:, 3] - [0.0, 10.0]
-    x, y = (frames[:, 0] - looks[:, 2]) / looks[:, 0] * z, (frames[:, 1] - looks[:, 3]) / looks[:, 1] * z
+    x, y = (
+        (frames[:, 0] - looks[:, 2]) / looks[:, 0] * z,
+        (frames[:, 1] - looks[:, 3]) / looks[:, 1] * z,
+    )
     told = targets_of(np.stack([x, y, z], axis=-1)[:, None], looks, frames)
     np.testing.assert_allclose(told[0], 0.0, atol=1e-6)
     assert told[1, 2] == pytest.approx(10.0 / frames[1, 4])
@@ -118,7 +129,8 @@ if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pypro
         toy = toy_mice(64, 6)
         some = training_set(toy, METHODS["paper"])
         nets = [
-            train_cnn(some, toy.skeleton, plan, np.random.default_rng(0), lambda share, what: None) for _ in range(2)
+            train_cnn(some, toy.skeleton, plan, np.random.default_rng(0), lambda share, what: None)
+            for _ in range(2)
         ]
         heights, looks = some.images.heights[:32], some.images.looks[:32]
         said = nets[0].joints(heights, looks)

@@ -36,17 +36,30 @@ class SwimmingFish:
         n, time = len(self.times_s), self.times_s
         xyz = self.joints()
         xyz[list(self.lost)] = np.nan
-        frames = pd.DataFrame({
-            "session_id": "swim", "individual": "fish_1", "frame_index": np.arange(n), "time_s": time,
-            "dt_s": np.append(np.nan, np.diff(time)), "flag": "", "zone": "", "spine_mm": LENGTH_MM,
-            "wall_distance_mm": np.nan,
-        })  # fmt: skip
+        frames = pd.DataFrame(
+            {
+                "session_id": "swim",
+                "individual": "fish_1",
+                "frame_index": np.arange(n),
+                "time_s": time,
+                "dt_s": np.append(np.nan, np.diff(time)),
+                "flag": "",
+                "zone": "",
+                "spine_mm": LENGTH_MM,
+                "wall_distance_mm": np.nan,
+            }
+        )
         flat = xyz.reshape(-1, 3)
-        poses = pd.DataFrame({
-            "frame_index": np.repeat(np.arange(n), len(JOINTS)), "joint": np.tile(JOINTS, n),
-            "x_mm": flat[:, 0], "y_mm": flat[:, 1], "z_mm": flat[:, 2],
-            "sd_mm": np.where(np.isfinite(flat[:, 0]), self.sd_mm, np.nan),
-        })  # fmt: skip
+        poses = pd.DataFrame(
+            {
+                "frame_index": np.repeat(np.arange(n), len(JOINTS)),
+                "joint": np.tile(JOINTS, n),
+                "x_mm": flat[:, 0],
+                "y_mm": flat[:, 1],
+                "z_mm": flat[:, 2],
+                "sd_mm": np.where(np.isfinite(flat[:, 0]), self.sd_mm, np.nan),
+            }
+        )
         return frames, poses
 
     def joints(self) -> np.ndarray:
@@ -57,20 +70,39 @@ class SwimmingFish:
         share = np.arange(1, 20) / 20.0
         late = (time[:, None] - self.still_until_s) - self.wave_s * share
         # the wave grows from nothing at the head, whose front quarter is stiff, to the tail
-        turns = self.beat_rad * np.clip(share - 0.25, 0, 1) / 0.75 * np.sin(2 * np.pi * self.beat_hz * late)
+        turns = (
+            self.beat_rad
+            * np.clip(share - 0.25, 0, 1)
+            / 0.75
+            * np.sin(2 * np.pi * self.beat_hz * late)
+        )
         turns = np.where(late > 0, turns, 0.0)
         direction = (
-            heading[:, None] + np.pi - np.concatenate([np.zeros((len(time), 1)), np.cumsum(turns, axis=1)], axis=1)
+            heading[:, None]
+            + np.pi
+            - np.concatenate([np.zeros((len(time), 1)), np.cumsum(turns, axis=1)], axis=1)
         )
-        bone = LENGTH_MM / 20.0 * np.stack([np.cos(direction), np.sin(direction), 0 * direction], axis=-1)
+        bone = (
+            LENGTH_MM
+            / 20.0
+            * np.stack([np.cos(direction), np.sin(direction), 0 * direction], axis=-1)
+        )
         joints = np.concatenate([np.zeros((len(time), 1, 3)), np.cumsum(bone, axis=1)], axis=1)
-        centre = np.stack([self.radius_mm * np.cos(turned), self.radius_mm * np.sin(turned),
-                           self.height_mm + self.climb_mm_s * time], axis=-1)  # fmt: skip
+        centre = np.stack(
+            [
+                self.radius_mm * np.cos(turned),
+                self.radius_mm * np.sin(turned),
+                self.height_mm + self.climb_mm_s * time,
+            ],
+            axis=-1,
+        )
         return joints + (centre - joints[:, :11].mean(axis=1))[:, None]
 
 
 def uneven(seconds: float, fps: float, seed: int = 3) -> np.ndarray:
     """Times of a camera whose clock is off by up to a fifth of a frame each time."""
     rng = np.random.default_rng(seed)
-    times = np.arange(round(seconds * fps)) / fps + rng.uniform(-0.2, 0.2, round(seconds * fps)) / fps
+    times = (
+        np.arange(round(seconds * fps)) / fps + rng.uniform(-0.2, 0.2, round(seconds * fps)) / fps
+    )
     return times - times[0]

@@ -24,7 +24,9 @@ def test_a_rear_is_found_once_with_its_rise_and_its_fall():
     bouts = bouts_of(WalkingMouse(steady(4.0), rear_s=(1.0, 2.2)))
     assert list(bouts["action"]) == ["walk", "rear", "walk"]
     rear = bouts.iloc[1]
-    assert rear["start_s"] == pytest.approx(1.06, abs=0.04)  # two thirds of 40 mm are reached 0.05 s into the rise
+    assert rear["start_s"] == pytest.approx(
+        1.06, abs=0.04
+    )  # two thirds of 40 mm are reached 0.05 s into the rise
     assert rear["stop_s"] == pytest.approx(2.15, abs=0.04)
     assert rear["duration_s"] == pytest.approx(rear["stop_s"] - rear["start_s"])
     assert rear["peak_nose_height_mm"] > 80
@@ -44,7 +46,9 @@ def test_speed_names_the_stretch(speed, word):
 
 
 def test_bouts_are_half_open_ordered_and_do_not_overlap():
-    mouse = WalkingMouse(np.delete(steady(6.0), slice(100, 104)), rear_s=(1.0, 2.0), lost=(120, 121))
+    mouse = WalkingMouse(
+        np.delete(steady(6.0), slice(100, 104)), rear_s=(1.0, 2.0), lost=(120, 121)
+    )
     bouts = bouts_of(mouse)
     assert (bouts["stop_s"].to_numpy()[:-1] <= bouts["start_s"].to_numpy()[1:] + 1e-9).all()
     assert (bouts["stop_frame"].to_numpy()[:-1] <= bouts["start_frame"].to_numpy()[1:]).all()
@@ -85,7 +89,9 @@ def test_short_pauses_are_bridged_before_short_bouts_are_dropped():
     time: np.ndarray = np.arange(40) * 0.1
     mask = np.zeros(40, bool)
     mask[[0, 1, 4, 5, 10, 20, 21, 22]] = True  # 0-0.2, 0.4-0.6 | 1.0-1.1 | 2.0-2.3
-    bouts = list(tidy(mask, np.ones(40, bool), np.zeros(40, np.int64), time, stop_times(time), MouseRules()))
+    bouts = list(
+        tidy(mask, np.ones(40, bool), np.zeros(40, np.int64), time, stop_times(time), MouseRules())
+    )
     assert bouts == [(0, 6), (20, 23)]
     taken = np.ones(40, bool)
     taken[2:4] = False  # another action holds the frames between

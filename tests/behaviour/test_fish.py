@@ -17,18 +17,33 @@ def one_bout(moved: pd.DataFrame, action: str = "scoot") -> pd.Series:
     """All frames as one bout of a person's making, measured."""
     step = float(moved["time_s"].diff().median())
     stop = moved["time_s"].iloc[-1] + step
-    bouts = to_pandas(BOUTS, {
-        "session_id": "swim", "individual": "fish_1", "action": [action], "start_s": [0.0], "stop_s": [stop],
-        "duration_s": [stop], "start_frame": [0], "stop_frame": [len(moved)], "score": [1.0], "source": ["human"],
-        "model_hash": [""],
-    })  # fmt: skip
+    bouts = to_pandas(
+        BOUTS,
+        {
+            "session_id": "swim",
+            "individual": "fish_1",
+            "action": [action],
+            "start_s": [0.0],
+            "stop_s": [stop],
+            "duration_s": [stop],
+            "start_frame": [0],
+            "stop_frame": [len(moved)],
+            "score": [1.0],
+            "source": ["human"],
+            "model_hash": [""],
+        },
+    )
     return measure_bouts(bouts, moved).iloc[0]
 
 
 def test_a_fish_on_a_circle_of_10_mm_at_2_rad_a_second_before_an_uneven_clock():
     times = uneven(6.0, 50.0)
-    moved = kinematics(*SwimmingFish(np.delete(times, [40, 90, 91, 92]), radius_mm=10.0, turn_rad_s=2.0).tables())
-    np.testing.assert_allclose(moved["speed_mm_s"], 20.0, rtol=2e-3)  # a chord is shorter than its arc by 0.1 %
+    moved = kinematics(
+        *SwimmingFish(np.delete(times, [40, 90, 91, 92]), radius_mm=10.0, turn_rad_s=2.0).tables()
+    )
+    np.testing.assert_allclose(
+        moved["speed_mm_s"], 20.0, rtol=2e-3
+    )  # a chord is shorter than its arc by 0.1 %
     np.testing.assert_allclose(moved["yaw_rate_rad_s"], 2.0, rtol=1e-9)
     np.testing.assert_allclose(moved["acceleration_mm_s2"], 0.0, atol=1.0)
     np.testing.assert_allclose(moved["vertical_speed_mm_s"], 0.0, atol=1e-9)
@@ -37,7 +52,9 @@ def test_a_fish_on_a_circle_of_10_mm_at_2_rad_a_second_before_an_uneven_clock():
     np.testing.assert_allclose(moved["straightness"], 1.0)
     np.testing.assert_allclose(moved["length_mm"], LENGTH_MM)
     bout = one_bout(moved)
-    seen_s = 6.0 - 4 * 0.02  # three frames at once leave a gap; the one that is missing alone does, too
+    seen_s = (
+        6.0 - 4 * 0.02
+    )  # three frames at once leave a gap; the one that is missing alone does, too
     assert bout["path_mm"] == pytest.approx(20.0 * seen_s, rel=1e-2)
     assert bout["net_turn_rad"] == pytest.approx(2.0 * times[-1], rel=1e-6)
     assert bout["heading_range_rad"] == pytest.approx(bout["net_turn_rad"])
@@ -64,14 +81,20 @@ def test_the_standard_deviations_are_those_of_simulated_errors():
     common = fish.sd_mm * lasting(rng, 8000, 3, 0.02)
     shifted[["x_mm", "y_mm", "z_mm"]] += np.repeat(common, 21, axis=0)
     moved = kinematics(frames, shifted)
-    assert moved["vertical_speed_mm_s"].std() == pytest.approx(moved["speed_sd_mm_s"].median(), rel=0.05)
+    assert moved["vertical_speed_mm_s"].std() == pytest.approx(
+        moved["speed_sd_mm_s"].median(), rel=0.05
+    )
     each = poses.copy()
     each[["x_mm", "y_mm", "z_mm"]] += fish.sd_mm * lasting(rng, 8000, 63, 0.02).reshape(-1, 3)
     moved, true = kinematics(frames, each), kinematics(frames, poses)
     off = np.angle(np.exp(1j * (moved["heading_rad"] - true["heading_rad"])))
     assert off.std() == pytest.approx(moved["heading_sd_rad"].median(), rel=0.05)
-    assert (moved["yaw_rate_rad_s"] - 0.2).std() == pytest.approx(moved["yaw_rate_sd_rad_s"].median(), rel=0.05)
-    assert moved["body_pitch_rad"].std() == pytest.approx(moved["body_pitch_sd_rad"].median(), rel=0.05)
+    assert (moved["yaw_rate_rad_s"] - 0.2).std() == pytest.approx(
+        moved["yaw_rate_sd_rad_s"].median(), rel=0.05
+    )
+    assert moved["body_pitch_rad"].std() == pytest.approx(
+        moved["body_pitch_sd_rad"].median(), rel=0.05
+    )
 
 
 @pytest.mark.parametrize(("hertz", "fps"), [(3.0, 30.0), (5.0, 60.0), (8.0, 100.0)])
@@ -98,7 +121,9 @@ def test_the_wave_runs_down_the_body_as_fast_as_it_was_made():
 
 
 def test_a_beat_too_fast_for_the_camera_is_left_empty():
-    moved = kinematics(*SwimmingFish(np.arange(120) / 30.0, turn_rad_s=0.0, beat_hz=9.0, sd_mm=0.02).tables())
+    moved = kinematics(
+        *SwimmingFish(np.arange(120) / 30.0, turn_rad_s=0.0, beat_hz=9.0, sd_mm=0.02).tables()
+    )
     assert moved["tail_beat_hz"].isna().all()  # 9 Hz at 30 frames/s: more than a quarter
     bout = one_bout(moved)
     assert np.isnan(bout["wave_speed_mm_s"])  # and a camera of 30 frames/s sees no wave
@@ -121,7 +146,11 @@ def test_a_tail_to_the_left_is_a_positive_bend():
     tail = poses["joint"].isin(["spine_17", "spine_18", "spine_19", "tail_tip"])
     poses.loc[tail, "x_mm"] -= 3.0
     moved = kinematics(frames, poses)
-    assert heading @ [np.cos(moved["heading_rad"][0]), np.sin(moved["heading_rad"][0]), 0] == pytest.approx(1.0)
+    assert heading @ [
+        np.cos(moved["heading_rad"][0]),
+        np.sin(moved["heading_rad"][0]),
+        0,
+    ] == pytest.approx(1.0)
     assert (moved["tail_mm"] > 2.9).all()
     assert (moved["tail_angle_rad"] > 0).all()
     assert (moved["bend_middle_rad"].abs() < 1e-9).all()
@@ -138,7 +167,9 @@ def test_a_half_circle_is_bent_by_nearly_pi_and_as_straight_as_its_chord():
 
 
 def test_speed_of_a_swimming_animal_has_its_vertical_part():
-    moved = kinematics(*SwimmingFish(np.arange(100) / 50.0, turn_rad_s=0.0, climb_mm_s=-15.0).tables())
+    moved = kinematics(
+        *SwimmingFish(np.arange(100) / 50.0, turn_rad_s=0.0, climb_mm_s=-15.0).tables()
+    )
     np.testing.assert_allclose(moved["speed_mm_s"], 15.0)
     np.testing.assert_allclose(moved["vertical_speed_mm_s"], -15.0)
     assert one_bout(moved, "dive")["rise_mm"] == pytest.approx(-15.0 * 99 / 50)

@@ -22,8 +22,12 @@ from tests.sessions.walking_mouse import WalkingMouse, steady
 def tables_of(mouse: WalkingMouse) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The tables `frames` and `poses` of a mouse."""
     times = mouse.times_ns
-    rows = Rows(mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times)))
-    poses = pd.concat([tables.to_pandas(tables.POSES, block) for block in rows.poses()], ignore_index=True)
+    rows = Rows(
+        mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times))
+    )
+    poses = pd.concat(
+        [tables.to_pandas(tables.POSES, block) for block in rows.poses()], ignore_index=True
+    )
     return rows.frames_table(), poses
 
 
@@ -38,14 +42,18 @@ def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
 
 @pytest.mark.parametrize("fps", [10.0, 25.0, 30.0, 60.0, 200.0])
 def test_the_speed_does_not_depend_on_the_frame_rate(fps):
-    moved = kinematics(*tables_of(WalkingMouse(steady(3.0, fps), speed_mm_s=150.0, radius_mm=300.0)))
+    moved = kinematics(
+        *tables_of(WalkingMouse(steady(3.0, fps), speed_mm_s=150.0, radius_mm=300.0))
+    )
     np.testing.assert_allclose(moved["speed_mm_s"], 150.0, rtol=2e-3)
 
 
 @pytest.mark.parametrize("swims", [False, True])
 def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, monkeypatch):
     fish = SwimmingFish(np.delete(steady(3.0), [30, 31, 60]), beat_hz=4.0, lost=(10, 11, 25))
-    mouse = WalkingMouse(np.delete(steady(3.0), [30, 31, 60]), radius_mm=100.0, rear_s=(1.0, 2.0), lost=(10, 11, 25))
+    mouse = WalkingMouse(
+        np.delete(steady(3.0), [30, 31, 60]), radius_mm=100.0, rear_s=(1.0, 2.0), lost=(10, 11, 25)
+    )
     told = fish.tables() if swims else tables_of(mouse)
     in_memory = kinematics(*told, surface_z_mm=90.0)
     monkeypatch.setattr(import_module("liex_lab.behaviour.kinematics"), "_BLOCK", 16)
@@ -74,19 +82,29 @@ def test_no_difference_is_taken_across_a_gap():
 
 def test_a_lost_animal_has_no_speed_and_its_neighbours_have_their_own():
     moved = kinematics(*tables_of(WalkingMouse(steady(2.0), lost=(10, 11, 25, 27))))
-    assert list(np.flatnonzero(moved["speed_mm_s"].isna())) == [10, 11, 25, 26, 27]  # 26 stands alone
+    assert list(np.flatnonzero(moved["speed_mm_s"].isna())) == [
+        10,
+        11,
+        25,
+        26,
+        27,
+    ]  # 26 stands alone
     np.testing.assert_allclose(moved["speed_mm_s"].dropna(), 200.0, rtol=1e-3)
     assert len(moved) == 60
 
 
 def test_heights_and_pitch_follow_a_rear():
-    moved = kinematics(*tables_of(WalkingMouse(steady(3.0), rear_s=(1.0, 2.0)))).set_index("frame_index")
+    moved = kinematics(*tables_of(WalkingMouse(steady(3.0), rear_s=(1.0, 2.0)))).set_index(
+        "frame_index"
+    )
     up, down = moved.loc[45], moved.loc[0]
     assert up["body_pitch_rad"] == pytest.approx(np.radians(55.0))
     assert up["nose_over_rump_mm"] == pytest.approx(90.0 * np.sin(np.radians(55.0)))
     assert down["nose_over_rump_mm"] == pytest.approx(0.0, abs=1e-9)
     assert up["nose_height_mm"] > up["back_height_mm"] > down["back_height_mm"]
-    np.testing.assert_allclose(moved["speed_mm_s"], 200.0, rtol=1e-3)  # the body's centre goes on as before
+    np.testing.assert_allclose(
+        moved["speed_mm_s"], 200.0, rtol=1e-3
+    )  # the body's centre goes on as before
 
 
 def test_an_upright_animal_has_no_heading():
@@ -129,7 +147,12 @@ def test_body_points_are_found_by_name_or_along_the_chain():
     named = Body.of(["neck", "loin", "chest", "rump", "nose"])
     assert (named.front, named.rear, named.axis, named.swims) == (4, 3, (3, 0), False)
     chain = Body.of(["a", "b", "c", "d"])
-    assert (chain.spine, chain.axis, chain.back, chain.trunk) == ((3, 2, 1, 0), (0, 2), (2, 1), (0, 1, 2))
+    assert (chain.spine, chain.axis, chain.back, chain.trunk) == (
+        (3, 2, 1, 0),
+        (0, 2),
+        (2, 1),
+        (0, 1, 2),
+    )
     fish = Body.of(["head", *(f"spine_{k}" for k in range(8)), "tail_tip"])
     assert (fish.front, fish.rear, fish.axis, fish.swims) == (0, 9, (2, 0), True)
     alone = Body.of(["a"])
@@ -153,5 +176,9 @@ def test_measures_made_in_blocks_from_the_track_are_those_of_the_whole_table(mon
     mouse = WalkingMouse(steady(2.0), lost=(10, 11, 25))
     frames, poses = tables_of(mouse)
     whole = kinematics(frames, poses)
-    monkeypatch.setitem(kinematics.__globals__, "_BLOCK", 7)  # the package names the function like its module
-    pd.testing.assert_frame_equal(kinematics(frames, Joints.of_track(mouse.track())), whole, check_exact=True)
+    monkeypatch.setitem(
+        kinematics.__globals__, "_BLOCK", 7
+    )  # the package names the function like its module
+    pd.testing.assert_frame_equal(
+        kinematics(frames, Joints.of_track(mouse.track())), whole, check_exact=True
+    )

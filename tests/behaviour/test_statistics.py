@@ -19,13 +19,20 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 RNG = np.random.default_rng(0)
 
 
-def study(n: int, *, cage: list[str] | None = None, batch: list[str] | None = None, values: Any = None) -> pd.DataFrame:
+def study(
+    n: int, *, cage: list[str] | None = None, batch: list[str] | None = None, values: Any = None
+) -> pd.DataFrame:
     """n animals in each of the groups a and b, a session each."""
-    return pd.DataFrame({
-        "subject_id": [f"m{k}" for k in range(2 * n)], "group": ["a"] * n + ["b"] * n,
-        "cage": cage or [""] * (2 * n), "batch": batch or [""] * (2 * n),
-        "speed": np.random.default_rng(1).normal(size=2 * n) if values is None else values, "observed_s": 60.0,
-    })  # fmt: skip
+    return pd.DataFrame(
+        {
+            "subject_id": [f"m{k}" for k in range(2 * n)],
+            "group": ["a"] * n + ["b"] * n,
+            "cage": cage or [""] * (2 * n),
+            "batch": batch or [""] * (2 * n),
+            "speed": np.random.default_rng(1).normal(size=2 * n) if values is None else values,
+            "observed_s": 60.0,
+        }
+    )
 
 
 def only(table: pd.DataFrame, **options: Any) -> dict[str, Any]:
@@ -47,7 +54,12 @@ def test_the_permutation_is_the_count_a_reader_would_make():
     row = only(table)
     assert row["p"] == pytest.approx(slow)
     assert row["estimate"] == pytest.approx(y[5:].mean() - y[:5].mean())
-    assert (row["unit"], row["n_units_first"], row["n_animals"], row["n_sessions"]) == ("animal", 5, 10, 10)
+    assert (row["unit"], row["n_units_first"], row["n_animals"], row["n_sessions"]) == (
+        "animal",
+        5,
+        10,
+        10,
+    )
 
 
 def test_within_blocks_the_permutation_agrees_with_the_loop_a_reader_would_write():
@@ -57,7 +69,9 @@ def test_within_blocks_the_permutation_agrees_with_the_loop_a_reader_would_write
     y, second, block = units.values, units.second, units.block
 
     def difference(way):  # of the groups' means in each batch, both of two animals
-        return np.mean([y[way & (block == b)].mean() - y[~way & (block == b)].mean() for b in (0, 1)])
+        return np.mean(
+            [y[way & (block == b)].mean() - y[~way & (block == b)].mean() for b in (0, 1)]
+        )
 
     slow = []
     for first in combinations(np.flatnonzero(block == 0), 2):
@@ -81,7 +95,24 @@ def test_many_arrangements_are_drawn_and_few_gone_through():
 
 
 def test_cages_of_one_group_are_the_unit_and_their_animals_are_not():
-    cage = ["c1", "c1", "c2", "c2", "c3", "c3", "c4", "c4", "c5", "c5", "c6", "c6", "c7", "c7", "c8", "c8"]
+    cage = [
+        "c1",
+        "c1",
+        "c2",
+        "c2",
+        "c3",
+        "c3",
+        "c4",
+        "c4",
+        "c5",
+        "c5",
+        "c6",
+        "c6",
+        "c7",
+        "c7",
+        "c8",
+        "c8",
+    ]
     row = only(study(8, cage=cage))
     assert (row["unit"], row["n_units_first"], row["n_units_second"]) == (CAGE, 4, 4)
     assert (row["n_animals"], row["n_cages"]) == (16, 8)
@@ -98,7 +129,9 @@ def test_cages_with_both_groups_are_blocks():
 
 def test_an_animal_s_sessions_are_one_value():
     table = study(5)
-    doubled = pd.concat([table.assign(speed=table["speed"] - 0.3), table.assign(speed=table["speed"] + 0.3)])
+    doubled = pd.concat(
+        [table.assign(speed=table["speed"] - 0.3), table.assign(speed=table["speed"] + 0.3)]
+    )
     one, two = only(table), only(doubled, engine="permutation")
     assert two["p"] == one["p"]
     assert (two["n_sessions"], two["n_animals"]) == (20, 10)
@@ -107,10 +140,13 @@ def test_an_animal_s_sessions_are_one_value():
 def test_animals_that_were_in_both_groups_are_compared_with_themselves():
     rng = np.random.default_rng(3)
     own = rng.normal(0, 5, 8)
-    table = pd.DataFrame({
-        "subject_id": [f"m{k}" for k in range(8)] * 2, "group": ["a"] * 8 + ["b"] * 8,
-        "speed": np.concatenate([own, own + 1 + rng.normal(0, 0.1, 8)]),
-    })  # fmt: skip
+    table = pd.DataFrame(
+        {
+            "subject_id": [f"m{k}" for k in range(8)] * 2,
+            "group": ["a"] * 8 + ["b"] * 8,
+            "speed": np.concatenate([own, own + 1 + rng.normal(0, 0.1, 8)]),
+        }
+    )
     row = only(table)
     assert row["unit"] == PAIRED
     assert row["p"] == pytest.approx(2 / 2**8)
@@ -192,7 +228,9 @@ def test_the_false_discovery_rate_is_of_the_tests_that_were_made():
 
 
 def test_three_groups_are_compared_in_pairs_or_with_the_one_named():
-    table = pd.concat([study(5), study(5).assign(group="c", subject_id=[f"n{k}" for k in range(10)])])
+    table = pd.concat(
+        [study(5), study(5).assign(group="c", subject_id=[f"n{k}" for k in range(10)])]
+    )
     assert list(compare(table, ["speed"])["contrast"]) == ["b - a", "c - a", "c - b"]
     assert list(compare(table, ["speed"], reference="b")["contrast"]) == ["a - b", "c - b"]
 
@@ -208,10 +246,14 @@ def test_sessions_are_collected_with_who_they_are_of(tmp_path):
     sessions = []
     for k in range(2):
         subject = {"subject_id": f"m{k}", "group": "ab"[k], "cage": "c1"}
-        sessions.append(write(tmp_path / f"{k}.liex", WalkingMouse(steady(1.0)), name=f"s{k}", subject=subject))
+        sessions.append(
+            write(tmp_path / f"{k}.liex", WalkingMouse(steady(1.0)), name=f"s{k}", subject=subject)
+        )
     table = collect(sessions)
     assert list(table["subject_id"]) == ["m0", "m1"]
-    assert table["distance_m"].iloc[0] == pytest.approx(measure_session(sessions[0]).summary["distance_m"].iloc[0])
+    assert table["distance_m"].iloc[0] == pytest.approx(
+        measure_session(sessions[0]).summary["distance_m"].iloc[0]
+    )
     assert (table["n_bouts"] > 0).all()
     assert "observed_s" in table
 
@@ -227,7 +269,9 @@ def test_studies_without_an_effect_are_rarely_called_significant(plan):
 
 
 def test_a_large_effect_is_found():
-    assert power(StudyPlan("6 animals", 6, 1, 1, caged=False), 3.0, 40, np.random.default_rng(0)) > 0.9
+    assert (
+        power(StudyPlan("6 animals", 6, 1, 1, caged=False), 3.0, 40, np.random.default_rng(0)) > 0.9
+    )
 
 
 def test_what_a_permutation_can_reach_is_told():

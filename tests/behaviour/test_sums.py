@@ -29,12 +29,22 @@ def ethogram(words: list[str], length_s: float = 1.0) -> pd.DataFrame:
     """Bouts of equal length, one after the other."""
     start = length_s * np.arange(len(words))
     frames = np.rint(30 * start).astype(int)
-    return to_pandas(BOUTS, {
-        "session_id": "s", "individual": "m", "action": words, "start_s": start, "stop_s": start + length_s,
-        "duration_s": [length_s] * len(words), "start_frame": frames,
-        "stop_frame": frames + round(30 * length_s), "score": [1.0] * len(words), "source": ["human"] * len(words),
-        "model_hash": [""] * len(words),
-    })  # fmt: skip
+    return to_pandas(
+        BOUTS,
+        {
+            "session_id": "s",
+            "individual": "m",
+            "action": words,
+            "start_s": start,
+            "stop_s": start + length_s,
+            "duration_s": [length_s] * len(words),
+            "start_frame": frames,
+            "stop_frame": frames + round(30 * length_s),
+            "score": [1.0] * len(words),
+            "source": ["human"] * len(words),
+            "model_hash": [""] * len(words),
+        },
+    )
 
 
 def rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -71,7 +81,9 @@ def test_the_bout_of_a_rear_tells_its_peak_and_its_turn():
     bouts = measure(*tables_of(WalkingMouse(steady(6.0), rear_s=(2.0, 3.2)))).bouts
     rear = bouts[bouts["action"] == "rear"].iloc[0]
     assert rear["time_to_peak_height_s"] == pytest.approx(0.1, abs=0.07)
-    assert rear["net_turn_rad"] == pytest.approx(200 / 150 * (rear["duration_s"] - 1 / 30), rel=1e-6)
+    assert rear["net_turn_rad"] == pytest.approx(
+        200 / 150 * (rear["duration_s"] - 1 / 30), rel=1e-6
+    )
     assert rear["net_turn_sd_rad"] > 0
     chord = 2 * 150 * np.sin(rear["net_turn_rad"] / 2)
     assert rear["displacement_mm"] == pytest.approx(chord, rel=1e-3)
@@ -92,10 +104,19 @@ def test_transitions_are_counted_and_a_gap_or_a_long_pause_parts_them():
     words = ["walk", "rear", "walk", "pause", "walk", "rear"]
     counts = count_transitions(ethogram(words), ("walk", "rear", "pause"), NO_GAPS, 0.33)
     np.testing.assert_array_equal(counts, [[0, 2, 1], [1, 0, 0], [1, 0, 0]])
-    gap = to_pandas(GAPS, {
-        "session_id": "s", "individual": "m", "start_s": [1.0], "stop_s": [1.1], "start_frame": [33],
-        "stop_frame": [33], "n_frames_missing": [2], "reason": ["camera_dropped"],
-    })  # fmt: skip
+    gap = to_pandas(
+        GAPS,
+        {
+            "session_id": "s",
+            "individual": "m",
+            "start_s": [1.0],
+            "stop_s": [1.1],
+            "start_frame": [33],
+            "stop_frame": [33],
+            "n_frames_missing": [2],
+            "reason": ["camera_dropped"],
+        },
+    )
     late = ethogram(words)
     late.loc[1, "start_s"] = 1.1
     assert count_transitions(late, ("walk", "rear", "pause"), gap, 0.33)[0, 1] == 1
@@ -109,19 +130,26 @@ def test_chance_keeps_how_often_each_action_occurs_and_never_repeats_one():
     chance = by_chance(counts)
     np.testing.assert_array_equal(np.diag(chance), 0.0)
     np.testing.assert_allclose(chance.sum(axis=1), 1.0)
-    np.testing.assert_allclose((chance * counts.sum(axis=1)[:, None]).sum(axis=0), counts.sum(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(
+        (chance * counts.sum(axis=1)[:, None]).sum(axis=0), counts.sum(axis=0), rtol=1e-6
+    )
 
 
 def test_what_follows_by_chance_is_rarely_called_significant_and_a_habit_is():
     words = ("rear", "run", "walk", "pause")
     weights = {"rear": 1.0, "run": 1.0, "walk": 3.0, "pause": 2.0}
-    p = [transitions(ethogram(chain(300, seed, weights)), words, NO_GAPS, 0.33)["p"] for seed in range(60)]
+    p = [
+        transitions(ethogram(chain(300, seed, weights)), words, NO_GAPS, 0.33)["p"]
+        for seed in range(60)
+    ]
     assert np.mean(np.concatenate(p) < 0.05) <= 0.06
     habit = []
     for word in chain(300, 7, weights):
         habit += [word] if word != "rear" else ["rear", "run"]
     table = transitions(ethogram(habit), words, NO_GAPS, 0.33)
-    (pair,) = (row for row in rows_of(table) if (row["from_action"], row["to_action"]) == ("rear", "run"))
+    (pair,) = (
+        row for row in rows_of(table) if (row["from_action"], row["to_action"]) == ("rear", "run")
+    )
     assert pair["p_fdr"] < 1e-3
     assert pair["probability"] > 0.9 > 2 * pair["by_chance"]
 
@@ -146,7 +174,9 @@ def test_a_mouse_on_a_circle_visits_a_zone_once_a_round():
     """On a circle of 150 mm at 200 mm/s it is right of x = 75 mm for a third of each round of 4.71 s."""
     mouse = WalkingMouse(steady(20.0))
     frames, poses = tables_of(mouse)
-    right = Zone("right", polygon_mm=((75.0, -400.0), (400.0, -400.0), (400.0, 400.0), (75.0, 400.0)))
+    right = Zone(
+        "right", polygon_mm=((75.0, -400.0), (400.0, -400.0), (400.0, 400.0), (75.0, 400.0))
+    )
     far = Zone("far", circle_mm=(900.0, 0.0, 10.0))
     moved = measure(frames, poses).kinematics
     frames["zone"] = zone_names([right, far], moved[["x_mm", "y_mm"]].to_numpy())
@@ -177,7 +207,11 @@ def test_a_border_that_is_crossed_by_jitter_is_one_visit():
 
 
 @pytest.mark.parametrize(
-    "arena", [Arena("round", (0.0, 0.0), 200.0), Arena("rectangular", (0.0, 0.0), None, (250.0, 120.0), 0.0)]
+    "arena",
+    [
+        Arena("round", (0.0, 0.0), 200.0),
+        Arena("rectangular", (0.0, 0.0), None, (250.0, 120.0), 0.0),
+    ],
 )
 def test_the_outer_half_is_half_of_the_floor(arena):
     rng = np.random.default_rng(1)
@@ -196,7 +230,9 @@ def test_a_mouse_along_the_wall_is_in_the_outer_half():
 
 
 def test_activity_adds_up_to_the_session():
-    frames, poses = tables_of(WalkingMouse(steady(30.0), rear_s=(5.0, 8.0), lost=tuple(range(300, 360))))
+    frames, poses = tables_of(
+        WalkingMouse(steady(30.0), rear_s=(5.0, 8.0), lost=tuple(range(300, 360)))
+    )
     behaviour = measure(frames, poses)
     table, row = behaviour.activity, behaviour.summary.iloc[0]
     assert len(table) == 10
@@ -232,7 +268,9 @@ def test_activity_has_a_row_for_every_interval_of_an_animal_never_seen():
 
 @pytest.mark.slow
 def test_an_hour_is_measured_in_a_few_seconds():
-    frames, poses = tables_of(WalkingMouse(steady(3600.0), rear_s=(1000.0, 1500.0), speed_mm_s=90.0))
+    frames, poses = tables_of(
+        WalkingMouse(steady(3600.0), rear_s=(1000.0, 1500.0), speed_mm_s=90.0)
+    )
     began = time.process_time()
     behaviour = measure(frames, poses)
     assert time.process_time() - began < 20.0
@@ -243,9 +281,18 @@ def test_an_hour_is_measured_in_a_few_seconds():
 def test_the_tables_can_be_made_again_from_the_session_s_folder_alone(tmp_path):
     nest = Zone("nest", polygon_mm=((0.0, 0.0), (200.0, 0.0), (200.0, 200.0), (0.0, 200.0)))
     mouse = WalkingMouse(steady(5.0), rear_s=(1.0, 2.2), lost=(90, 91))
-    session = write(tmp_path / "c.liex", mouse, arena=Arena("round", (0.0, 0.0), 250.0), zones=(nest,))
+    session = write(
+        tmp_path / "c.liex", mouse, arena=Arena("round", (0.0, 0.0), 250.0), zones=(nest,)
+    )
     again = measure_session(session)
     for name, table in again.tables.items():
         stored = session.summary if name == "summary" else session.table(name)
         pd.testing.assert_frame_equal(table, stored, check_dtype=False)
-    assert set(again.tables) == {"kinematics", "bouts", "summary", "transitions", "activity", "zones"}
+    assert set(again.tables) == {
+        "kinematics",
+        "bouts",
+        "summary",
+        "transitions",
+        "activity",
+        "zones",
+    }

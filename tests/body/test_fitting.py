@@ -52,7 +52,9 @@ def test_what_points_leave_open_stays_at_rest() -> None:
     weights = np.zeros((3, HAND.n_joints))
     weights[[0, 1, 2], [0, 1, 2]] = 1.0  # the palm and the wrist know nothing of the fingers
     start = hands(1, 4)
-    fit = fit_poses(HAND, pose.joints(HAND)[:, :3], weights, Pose(pose.root, start.angles, pose.scale))
+    fit = fit_poses(
+        HAND, pose.joints(HAND)[:, :3], weights, Pose(pose.root, start.angles, pose.scale)
+    )
     assert np.abs(fit.pose.angles).max() < 1e-3
 
 
@@ -64,6 +66,8 @@ def test_the_slopes_are_those_of_small_steps(seed: int) -> None:
     for c in range(slope.shape[-1]):
         by = np.zeros((3, slope.shape[-1]))
         by[:, c] = step
-        ahead, back = (_moved(pose, sign * by, FREE, low, high).joints(HAND) for sign in (1.0, -1.0))
+        ahead, back = (
+            _moved(pose, sign * by, FREE, low, high).joints(HAND) for sign in (1.0, -1.0)
+        )
         numeric = (ahead - back).reshape(3, -1) / (2.0 * step)
         np.testing.assert_allclose(slope[..., c], numeric, atol=2e-4)

@@ -37,7 +37,10 @@ def test_families_follow_the_seed(family: str) -> None:
 
 def test_the_other_familys_hands_are_thicker_or_thinner_than_any_trained_on() -> None:
     rng = np.random.default_rng(4)
-    usual, other = (draw_hands(rng, HAND, family, 400).flesh.radii.mean(axis=(1, 2)) for family in ("train", "other"))
+    usual, other = (
+        draw_hands(rng, HAND, family, 400).flesh.radii.mean(axis=(1, 2))
+        for family in ("train", "other")
+    )
     low, high = np.quantile(usual, [0.1, 0.9])
     assert ((other < low) | (other > high)).mean() > 0.9
 
@@ -51,8 +54,11 @@ def test_whoever_holds_out_a_hand_stands_behind_it() -> None:
     rng = np.random.default_rng(5)
     n = 200
     shape = draw_hands(rng, HAND, "train", n)
-    pose = Pose(SE3(so3.exp(rng.normal(0.0, 2.0, (n, 3))), np.tile([0.0, 0.0, 700.0], (n, 1))),
-                np.zeros((n, HAND.n_joints, 3)), np.ones(n))  # fmt: skip
+    pose = Pose(
+        SE3(so3.exp(rng.normal(0.0, 2.0, (n, 3))), np.tile([0.0, 0.0, 700.0], (n, 1))),
+        np.zeros((n, HAND.n_joints, 3)),
+        np.ones(n),
+    )
     rotations, positions = shape.joints(HAND, pose)
     frame, elbow = forearms(rng, rotations, positions, pose.scale)
     wrist = positions[:, 1:3].mean(axis=1)

@@ -50,7 +50,11 @@ def winding(n: int) -> Pose:
     rng = np.random.default_rng(5)
     angles = np.zeros((n, SNAKE.n_joints, 3))
     angles[:, 1:-1, 2] = rng.uniform(-0.4, 0.4, (n, SNAKE.n_joints - 2))
-    root = SE3.exp(np.concatenate([np.zeros((n, 2)), rng.uniform(-3, 3, (n, 1)), rng.uniform(-50, 50, (n, 3))], axis=1))
+    root = SE3.exp(
+        np.concatenate(
+            [np.zeros((n, 2)), rng.uniform(-3, 3, (n, 1)), rng.uniform(-50, 50, (n, 3))], axis=1
+        )
+    )
     return Pose(root, angles, rng.uniform(0.8, 1.2, n))
 
 
@@ -118,10 +122,14 @@ def test_what_is_not_a_mesh_is_refused_in_a_sentence(tmp_path, surface, words):
 
 def test_a_fine_mesh_is_thinned_out(tmp_path):
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 121)[:-1], np.linspace(0.02, np.pi - 0.02, 100))
-    ball = np.stack([120 * np.cos(v) - 120, 15 * np.sin(v) * np.cos(u), 15 * np.sin(v) * np.sin(u)], -1).reshape(-1, 3)
+    ball = np.stack(
+        [120 * np.cos(v) - 120, 15 * np.sin(v) * np.cos(u), 15 * np.sin(v) * np.sin(u)], -1
+    ).reshape(-1, 3)
     at = np.arange(120 * 99).reshape(99, 120)
     right = np.roll(at, -1, axis=1)
-    faces = np.concatenate([np.stack([at, right, at + 120], -1), np.stack([right, right + 120, at + 120], -1)])
+    faces = np.concatenate(
+        [np.stack([at, right, at + 120], -1), np.stack([right, right + 120, at + 120], -1)]
+    )
     write_obj(tmp_path / "ball.obj", ball, faces.reshape(-1, 3))
     surface = Surface.of(Skeleton.load(snake_toml(tmp_path, 'mesh = "ball.obj"')))
     assert 2000 < len(surface.faces) <= 4000

@@ -41,7 +41,9 @@ def test_pictures_agree_with_a_ray_through_every_pixel(animal: str, z_mm: float,
 def test_a_window_is_that_part_of_the_picture() -> None:
     surface, pose = random_pose("mouse", 3, 300.0)
     whole = surface.render(pose, CAMERA)
-    np.testing.assert_array_equal(surface.render(pose, CAMERA, (20, 10, 30, 25)), whole[10:35, 20:50])
+    np.testing.assert_array_equal(
+        surface.render(pose, CAMERA, (20, 10, 30, 25)), whole[10:35, 20:50]
+    )
 
 
 def test_depth_across_a_tilted_triangle_is_perspective_correct() -> None:
@@ -51,7 +53,9 @@ def test_depth_across_a_tilted_triangle_is_perspective_correct() -> None:
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     rows, columns = np.nonzero(depth)
     rays = camera.unproject(np.stack([columns, rows], -1), np.ones(len(rows)))
-    np.testing.assert_allclose(depth[rows, columns], corners[0] @ normal / (rays @ normal), rtol=1e-6)
+    np.testing.assert_allclose(
+        depth[rows, columns], corners[0] @ normal / (rays @ normal), rtol=1e-6
+    )
     assert len(rows) > 500
 
 
@@ -78,7 +82,11 @@ def test_a_batch_is_its_pictures_one_by_one_serial_or_parallel() -> None:
     vertices = surface.vertices(pose)
     intrinsics, origin = np.tile([k.fx, k.fy, k.cx, k.cy], (n, 1)), np.tile([210.0, 170.0], (n, 1))
     serial = render_meshes(vertices, surface.faces, T, intrinsics, origin, (96, 80), parallel=False)
-    parallel = render_meshes(vertices, surface.faces, T, intrinsics, origin, (96, 80), parallel=True)
+    parallel = render_meshes(
+        vertices, surface.faces, T, intrinsics, origin, (96, 80), parallel=True
+    )
     np.testing.assert_array_equal(serial, parallel)
-    one = render_mesh(vertices[7], surface.faces, k, (210, 170, 96, 80), SE3(T.rotation[7], T.translation[7]))
+    one = render_mesh(
+        vertices[7], surface.faces, k, (210, 170, 96, 80), SE3(T.rotation[7], T.translation[7])
+    )
     np.testing.assert_array_equal(serial[7], one)

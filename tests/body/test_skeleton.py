@@ -15,7 +15,9 @@ from liex_lab.geometry import SE3, so3
 from liex_lab.geometry.se3 import product_of_exponentials
 
 
-@pytest.mark.parametrize(("animal", "joints", "dof"), [("fish", 21, 25), ("mouse", 5, 12), ("hand", 23, 26)])
+@pytest.mark.parametrize(
+    ("animal", "joints", "dof"), [("fish", 21, 25), ("mouse", 5, 12), ("hand", 23, 26)]
+)
 def test_presets_have_the_papers_joints_and_degrees_of_freedom(animal, joints, dof):
     skeleton = Skeleton.load(animal)
     assert (skeleton.n_joints, skeleton.dof) == (joints, dof)
@@ -31,7 +33,9 @@ def test_the_mouse_has_the_bone_ratios_of_the_published_tracks():
 def test_published_mouse_poses_are_poses_of_our_skeleton(reference_data):
     skeleton = Skeleton.load("mouse")
     rows = np.loadtxt(reference_data / "liex_tracks" / "mouse_S1_frames_1_40.txt").reshape(-1, 5, 3)
-    joints = rows * np.array([1.0, 1.0, 1.0])  # x right, y up, z towards the camera: already right-handed, z up
+    joints = rows * np.array(
+        [1.0, 1.0, 1.0]
+    )  # x right, y up, z towards the camera: already right-handed, z up
     pose = Pose.from_joints(skeleton, joints, np.array([0.0, 0.0, 1.0]))
     assert np.abs(pose.joints(skeleton) - joints).max() < 0.02
     np.testing.assert_allclose(pose.scale, np.round(pose.scale, 2), atol=2e-4)
@@ -77,7 +81,9 @@ def test_aiming_turns_one_direction_onto_the_other_even_when_they_are_opposite()
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(2, 50, 3))
     b[0], b[1] = -a[0], 3 * a[1]
-    turned = np.einsum("nij,nj->ni", so3.exp(aim(a, b)), a / np.linalg.norm(a, axis=1, keepdims=True))
+    turned = np.einsum(
+        "nij,nj->ni", so3.exp(aim(a, b)), a / np.linalg.norm(a, axis=1, keepdims=True)
+    )
     np.testing.assert_allclose(turned, b / np.linalg.norm(b, axis=1, keepdims=True), atol=1e-9)
 
 
@@ -112,7 +118,9 @@ def test_a_view_follows_from_the_animals_size_unless_the_toml_states_it():
     for joint in table["joints"][1:]:
         joint["offset_mm"] = [3.0 * x for x in joint["offset_mm"]]
     large = Skeleton.from_table(table, "rat.toml").view
-    assert [large.behind_mm, large.smooth_mm, large.min_height_mm] == pytest.approx([360.0, 6.0, 7.0])
+    assert [large.behind_mm, large.smooth_mm, large.min_height_mm] == pytest.approx(
+        [360.0, 6.0, 7.0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,15 @@ from liex_lab.estimation.cascade import body_of
 def placed(skeleton: Skeleton, pose: Pose) -> np.ndarray:
     balls, frames = Balls.of(skeleton), pose.frames(skeleton)
     out = np.empty((len(balls.radius), 3))
-    place_balls(frames.rotation[0], frames.translation[0], float(pose.scale[0]), body_of(balls), out)
+    place_balls(
+        frames.rotation[0], frames.translation[0], float(pose.scale[0]), body_of(balls), out
+    )
     return out
 
 
-@pytest.mark.parametrize("animal", ["mouse", "hand"])  # not the fish: it is flat, and balls are as thick as it is wide
+@pytest.mark.parametrize(
+    "animal", ["mouse", "hand"]
+)  # not the fish: it is flat, and balls are as thick as it is wide
 def test_balls_lie_within_the_body_and_reach_its_skin(animal: str) -> None:
     skeleton = Skeleton.load(animal)
     balls, surface = Balls.of(skeleton), Surface.of(skeleton)
@@ -28,7 +32,9 @@ def test_balls_lie_within_the_body_and_reach_its_skin(animal: str) -> None:
     to_ball = np.linalg.norm(skin[:, None] - middles, axis=-1) - balls.radius[: balls.n_own]
     gap = to_ball.min(axis=1)  # of every point of the skin to the nearest ball
     assert np.abs(np.median(gap)) < 0.5 * np.median(balls.radius)
-    assert (to_ball.min(axis=0) < 1.0 * balls.radius[: balls.n_own]).all()  # no ball is far from the skin
+    assert (
+        to_ball.min(axis=0) < 1.0 * balls.radius[: balls.n_own]
+    ).all()  # no ball is far from the skin
 
 
 def test_every_bone_of_a_hand_has_a_ball_at_its_end() -> None:

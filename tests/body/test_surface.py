@@ -51,7 +51,9 @@ def test_an_adult_mouse_is_as_wide_and_high_as_the_preset_says() -> None:
     extent = np.ptp(trunk, axis=0)
     assert 30.0 < extent[1] < 34.0
     assert 30.0 < extent[2] < 36.0
-    np.testing.assert_allclose(trunk[:, 0].max(), 65.0, atol=0.1)  # the nose joint is the nose's tip
+    np.testing.assert_allclose(
+        trunk[:, 0].max(), 65.0, atol=0.1
+    )  # the nose joint is the nose's tip
     np.testing.assert_allclose(trunk[:, 0].min(), 65.0 * STATIONS[0], atol=0.1)
 
 
@@ -70,7 +72,9 @@ def test_the_trunk_moves_rigidly_with_its_root() -> None:
     angles = rng.uniform(-0.5, 0.5, (5, 3)) * MOUSE.axes
     angles[0] = 0
     pose, T = Pose(SE3.identity(), angles, np.array(1.0)), SE3.exp(rng.uniform(-2, 2, 6))
-    np.testing.assert_allclose(surface.vertices(pose.moved(T)), T @ surface.vertices(pose), atol=1e-9)
+    np.testing.assert_allclose(
+        surface.vertices(pose.moved(T)), T @ surface.vertices(pose), atol=1e-9
+    )
 
 
 def test_the_mesh_scales_with_the_animal() -> None:
@@ -89,8 +93,11 @@ def test_a_capsule_surface_holds_its_joints_radii() -> None:
 
 
 def test_a_users_own_animal_needs_only_a_table() -> None:
-    table = {"name": "worm", "joints": [{"name": "a"}, {"name": "b", "parent": "a", "offset_mm": [10, 0, 0]}],
-             "surface": {"radii_mm": [2.0, 1.0]}}  # fmt: skip
+    table = {
+        "name": "worm",
+        "joints": [{"name": "a"}, {"name": "b", "parent": "a", "offset_mm": [10, 0, 0]}],
+        "surface": {"radii_mm": [2.0, 1.0]},
+    }
     worm = Skeleton.from_table(table, "worm.toml")
     assert np.ptp(Surface.of(worm).vertices(Pose.home(worm))[:, 0]) == pytest.approx(13.0)
     table["surface"] = {"radii_mm": [2.0]}
@@ -107,7 +114,9 @@ def test_shapes_are_bodies_and_follow_the_seed(family: str) -> None:
     assert np.isfinite(shapes.half_height).all()
     assert (shapes.half_width[:, 1:-1] > 0).all()
     assert shapes.half_width.max(axis=1).min() > 6.0
-    assert shapes.half_width.max() < (40.0 if family == "augmented" else 25.0)  # augmented leaves the range of mice
+    assert shapes.half_width.max() < (
+        40.0 if family == "augmented" else 25.0
+    )  # augmented leaves the range of mice
 
 
 def slim(shape: BodyShape) -> np.ndarray:
@@ -117,12 +126,19 @@ def slim(shape: BodyShape) -> np.ndarray:
 
 def test_the_other_familys_profiles_are_not_the_training_familys() -> None:
     rng = np.random.default_rng(6)
-    train, other = (draw_shapes(rng, MOUSE, family, 2000).half_width for family in ("train", "other"))
+    train, other = (
+        draw_shapes(rng, MOUSE, family, 2000).half_width for family in ("train", "other")
+    )
     # what the training family's four principal shapes leave unexplained
-    relative = [np.log(width[:, 2:-2] / width.max(axis=1, keepdims=True)) for width in (train, other)]
+    relative = [
+        np.log(width[:, 2:-2] / width.max(axis=1, keepdims=True)) for width in (train, other)
+    ]
     mean = relative[0].mean(axis=0)
     _, _, axes = np.linalg.svd(relative[0] - mean, full_matrices=False)
-    rest = [np.linalg.norm((r - mean) - (r - mean) @ axes[:4].T @ axes[:4], axis=1).mean() for r in relative]
+    rest = [
+        np.linalg.norm((r - mean) - (r - mean) @ axes[:4].T @ axes[:4], axis=1).mean()
+        for r in relative
+    ]
     assert rest[1] > 2.0 * rest[0]
 
 

@@ -26,9 +26,10 @@ def girths(skeleton: Skeleton, family: str, n: int = 800) -> np.ndarray:
     assert isinstance(body, BodyShape)
     assert surface.shape is not None
     inner = slice(2, -2)
-    return np.sqrt(body.half_width * body.half_height)[:, inner] / np.sqrt(
-        surface.shape.half_width * surface.shape.half_height
-    )[inner]
+    return (
+        np.sqrt(body.half_width * body.half_height)[:, inner]
+        / np.sqrt(surface.shape.half_width * surface.shape.half_height)[inner]
+    )
 
 
 @pytest.mark.parametrize("skeleton", [FISH, SNAKE], ids=["fish", "snake"])

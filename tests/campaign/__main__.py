@@ -16,11 +16,17 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=["kills", "workers", "faults", "broken", "fuzz"])
-    parser.add_argument("--n", type=int, help="kills: 50, workers: 20, faults of each kind: 3, sessions: 100")
-    parser.add_argument("--frames", type=int, help="of a recording: 900, of a session of a hundred: 30")
+    parser.add_argument(
+        "--n", type=int, help="kills: 50, workers: 20, faults of each kind: 3, sessions: 100"
+    )
+    parser.add_argument(
+        "--frames", type=int, help="of a recording: 900, of a session of a hundred: 30"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=60.0, help="fuzz: of one core's work")
-    parser.add_argument("--folder", type=Path, help="of the hundred sessions: given again, it goes on there")
+    parser.add_argument(
+        "--folder", type=Path, help="of the hundred sessions: given again, it goes on there"
+    )
     asked = parser.parse_args()
     figures = {
         "kills": lambda: kills.kills(asked.n or 50, asked.frames or 900, asked.seed),

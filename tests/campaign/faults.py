@@ -20,7 +20,9 @@ def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
     """Each fault n times; what was refused, and with which sentences, and whether the tables were equal in the end."""
     rng, scratch = random.Random(seed), Path(tempfile.mkdtemp(prefix="liex-faults-"))
     _, expected = undisturbed(scratch, n_frames)
-    whole_mb = sum(f.stat().st_size for f in (scratch / "undisturbed").rglob("*") if f.is_file()) / 1e6
+    whole_mb = (
+        sum(f.stat().st_size for f in (scratch / "undisturbed").rglob("*") if f.is_file()) / 1e6
+    )
     found: dict[str, Any] = {}
 
     def ended(out: Path) -> bool:
@@ -33,7 +35,9 @@ def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
     def broken(name: str, out: Path, **how: Any) -> None:
         process = begin(out, n_frames, **how)
         process.join()
-        count(name, refused=int(process.exitcode == 1), taken_for_whole=len(list(out.glob("*.liex"))))
+        count(
+            name, refused=int(process.exitcode == 1), taken_for_whole=len(list(out.glob("*.liex")))
+        )
         sentences.add(_plain(refusal(out), scratch))
 
     def count(name: str, **more: int) -> None:
@@ -49,7 +53,11 @@ def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
         process = begin(scratch / f"clock{k}", n_frames, jumping=True)
         process.join()
         places = list((scratch / f"clock{k}").glob("*.liex"))
-        count("clock jumps", finished=len(places), equal_tables=sum(tables_of(one) == expected for one in places))
+        count(
+            "clock jumps",
+            finished=len(places),
+            equal_tables=sum(tables_of(one) == expected for one in places),
+        )
         figures, said = _two_at_once(scratch / f"two{k}", n_frames, expected)
         count("two at once", **figures)
         found["two at once"].setdefault("said", _plain(said, scratch))
@@ -68,7 +76,9 @@ def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
     return {"times_each": n, **found}
 
 
-def _two_at_once(out: Path, n_frames: int, expected: dict[str, bytes]) -> tuple[dict[str, int], str]:
+def _two_at_once(
+    out: Path, n_frames: int, expected: dict[str, bytes]
+) -> tuple[dict[str, int], str]:
     """Two runs into one folder: one is refused, the other one's tables are equal."""
     both = [begin(out, n_frames) for _ in range(2)]
     for process in both:

@@ -32,8 +32,14 @@ def fuzz(minutes: float, rng_seed: int) -> dict[str, Any]:
     example.
     """
     rng, tried, broken = random.Random(rng_seed), dict[str, int](), dict[str, str]()
-    began, until = time.monotonic(), time.process_time() + 60 * minutes  # on a busy machine it takes as much longer
-    with tempfile.TemporaryDirectory() as scratch, suppress(KeyboardInterrupt):  # stopped, it tells what it has
+    began, until = (
+        time.monotonic(),
+        time.process_time() + 60 * minutes,
+    )  # on a busy machine it takes as much longer
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        suppress(KeyboardInterrupt),
+    ):  # stopped, it tells what it has
         laws = _laws(Path(scratch))
         while time.process_time() < until:
             for name, law in laws.items():
@@ -61,8 +67,11 @@ def _laws(scratch: Path) -> dict[str, Law]:
     """Each law by its name."""
     whole = sessions.write(scratch / "a.liex", sessions.WalkingMouse(sessions.steady(1.0))).path
     sessions.add_evidence(whole)
-    known = {"whole": whole, "copy": Path(shutil.copytree(whole, scratch / "b.liex")),
-             "part": sessions.begun(scratch / "begun")}  # fmt: skip
+    known = {
+        "whole": whole,
+        "copy": Path(shutil.copytree(whole, scratch / "b.liex")),
+        "part": sessions.begun(scratch / "begun"),
+    }
     found: dict[str, Law] = {}
     for module in (test_study, test_plan_fuzz, test_file_fuzz, labels, sessions):
         for name, law in vars(module).items():

@@ -55,9 +55,15 @@ def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
                 half += 1
             finished += 1
             shutil.rmtree(place)
-        figures = {"killed": killed, "killed_while": where, "finished": finished, "equal_tables": equal,
-                   "half_written_read_as_whole": half, "usual_s": round(usual_s, 1),
-                   "most_s_of_measuring_done_again": round(max(lost), 1)}  # fmt: skip
+        figures = {
+            "killed": killed,
+            "killed_while": where,
+            "finished": finished,
+            "equal_tables": equal,
+            "half_written_read_as_whole": half,
+            "usual_s": round(usual_s, 1),
+            "most_s_of_measuring_done_again": round(max(lost), 1),
+        }
         print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
     shutil.rmtree(scratch)
     return figures

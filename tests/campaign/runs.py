@@ -17,9 +17,20 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.recording import Recording
 
 SAMPLE = find_sample("mouse_walk.mcap")
-_PRELOADED = ["pandas", "rerun", "foxglove", "cv2", "pyarrow.parquet", "scipy.spatial", "liex_lab.pipelines.session",
-              "liex_lab.dashboards.report.report", "liex_lab.behaviour", "liex_lab.sessions.mcap",
-              "liex_lab.tracking.tracker", "liex_lab.pipelines.evaluation.long_sessions"]  # fmt: skip
+_PRELOADED = [
+    "pandas",
+    "rerun",
+    "foxglove",
+    "cv2",
+    "pyarrow.parquet",
+    "scipy.spatial",
+    "liex_lab.pipelines.session",
+    "liex_lab.dashboards.report.report",
+    "liex_lab.behaviour",
+    "liex_lab.sessions.mcap",
+    "liex_lab.tracking.tracker",
+    "liex_lab.pipelines.evaluation.long_sessions",
+]
 _KINDS = {".parquet", ".csv", ".toml"}
 
 
@@ -58,7 +69,9 @@ def run_here(out: str, told: str, n_frames: int, broken_at: int, jumping: bool) 
             (folder / "stage.json").write_text(json.dumps([what, real()]))
 
     try:
-        run_session(long_sample(n_frames, broken_at), Plan.load("mouse"), out, overwrite=True, progress=tell)
+        run_session(
+            long_sample(n_frames, broken_at), Plan.load("mouse"), out, overwrite=True, progress=tell
+        )
     except (LiexError, OSError) as error:
         Path(told).write_text(json.dumps(str(error)))
         raise SystemExit(1) from None
@@ -76,7 +89,9 @@ def begin(out: Path, n_frames: int, broken_at: int = -1, jumping: bool = False) 
     """Start such a process; every one uses both cores."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
-    process = context.Process(target=run_here, args=(str(out), str(_refusal_of(out)), n_frames, broken_at, jumping))
+    process = context.Process(
+        target=run_here, args=(str(out), str(_refusal_of(out)), n_frames, broken_at, jumping)
+    )
     process.start()
     return process
 
@@ -96,7 +111,9 @@ def _refusal_of(out: Path) -> Path:
 
 def tables_of(folder: Path) -> dict[str, bytes]:
     """Everything that has to be equal."""
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in _KINDS}
+    return {
+        path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in _KINDS
+    }
 
 
 def undisturbed(scratch: Path, n_frames: int) -> tuple[float, dict[str, bytes]]:

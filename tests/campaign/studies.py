@@ -40,9 +40,15 @@ def workers(n: int, seed: int) -> dict[str, Any]:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while process.poll() is None:
             time.sleep(rng.uniform(3.0, 20.0))
-            found = [] if process.poll() is not None else [
-                one for one in psutil.Process(process.pid).children(recursive=True)
-                if "spawn_main" in " ".join(one.cmdline())]  # fmt: skip
+            found = (
+                []
+                if process.poll() is not None
+                else [
+                    one
+                    for one in psutil.Process(process.pid).children(recursive=True)
+                    if "spawn_main" in " ".join(one.cmdline())
+                ]
+            )
             if found and not quiet and killed < n:
                 rng.choice(found).send_signal(signal.SIGKILL)
                 killed += 1
@@ -53,12 +59,19 @@ def workers(n: int, seed: int) -> dict[str, Any]:
             tables = tables_of(one.session.folder)
             same += expected.setdefault(one.session.id, tables) == tables
             done += 1
-        if any(one.state == "failed" for one in standings(Study.load(study))):  # one command tries them again
+        if any(
+            one.state == "failed" for one in standings(Study.load(study))
+        ):  # one command tries them again
             subprocess.run([*command, "--retry"], capture_output=True, check=False)
             again += all(one.state == "done" for one in standings(Study.load(study)))
         shutil.rmtree(folder)
-        figures = {"workers_killed": killed, "sessions_done": done, "equal_tables": same, "given_up": given_up,
-                   "studies_whole_after_retry": again}  # fmt: skip
+        figures = {
+            "workers_killed": killed,
+            "sessions_done": done,
+            "equal_tables": same,
+            "given_up": given_up,
+            "studies_whole_after_retry": again,
+        }
         print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
     return figures
 
@@ -91,16 +104,23 @@ def broken(n: int, n_frames: int, n_workers: int, kept: Path | None = None) -> d
         raw.mkdir(parents=True, exist_ok=True)
         _break(raw, SAMPLE.read_bytes())
         names = [(f"b{k}", f"rawdata/{_file_of(name)}") for k, name in enumerate(BROKEN)]
-        names += [(f"g{k}", f"synthetic:walk?seed={k}&frames={n_frames}&sensor=primesense-qvga")
-                  for k in range(n - len(BROKEN))]  # fmt: skip
+        names += [
+            (f"g{k}", f"synthetic:walk?seed={k}&frames={n_frames}&sensor=primesense-qvga")
+            for k in range(n - len(BROKEN))
+        ]
         _study(folder, names)
     if not first.is_file():
         began = time.monotonic()
         found = run_study(study, workers=n_workers)
         told = {name: _said(one) for name, one in zip(BROKEN, found, strict=False)}
         right = [name for name, said in told.items() if BROKEN[name] in str(said["reason"])]
-        figures = {"done": _count(found, "done"), "failed": _count(found, "failed"),
-                   "with_the_right_reason": len(right), "reasons": told, "seconds": round(time.monotonic() - began)}
+        figures = {
+            "done": _count(found, "done"),
+            "failed": _count(found, "failed"),
+            "with_the_right_reason": len(right),
+            "reasons": told,
+            "seconds": round(time.monotonic() - began),
+        }
         first.write_text(json.dumps(figures))
     for name in BROKEN:
         shutil.copy(SAMPLE, raw / _file_of(name).replace(".png", ".mcap"))
@@ -122,8 +142,11 @@ def _said(one: Standing) -> dict[str, Any]:
 
 def _study(folder: Path, names: list[tuple[str, str]]) -> Path:
     """A study file with one animal for each (name, recording)."""
-    text = "".join(f'[[animals]]\nid = "{name}"\n[[sessions]]\nanimal = "{name}"\nsession = "01"\n'
-                   f'recording = "{recording}"\n' for name, recording in names)  # fmt: skip
+    text = "".join(
+        f'[[animals]]\nid = "{name}"\n[[sessions]]\nanimal = "{name}"\nsession = "01"\n'
+        f'recording = "{recording}"\n'
+        for name, recording in names
+    )
     (folder / "study.toml").write_text(text)
     return folder / "study.toml"
 
@@ -139,8 +162,12 @@ def _break(raw: Path, sample: bytes) -> None:
 
     from tests.recordings.writers import write_mcap
 
-    contents = {"empty file": b"", "cut short": sample[: len(sample) // 2], "no mcap": os.urandom(5000),
-                "text": b"x,y\n1,2"}  # fmt: skip
+    contents = {
+        "empty file": b"",
+        "cut short": sample[: len(sample) // 2],
+        "no mcap": os.urandom(5000),
+        "text": b"x,y\n1,2",
+    }
     for name, content in contents.items():
         (raw / _file_of(name)).write_bytes(content)
     cv2.imwrite(str(raw / _file_of("8 bit")), np.zeros((20, 20), np.uint8))

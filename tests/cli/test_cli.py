@@ -51,7 +51,9 @@ def test_help_is_quick() -> None:
     assert min(walls) < 1.0, f"liex --help took {min(walls):.2f} s"
 
 
-@pytest.mark.parametrize("words", [[], *([verb] for verb in VERBS), *(["evaluate", name] for name in MEASURES)])
+@pytest.mark.parametrize(
+    "words", [[], *([verb] for verb in VERBS), *(["evaluate", name] for name in MEASURES)]
+)
 def test_every_verb_explains_itself(words: list[str]) -> None:
     result = CliRunner().invoke(cli.app, [*words, "--help"])
     assert result.exit_code == 0, result.output
@@ -64,7 +66,9 @@ def test_it_says_which_version_it_is() -> None:
 
 
 def test_python_m_is_the_same_command() -> None:
-    ran = subprocess.run([sys.executable, "-m", "liex_lab", "--version"], capture_output=True, text=True)
+    ran = subprocess.run(
+        [sys.executable, "-m", "liex_lab", "--version"], capture_output=True, text=True
+    )
     assert ran.stdout == f"liex_lab {liex_lab.__version__}\n"
 
 
@@ -101,7 +105,12 @@ def test_a_fault_of_ours_says_so_and_shows_where() -> None:
 
 
 def test_a_full_disk_is_a_sentence() -> None:
-    ran = liex("info", "--plan", "mouse", code=BREAK.format("raise OSError(28, 'No space left on device', 'a.mcap')"))
+    ran = liex(
+        "info",
+        "--plan",
+        "mouse",
+        code=BREAK.format("raise OSError(28, 'No space left on device', 'a.mcap')"),
+    )
     assert ran.returncode == 1
     assert "a.mcap: No space left" in ran.stderr
     assert "Traceback" not in ran.stderr
@@ -111,7 +120,9 @@ def test_a_full_disk_is_a_sentence() -> None:
 def test_interrupting_leaves_without_a_traceback() -> None:
     wait = BREAK.format("print('begun', flush=True); import time; time.sleep(30)")
     command = [sys.executable, "-c", wait, "info", "--plan", "mouse"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
         assert running.stdout is not None
         assert running.stderr is not None
         assert running.stdout.readline() == "begun\n"
@@ -120,10 +131,14 @@ def test_interrupting_leaves_without_a_traceback() -> None:
         assert "Traceback" not in running.stderr.read()
 
 
-def test_run_hands_the_plan_with_its_settings_to_the_job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_run_hands_the_plan_with_its_settings_to_the_job(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     seen: dict[str, Any] = {}
 
-    def run_session(recording: Path, plan: Plan, out: Path, *, overwrite: bool, workers: int, progress: Any) -> Path:
+    def run_session(
+        recording: Path, plan: Plan, out: Path, *, overwrite: bool, workers: int, progress: Any
+    ) -> Path:
         progress(1, 2, "working")
         progress(2, 2, "working")
         progress(0, None, "closing")
@@ -134,7 +149,17 @@ def test_run_hands_the_plan_with_its_settings_to_the_job(monkeypatch: pytest.Mon
         return session
 
     monkeypatch.setattr("liex_lab.api.run_session", run_session)
-    words = ["run", "m01.mcap", "--set", "animal.spine_mm=65", "--set", "seed=4", "--out", str(tmp_path), "--overwrite"]
+    words = [
+        "run",
+        "m01.mcap",
+        "--set",
+        "animal.spine_mm=65",
+        "--set",
+        "seed=4",
+        "--out",
+        str(tmp_path),
+        "--overwrite",
+    ]
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == 0, result.output
     assert seen["plan"] == Plan.load("mouse").with_settings(["animal.spine_mm=65", "seed=4"])
@@ -143,7 +168,9 @@ def test_run_hands_the_plan_with_its_settings_to_the_job(monkeypatch: pytest.Mon
     assert f"report:  {tmp_path / 'm01.liex' / 'report.html'}" in result.output
 
 
-def test_demo_ends_with_the_path_of_a_session(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_demo_ends_with_the_path_of_a_session(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("liex_lab.api.run_demo", lambda out, progress: out / "sample.liex")
     result = CliRunner().invoke(cli.app, ["demo", "--out", str(tmp_path)])
     assert f"session: {tmp_path / 'sample.liex'}" in result.output
@@ -157,7 +184,12 @@ def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -
         "floor_mm": math.nan,
         "problems": ["a"],
     }
-    job(monkeypatch, "doctor", examine=lambda path, **options: findings, print_report=lambda findings: print("fine"))
+    job(
+        monkeypatch,
+        "doctor",
+        examine=lambda path, **options: findings,
+        print_report=lambda findings: print("fine"),
+    )
     result = CliRunner().invoke(cli.app, ["doctor", "m01.mcap", "--json"])
     expected = {"format": "mcap", "n_frames": 3, "fx": 365.0, "floor_mm": None, "problems": ["a"]}
     assert json.loads(result.output) == expected
@@ -179,7 +211,18 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
 
     job(monkeypatch, "evaluate", evaluate_pose=evaluate_pose)
     file = tmp_path / "numbers" / "pose.json"
-    words = ["--animal", "mouse", "--split", "hard", "--variant", "paper", "--frames", "50", "--spine-mm", "65"]
+    words = [
+        "--animal",
+        "mouse",
+        "--split",
+        "hard",
+        "--variant",
+        "paper",
+        "--frames",
+        "50",
+        "--spine-mm",
+        "65",
+    ]
     result = CliRunner().invoke(cli.app, ["evaluate", "pose", *words, "--json", str(file)])
     assert result.exit_code == 0, result.output
     assert seen == ["mouse", "hard", "paper", {"model": None, "n_frames": 50, "spine_mm": 65.0}]
@@ -187,28 +230,44 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert "mean over joints [mm]" in result.output, "brackets are text, not markup"
 
 
-def test_the_other_measures_reach_their_jobs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_other_measures_reach_their_jobs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     job(
-        monkeypatch, "speed",
-        evaluate_speed=lambda animal, progress: {"animal": animal, "stages_ms": {"foreground": 0.1}},
-    )  # fmt: skip
+        monkeypatch,
+        "speed",
+        evaluate_speed=lambda animal, progress: {
+            "animal": animal,
+            "stages_ms": {"foreground": 0.1},
+        },
+    )
     job(
         monkeypatch,
         "evaluate",
         evaluate_sizes=lambda animal, n_frames, progress: {"n_frames": n_frames},
-        evaluate_reference=lambda session, reference: {"session": str(session), "reference": str(reference)},
+        evaluate_reference=lambda session, reference: {
+            "session": str(session),
+            "reference": str(reference),
+        },
     )
-    speed, sizes, reference = (tmp_path / f"{name}.json" for name in ("speed", "sizes", "reference"))
+    speed, sizes, reference = (
+        tmp_path / f"{name}.json" for name in ("speed", "sizes", "reference")
+    )
     runner = CliRunner()
     runner.invoke(cli.app, ["evaluate", "speed", "--json", str(speed)])
     runner.invoke(cli.app, ["evaluate", "sizes", "--json", str(sizes)])
-    runner.invoke(cli.app, ["evaluate", "reference", "m.liex", "--reference", "r.csv", "--json", str(reference)])
+    runner.invoke(
+        cli.app,
+        ["evaluate", "reference", "m.liex", "--reference", "r.csv", "--json", str(reference)],
+    )
     assert json.loads(speed.read_text()) == {"animal": "mouse", "stages_ms": {"foreground": 0.1}}
     assert json.loads(sizes.read_text()) == {"n_frames": None}
     assert json.loads(reference.read_text()) == {"session": "m.liex", "reference": "r.csv"}
 
 
-def test_evaluate_tables_names_what_it_wrote(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_evaluate_tables_names_what_it_wrote(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     seen: list[Any] = []
 
     def run_tables(out: Path, animals: Any, **options: Any) -> list[Path]:
@@ -217,13 +276,25 @@ def test_evaluate_tables_names_what_it_wrote(monkeypatch: pytest.MonkeyPatch, tm
         return [out / "tables.md"]
 
     monkeypatch.setattr(api, "run_tables", run_tables)
-    words = ["--out", str(tmp_path), "--animal", "mouse", "--animal", "fish", "--frames", "50", "--quick"]
+    words = [
+        "--out",
+        str(tmp_path),
+        "--animal",
+        "mouse",
+        "--animal",
+        "fish",
+        "--frames",
+        "50",
+        "--quick",
+    ]
     result = CliRunner().invoke(cli.app, ["evaluate", "tables", *words])
     assert result.output == f"{tmp_path / 'tables.md'}\n"
     assert seen == [tmp_path, ["mouse", "fish"], {"n_frames": 50, "quick": True, "fresh": False}]
 
 
-def test_evaluate_speed_measures_recordings_where_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_evaluate_speed_measures_recordings_where_asked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     numbers = {"frames_per_s_1core": {"mcap": 400.0}}
     job(monkeypatch, "evaluate_recordings", evaluate_recordings=lambda progress: numbers)
     file = tmp_path / "numbers.json"
@@ -232,7 +303,9 @@ def test_evaluate_speed_measures_recordings_where_asked(monkeypatch: pytest.Monk
     assert json.loads(file.read_text()) == numbers
 
 
-def test_convert_says_what_was_written_and_what_is_odd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_convert_says_what_was_written_and_what_is_odd(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     seen: dict[str, Any] = {}
 
     def convert(recording: Path, to: Path, *, progress: Any, **how: Any) -> Any:
@@ -240,13 +313,30 @@ def test_convert_says_what_was_written_and_what_is_odd(monkeypatch: pytest.Monke
         return SimpleNamespace(path=to, n_frames=7, notes=["a [note]"], problems=["it was cut"])
 
     job(monkeypatch, "convert", convert=convert)
-    words = ["convert", "a.bag", "--to", "b.oni", "--topic", "/d", "--step-mm", "0.1", "--fps", "30", "--overwrite"]
+    words = [
+        "convert",
+        "a.bag",
+        "--to",
+        "b.oni",
+        "--topic",
+        "/d",
+        "--step-mm",
+        "0.1",
+        "--fps",
+        "30",
+        "--overwrite",
+    ]
     result = CliRunner().invoke(cli.app, words)
     assert result.output == "recording: b.oni (7 frames)\nnote: it was cut\nnote: a [note]\n"
     assert seen == {
-        "recording": Path("a.bag"), "to": Path("b.oni"), "topic": "/d", "step_mm": 0.1, "fps": 30.0, "ros": False,
+        "recording": Path("a.bag"),
+        "to": Path("b.oni"),
+        "topic": "/d",
+        "step_mm": 0.1,
+        "fps": 30.0,
+        "ros": False,
         "overwrite": True,
-    }  # fmt: skip
+    }
 
 
 def test_run_hands_the_topic_to_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -257,12 +347,16 @@ def test_run_hands_the_topic_to_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_pa
         return out
 
     monkeypatch.setattr("liex_lab.api.run_session", run_session)
-    CliRunner().invoke(cli.app, ["run", "m01.mcap", "--topic", "/left/depth", "--out", str(tmp_path)])
+    CliRunner().invoke(
+        cli.app, ["run", "m01.mcap", "--topic", "/left/depth", "--out", str(tmp_path)]
+    )
     assert plans[0].recording.topic == "/left/depth"
 
 
 def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch) -> None:
-    def train(animal: str, variant: str, out: Path, workers: int, n_images: int | None, progress: Any) -> Any:
+    def train(
+        animal: str, variant: str, out: Path, workers: int, n_images: int | None, progress: Any
+    ) -> Any:
         return out, variant, workers, n_images
 
     job(monkeypatch, "train", train_model=train)
@@ -272,7 +366,9 @@ def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch)
     assert result.output == f"model: {(Path('snake.npz'), 'default', 0, 512)}\n"
 
 
-def test_errors_of_a_job_come_through(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_of_a_job_come_through(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def examine(path: Path, **options: Any) -> dict[str, Any]:
         raise RecordingError(f"{path} holds colour [uint8], not depth")
 
@@ -287,4 +383,7 @@ def test_errors_of_a_job_come_through(monkeypatch: pytest.MonkeyPatch, capsys: p
 def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:
     told = CliRunner().invoke(cli.app, ["info"]).output
     assert all(word in told for word in ("numba", "rerun-sdk", "plans", "mouse", "models"))
-    assert CliRunner().invoke(cli.app, ["info", "--plan", "mouse"]).output == Plan.load("mouse").to_toml()
+    assert (
+        CliRunner().invoke(cli.app, ["info", "--plan", "mouse"]).output
+        == Plan.load("mouse").to_toml()
+    )

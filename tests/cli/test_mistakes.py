@@ -33,7 +33,9 @@ def cut_dat(folder: Path) -> Path:
 
 
 def cut_archive(folder: Path) -> Path:
-    archive = write_archive(cut_dat(folder), folder / "r.tar.gz", ["camera.toml", "metadata.json", "depth.dat"])
+    archive = write_archive(
+        cut_dat(folder), folder / "r.tar.gz", ["camera.toml", "metadata.json", "depth.dat"]
+    )
     return cut(archive, 0.6)
 
 
@@ -87,7 +89,9 @@ def whole(folder: Path) -> Path:
     return write_mcap(folder / "r.mcap", STORED)
 
 
-def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> str:
+def refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str
+) -> str:
     """The sentence with which the command line refuses, in this process: a new one takes seconds."""
     monkeypatch.setattr(sys, "argv", ["liex", *words])
     with pytest.raises(SystemExit) as left:
@@ -117,7 +121,11 @@ def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
     ],
 )
 def test_a_recording_that_cannot_be_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, make: Maker, says: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    make: Maker,
+    says: str,
 ) -> None:
     recording, out = make(tmp_path), tmp_path / "results"
     sentence = refused(capsys, monkeypatch, "run", str(recording), "--out", str(out))
@@ -138,10 +146,16 @@ def test_a_recording_that_cannot_be_used(
     ],
 )
 def test_a_plan_that_cannot_be_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: list[str], says: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    says: str,
 ) -> None:
     out = tmp_path / "results"
-    assert says in refused(capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(out), *words)
+    assert says in refused(
+        capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(out), *words
+    )
     assert not out.exists()
 
 
@@ -155,22 +169,32 @@ def test_a_plan_that_cannot_be_used(
     ],
 )
 def test_a_plan_of_ones_own_with_a_slip(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, content: str, says: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    content: str,
+    says: str,
 ) -> None:
     own, out = tmp_path / "own.toml", tmp_path / "results"
     own.write_text(content)
-    assert says in refused(capsys, monkeypatch, "run", str(whole(tmp_path)), "--plan", str(own), "--out", str(out))
+    assert says in refused(
+        capsys, monkeypatch, "run", str(whole(tmp_path)), "--plan", str(own), "--out", str(out)
+    )
     assert not out.exists()
 
 
 def test_a_place_that_is_a_file_is_told_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("liex_lab.pipelines.session.build_tracker", lambda *_: pytest.fail("work was begun"))
+    monkeypatch.setattr(
+        "liex_lab.pipelines.session.build_tracker", lambda *_: pytest.fail("work was begun")
+    )
     file = tmp_path / "results"
     file.write_text("mine")
     for out in (file, file / "deeper"):
-        assert f"{file} is a file" in refused(capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(out))
+        assert f"{file} is a file" in refused(
+            capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(out)
+        )
     assert file.read_text() == "mine"
     (tmp_path / "r.liex").write_text("mine")
     sentence = refused(capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(tmp_path))

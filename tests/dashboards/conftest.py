@@ -10,8 +10,15 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 _PATIENCE_MS = 30_000  # of a busy machine
-_FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-          "--disable-component-update", "--disable-sync"]  # fmt: skip
+_FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 
 
 @dataclass
@@ -38,7 +45,10 @@ def watch(page: Page) -> Watched:
             route.abort()
 
     page.route("**/*", pass_on)
-    page.on("console", lambda said: watched.complaints.append(said.text) if said.type == "error" else None)
+    page.on(
+        "console",
+        lambda said: watched.complaints.append(said.text) if said.type == "error" else None,
+    )
     page.on("pageerror", lambda error: watched.complaints.append(str(error)))
     return watched
 

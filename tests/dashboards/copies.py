@@ -16,7 +16,10 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_failure
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
-GROUPS = ("control", "<b>drug</b> %{y}")  # a name that must not be taken for markup, nor for a part of a template
+GROUPS = (
+    "control",
+    "<b>drug</b> %{y}",
+)  # a name that must not be taken for markup, nor for a part of a template
 _OWN = ("session.json", "summary.csv", "sessions.parquet", "report.html")
 FAILED, WAITING = 1, 2  # the places of the sessions that are not done
 
@@ -24,7 +27,9 @@ FAILED, WAITING = 1, 2  # the places of the sessions that are not done
 def session(folder: Path) -> Session:
     """The session that the others are copies of: 6 s, a rear from 2 to 3 s, a gap, two frames without a pose."""
     mouse = WalkingMouse(np.delete(steady(6.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(150, 151))
-    return write(folder, mouse, name="first", report=write_report, arena=Arena("round", (0.0, 0.0), 220.0))
+    return write(
+        folder, mouse, name="first", report=write_report, arena=Arena("round", (0.0, 0.0), 220.0)
+    )
 
 
 def study(folder: Path, n_sessions: int) -> Path:
@@ -33,13 +38,27 @@ def study(folder: Path, n_sessions: int) -> Path:
     summary, rng = first.summary, np.random.default_rng(3)
     lines = ['name = "copies"', 'plan = "mouse"', 'results = "derivatives"']
     for k in range(0, n_sessions, 2):
-        lines += ["[[animals]]", f'id = "m{k // 2:03d}"', f'group = "{GROUPS[k // 2 % 2]}"', f'cage = "c{k // 4}"']
+        lines += [
+            "[[animals]]",
+            f'id = "m{k // 2:03d}"',
+            f'group = "{GROUPS[k // 2 % 2]}"',
+            f'cage = "c{k // 4}"',
+        ]
     for k in range(n_sessions):
         animal, name = f"m{k // 2:03d}", f"{k % 2 + 1:02d}"
-        lines += ["[[sessions]]", f'animal = "{animal}"', f'session = "{name}"', f'recording = "raw/{k}.oni"']
+        lines += [
+            "[[sessions]]",
+            f'animal = "{animal}"',
+            f'session = "{name}"',
+            f'recording = "raw/{k}.oni"',
+        ]
         place = folder / "derivatives" / f"sub-{animal}" / f"ses-{name}" / "behav"
         if k == FAILED:
-            failure = {"stage": "measuring poses", "reason": "frame 33 cannot be read", "remedy": "copy it again"}
+            failure = {
+                "stage": "measuring poses",
+                "reason": "frame 33 cannot be read",
+                "remedy": "copy it again",
+            }
             write_failure(place, failure)
         elif k != WAITING:
             speed = summary["mean_speed_mm_s"] - 40.0 * (k // 2 % 2) + 10.0 * rng.standard_normal()
@@ -60,7 +79,9 @@ def _copy(first: Session, place: Path, name: str, animal: str, summary: pd.DataF
     about = first.metadata | {"session_id": name, "frames": first.metadata["frames"] | missed}
     (place / "session.json").write_text(json.dumps(about), encoding="utf-8")
     summary.assign(session_id=name).to_csv(place / "summary.csv", index=False)
-    first.table("sessions").assign(session_id=name, subject_id=animal).to_parquet(place / "sessions.parquet")
+    first.table("sessions").assign(session_id=name, subject_id=animal).to_parquet(
+        place / "sessions.parquet"
+    )
 
 
 def _as_planned(path: Path) -> None:

@@ -23,7 +23,9 @@ _A4_PX = 718  # the width of A4 between margins of 10 mm at 96 dpi
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("browser")
     mouse = WalkingMouse(np.delete(steady(14.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
-    nest = Zone("a nest with a rather long name", polygon_mm=((0.0, 0.0), (90.0, 0.0), (90.0, 90.0)))
+    nest = Zone(
+        "a nest with a rather long name", polygon_mm=((0.0, 0.0), (90.0, 0.0), (90.0, 90.0))
+    )
     bowl = Arena("round", (0.0, 0.0), 220.0)
     page = render(write(folder / "c.liex", mouse, arena=bowl, zones=(nest,)))
     (folder / "report.html").write_text(page, encoding="utf-8")

@@ -52,7 +52,9 @@ def test_every_session_of_the_study_is_listed_with_its_state_and_quality(data: S
     assert set(table["group"]) == set(copies.GROUPS)
 
 
-def test_a_folder_of_sessions_needs_no_study_file_and_older_tables_are_no_sessions(study: Path, tmp_path: Path) -> None:
+def test_a_folder_of_sessions_needs_no_study_file_and_older_tables_are_no_sessions(
+    study: Path, tmp_path: Path
+) -> None:
     one = tmp_path / "one.liex"
     shutil.copytree(study.parent / "first.liex", one)
     (one / "as_tracked").mkdir()
@@ -60,7 +62,10 @@ def test_a_folder_of_sessions_needs_no_study_file_and_older_tables_are_no_sessio
     shutil.copytree(one, tmp_path / "two.liex")
     name, look = list_sessions(tmp_path)
     assert name == tmp_path.name
-    assert [(entry.key, entry.state) for entry in look()] == [("one.liex", "done"), ("two.liex", "done")]
+    assert [(entry.key, entry.state) for entry in look()] == [
+        ("one.liex", "done"),
+        ("two.liex", "done"),
+    ]
     with pytest.raises(LiexError, match="no study"):
         list_sessions(tmp_path / "nowhere")
 
@@ -78,9 +83,10 @@ def test_a_session_that_is_written_again_is_read_again(study: Path, tmp_path: Pa
 
 @settings(max_examples=30)
 @given(
-    edges=st.lists(st.floats(0, 10), min_size=2, max_size=14, unique=True), n=st.integers(1, 40),
+    edges=st.lists(st.floats(0, 10), min_size=2, max_size=14, unique=True),
+    n=st.integers(1, 40),
     words=st.lists(st.sampled_from(["a", "b", "c"]), min_size=7, max_size=7),
-)  # fmt: skip
+)
 def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
     edges: list[float], n: int, words: list[str]
 ) -> None:
@@ -105,25 +111,36 @@ def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
     assert set(colours[n:]) == {GREY}
     words = ["rear", "run", "walk", "pause"]
     assert colours_of(["walk", "rear", "unheard"], words) == {
-        "walk": action_colour(2), "rear": action_colour(0), "unheard": action_colour(1)
-    }  # fmt: skip
+        "walk": action_colour(2),
+        "rear": action_colour(0),
+        "unheard": action_colour(1),
+    }
 
 
 def test_names_are_text_in_every_figure(data: StudyData) -> None:
     table = data.collected()
-    ones = {key: Ethogram(np.array([[0.0, 1.0]]), ["<i>x"], np.zeros((0, 2)), 2.0) for key in ("<b>s",)}
+    ones = {
+        key: Ethogram(np.array([[0.0, 1.0]]), ["<i>x"], np.zeros((0, 2)), 2.0) for key in ("<b>s",)
+    }
     shares = pd.DataFrame({"key": ["<b>s"], "<i>x_share": [0.5], "<i>x_s": [1.0]})
     figures = [
-        app_plots.groups(table, "mean_speed_mm_s", "<u>"), app_plots.ethograms(ones, {"<i>x": "#000"}),
-        app_plots.differences(data.stats("mean_speed_mm_s"), "<u>"), app_plots.time_budgets(shares, {"<i>x": "#000"}),
-        app_plots.whole_session(ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")]),
-    ]  # fmt: skip
+        app_plots.groups(table, "mean_speed_mm_s", "<u>"),
+        app_plots.ethograms(ones, {"<i>x": "#000"}),
+        app_plots.differences(data.stats("mean_speed_mm_s"), "<u>"),
+        app_plots.time_budgets(shares, {"<i>x": "#000"}),
+        app_plots.whole_session(
+            ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")]
+        ),
+    ]
     for figure in figures:
         for item in figure["data"]:
             item.pop("customdata", None)  # a key, which nobody shows
         text = json.dumps(figure, default=lambda value: np.asarray(value).tolist())
         assert not any(markup in text for markup in ("<b>", "<i>", "<u>", "drug</b>"))
-        assert "drug&lt;/b&gt; %{y}" not in text.partition("hovertemplate")[2].partition('"')[2].partition('"')[0]
+        assert (
+            "drug&lt;/b&gt; %{y}"
+            not in text.partition("hovertemplate")[2].partition('"')[2].partition('"')[0]
+        )
 
 
 def test_the_groups_are_compared_as_liex_compare_does(data: StudyData) -> None:
@@ -132,21 +149,28 @@ def test_the_groups_are_compared_as_liex_compare_does(data: StudyData) -> None:
     assert abs(row["estimate"]) == pytest.approx(40.0, abs=15.0)
     assert (row["n_animals"], row["n_sessions"]) == (12, 22)
     assert "measure" in app_tables.STATS
-    assert len(stats) > 3  # the family that p is corrected for is not the one measure that is looked at
+    assert (
+        len(stats) > 3
+    )  # the family that p is corrected for is not the one measure that is looked at
 
 
 def test_rows_are_found_by_words_and_sorted_with_the_unknown_last(data: StudyData) -> None:
     table = app_tables.find(data, "sessions")
-    assert app_tables.arranged(table, "m003 DONE", "", False)["session"].tolist() == [KEY, "sub-m003_ses-02"]
+    assert app_tables.arranged(table, "m003 DONE", "", False)["session"].tolist() == [
+        KEY,
+        "sub-m003_ses-02",
+    ]
     rows = app_tables.arranged(table, "", "predicted_error_mm", True)
     assert set(rows["state"].tail(2)) == {"failed", "new"}
     assert app_tables.arranged(table, "nobody", "", False).empty
 
 
 def test_a_table_in_a_spreadsheet_computes_nothing_and_is_whole() -> None:
-    rows = pd.DataFrame({"name": ['=HYPERLINK("http://x")', "-2+3", "plain", None], "=x": [1.5, -2.0, 3.0, np.nan]})
+    rows = pd.DataFrame(
+        {"name": ['=HYPERLINK("http://x")', "-2+3", "plain", None], "=x": [1.5, -2.0, 3.0, np.nan]}
+    )
     found = pd.read_csv(io.StringIO("".join(app_tables.as_csv(rows))))
-    assert found["name"].tolist()[:3] == ["'=HYPERLINK(\"http://x\")", "'-2+3", "plain"]
+    assert found["name"].tolist()[:3] == ['\'=HYPERLINK("http://x")', "'-2+3", "plain"]
     assert list(found.columns) == ["name", "'=x"]
     assert found["'=x"].tolist()[:3] == [1.5, -2.0, 3.0]
 
@@ -207,8 +231,12 @@ def test_the_token_is_new_each_time_and_only_where_others_can_ask(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[dict[str, object]] = []
-    monkeypatch.setattr("liex_lab.dashboards.app.server.make_app", lambda data, **how: made.append(how))
-    monkeypatch.setattr("liex_lab.dashboards.app.server.serve", lambda app, host, port, told: told(port))
+    monkeypatch.setattr(
+        "liex_lab.dashboards.app.server.make_app", lambda data, **how: made.append(how)
+    )
+    monkeypatch.setattr(
+        "liex_lab.dashboards.app.server.serve", lambda app, host, port, told: told(port)
+    )
     monkeypatch.setattr(StudyData, "warm", lambda self, progress: None)
     said: list[str] = []
     for host in ("127.0.0.1", "0.0.0.0", "0.0.0.0"):
@@ -221,7 +249,9 @@ def test_the_token_is_new_each_time_and_only_where_others_can_ask(
     assert said[1].endswith(str(made[1]["token"]))
 
 
-def test_without_dash_a_sentence_says_what_to_install(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dash_a_sentence_says_what_to_install(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "dash", None)
     for name in [name for name in sys.modules if name.startswith("liex_lab.dashboards.app.server")]:
         monkeypatch.delitem(sys.modules, name)

@@ -37,7 +37,11 @@ class Served:
         self.asked: list[tuple[Path, float]] = []
         data = StudyData(*list_sessions(study))
         data.warm()
-        app = make_app(data, show_replay=lambda replay, at_s: self.asked.append((replay, at_s)), correct=correct)
+        app = make_app(
+            data,
+            show_replay=lambda replay, at_s: self.asked.append((replay, at_s)),
+            correct=correct,
+        )
         ready = threading.Event()
 
         def told(port: int) -> None:
@@ -67,7 +71,10 @@ def test_two_hundred_sessions_open_in_seconds_are_sorted_filtered_and_had_as_csv
     assert len(rows(page)) == N_SESSIONS
     page.get_by_role("button", name="with a pose").click()
     page.wait_for_selector("th[aria-sort='ascending']")
-    assert set(rows(page)[-2:]) == {"sub-m000_ses-02", "sub-m001_ses-01"}  # of those nothing is known
+    assert set(rows(page)[-2:]) == {
+        "sub-m000_ses-02",
+        "sub-m001_ses-01",
+    }  # of those nothing is known
     page.get_by_placeholder("any word").first.fill("failed")
     expect(page.locator("tbody tr")).to_have_count(1)
     assert "frame 33 cannot be read; copy it again" in page.locator("tbody").inner_text()
@@ -104,13 +111,19 @@ def test_an_ethogram_leads_to_the_frame_and_its_replay(served: Served, watched: 
     assert replay.name == "session.rrd"
     assert shown_s == pytest.approx(float(page.locator("#moment").input_value()))
     assert f"--at {shown_s:.3f}" in page.locator("#replay-command").inner_text()
-    tools = page.locator(".modebar-btn").evaluate_all("buttons => buttons.map(one => one.dataset.title)")
+    tools = page.locator(".modebar-btn").evaluate_all(
+        "buttons => buttons.map(one => one.dataset.title)"
+    )
     assert "Download plot as a PNG" in tools
-    assert not any("hare" in tool or "loud" in tool for tool in tools), tools  # it would send the figure away
+    assert not any("hare" in tool or "loud" in tool for tool in tools), (
+        tools
+    )  # it would send the figure away
     watched.nothing_went_wrong()
 
 
-def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(served: Served, watched: Watched) -> None:
+def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(
+    served: Served, watched: Watched
+) -> None:
     page, key = watched.page, "sub-m004_ses-01"
     page.goto(f"{served.address}/session/{key}?t=2.5")
     page.get_by_text("Correct this session").click()
@@ -120,7 +133,9 @@ def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(served: Served,
     page.locator("#frame-picture").scroll_into_view_if_needed()
     picture = page.locator("#frame-picture .nsewdrag").bounding_box()
     assert picture is not None
-    page.mouse.click(picture["x"] + picture["width"] * 0.52, picture["y"] + picture["height"] * 0.45)
+    page.mouse.click(
+        picture["x"] + picture["width"] * 0.52, picture["y"] + picture["height"] * 0.45
+    )
     expect(page.locator("#correct-u")).not_to_have_value("")
     u, v = (float(page.locator(f"#correct-{name}").input_value()) for name in "uv")
     page.get_by_role("button", name="Put it under the pixel").click()
@@ -132,7 +147,9 @@ def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(served: Served,
     folder = next(served.study.parent.rglob("sub-m004/ses-01/behav"))
     session = Session.open(folder)
     row = int((session.frames["time_s"] - 2.5).abs().to_numpy().argmin())
-    poses = session.table("poses", None, [int(session.frames["frame_index"].iloc[row])]).set_index("joint")
+    poses = session.table("poses", None, [int(session.frames["frame_index"].iloc[row])]).set_index(
+        "joint"
+    )
     assert (poses.loc["nose", "u_px"], poses.loc["nose", "v_px"]) == pytest.approx((u, v), abs=1.5)
     assert "pause" in set(session.bouts["action"])
     page.get_by_role("button", name="Take back").last.click()
@@ -153,7 +170,9 @@ def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(served: Served,
     watched.nothing_went_wrong()
 
 
-def test_a_measure_is_chosen_and_its_groups_compared_with_names_as_text(served: Served, watched: Watched) -> None:
+def test_a_measure_is_chosen_and_its_groups_compared_with_names_as_text(
+    served: Served, watched: Watched
+) -> None:
     page = watched.page
     page.goto(f"{served.address}/groups")
     page.wait_for_selector(".verdict")
@@ -180,7 +199,9 @@ def test_every_page_fits_a_phone(served: Served, watched: Watched, path: str) ->
     watched.nothing_went_wrong()
 
 
-def test_everything_can_be_reached_with_the_keyboard_and_is_seen_when_it_is(served: Served, watched: Watched) -> None:
+def test_everything_can_be_reached_with_the_keyboard_and_is_seen_when_it_is(
+    served: Served, watched: Watched
+) -> None:
     page = watched.page
     page.goto(f"{served.address}/session/{KEY}?t=2.5")
     page.wait_for_selector("#frame-facts dd")

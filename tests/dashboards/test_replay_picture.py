@@ -22,16 +22,24 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 MOUSE = WalkingMouse(steady(2.0), speed_mm_s=220.0)
 MOMENTS = (5, 50)
 Picture = np.ndarray
-DEPTH_VIEW = np.s_[70:620, 965:1915]  # of a picture of 1920 x 1080 in our layout; Rerun's own crop of a view panics
+DEPTH_VIEW = np.s_[
+    70:620, 965:1915
+]  # of a picture of 1920 x 1080 in our layout; Rerun's own crop of a view panics
 
 
 def drivers() -> bool:
     """Whether there is anything that draws: Vulkan's loader and a driver for it."""
-    found = [Path(place) / "vulkan" / "icd.d" for place in ("/usr/share", "/etc", "/usr/local/share")]
-    return ctypes.util.find_library("vulkan") is not None and any(list(place.glob("*.json")) for place in found)
+    found = [
+        Path(place) / "vulkan" / "icd.d" for place in ("/usr/share", "/etc", "/usr/local/share")
+    ]
+    return ctypes.util.find_library("vulkan") is not None and any(
+        list(place.glob("*.json")) for place in found
+    )
 
 
-pytestmark = pytest.mark.skipif(not drivers(), reason="needs Vulkan: apt install libvulkan1 mesa-vulkan-drivers")
+pytestmark = pytest.mark.skipif(
+    not drivers(), reason="needs Vulkan: apt install libvulkan1 mesa-vulkan-drivers"
+)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +55,9 @@ def pictures(session: Session) -> dict[int, Picture]:
     found = importlib.util.find_spec("rerun_cli")
     assert found is not None
     assert found.origin is not None
-    program = Path(found.origin).parent / "rerun"  # the one that the package brings, wherever PATH leads
+    program = (
+        Path(found.origin).parent / "rerun"
+    )  # the one that the package brings, wherever PATH leads
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -76,10 +86,14 @@ def joints_in(picture: Picture) -> np.ndarray:
     return (red > 200) & (green > 40) & (green < 130) & (blue < 110)
 
 
-def test_the_two_moments_differ_where_the_animal_moved_and_the_skeleton_lies_on_it(pictures) -> None:
+def test_the_two_moments_differ_where_the_animal_moved_and_the_skeleton_lies_on_it(
+    pictures,
+) -> None:
     first, second = (pictures[moment] for moment in MOMENTS)
     changed = np.abs(first.astype(int) - second.astype(int)).max(axis=-1) > 70
-    body = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((13, 13), np.uint8)) > 0
+    body = (
+        cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((13, 13), np.uint8)) > 0
+    )
     assert 0.002 < body.mean() < 0.12, "only the animal moved"
     near = cv2.dilate(body.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     for picture in (first, second):
@@ -98,12 +112,15 @@ def test_the_skeleton_moved_as_the_track_says(pictures, session: Session) -> Non
     assert np.linalg.norm(seen) > 60.0
 
 
-
-def test_what_was_corrected_is_shown_in_place_of_what_was_measured(session: Session, tmp_path: Path) -> None:
+def test_what_was_corrected_is_shown_in_place_of_what_was_measured(
+    session: Session, tmp_path: Path
+) -> None:
     from liex_lab.sessions.viewer import show_replay
 
     folder = Path(shutil.copytree(session.path, tmp_path / session.path.name))
-    place = session.poses.loc[MOMENTS[0] * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float) + np.array([0, 0, 30.0])
+    place = session.poses.loc[MOMENTS[0] * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(
+        float
+    ) + np.array([0, 0, 30.0])
     correct_session(folder, [joint_move(session, MOMENTS[0], "nose", place)])
     shown = show_replay(folder / "session.rrd", MOMENTS[0] / 30, headless=True)
     try:

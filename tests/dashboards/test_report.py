@@ -35,9 +35,13 @@ MOUSE = WalkingMouse(np.delete(steady(4.0), slice(40, 46)), rear_s=(2.0, 3.0), l
 @pytest.fixture(scope="module")
 def session(tmp_path_factory) -> Session:
     return write(
-        tmp_path_factory.mktemp("report") / "circle.liex", MOUSE, report=write_report, problems=["Dark & <cold>."],
-        gaps=find_gaps(MOUSE.times_ns, median_step(MOUSE.times_ns)), model={"name": "mouse", "sha256": "ab" * 32},
-    )  # fmt: skip
+        tmp_path_factory.mktemp("report") / "circle.liex",
+        MOUSE,
+        report=write_report,
+        problems=["Dark & <cold>."],
+        gaps=find_gaps(MOUSE.times_ns, median_step(MOUSE.times_ns)),
+        model={"name": "mouse", "sha256": "ab" * 32},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,11 @@ def test_the_report_is_written_with_the_session_and_can_be_made_again(session, p
 
 def test_the_report_asks_for_nothing_from_outside(page):
     assert not re.search(r"https?://|<script|<link|@import|url\((?!#)", page)
-    sources = [source for source in re.findall(r'(?:src|href)="([^"]*)"', page) if not source.startswith("#")]
+    sources = [
+        source
+        for source in re.findall(r'(?:src|href)="([^"]*)"', page)
+        if not source.startswith("#")
+    ]
     assert sources
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert len(page) < 1_500_000
@@ -109,27 +117,48 @@ def test_warnings_come_before_everything_else_and_say_what_is_wrong(session, pag
 
 
 def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatch):
-    flips = tables.to_pandas(tables.FLIPS, {
-        "session_id": "circle", "individual": "mouse_1", "start_s": [1.0, 2.0], "stop_s": [1.5, 2.25],
-        "start_frame": [30, 60], "stop_frame": [45, 68], "p_flip": [0.9, 0.4], "applied": [True, False],
-        "source": ["model", "model"], "undone_at": ["", ""],
-    })  # fmt: skip
+    flips = tables.to_pandas(
+        tables.FLIPS,
+        {
+            "session_id": "circle",
+            "individual": "mouse_1",
+            "start_s": [1.0, 2.0],
+            "stop_s": [1.5, 2.25],
+            "start_frame": [30, 60],
+            "stop_frame": [45, 68],
+            "p_flip": [0.9, 0.4],
+            "applied": [True, False],
+            "source": ["model", "model"],
+            "undone_at": ["", ""],
+        },
+    )
     again = Session.open(session.path)
     monkeypatch.setattr(type(again), "flips", flips)
-    assert any("2 stretches of 0.8 s in all; 1 were put right" in sentence for sentence in warnings(again))
-    assert flip_rows(again) == [("1.00", "1.50", "0.90", "put right"), ("2.00", "2.25", "0.40", "left as it was")]
+    assert any(
+        "2 stretches of 0.8 s in all; 1 were put right" in sentence for sentence in warnings(again)
+    )
+    assert flip_rows(again) == [
+        ("1.00", "1.50", "0.90", "put right"),
+        ("2.00", "2.25", "0.40", "left as it was"),
+    ]
     assert "Head and tail perhaps exchanged" in render(again)
 
 
 def test_noise_that_hides_a_pause_is_warned_of(tmp_path):
-    assert not any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE)))
+    assert not any(
+        "not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE))
+    )
     track = replace(MOUSE, sd_mm=8.0)
-    assert any("not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track)))
+    assert any(
+        "not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track))
+    )
 
 
 def test_the_matrix_and_the_zones_are_on_the_page(tmp_path):
     nest = Zone("nest <1>", polygon_mm=((0.0, 0.0), (250.0, 0.0), (250.0, 250.0), (0.0, 250.0)))
-    page = render(write(tmp_path / "z.liex", WalkingMouse(steady(12.0), rear_s=(2.0, 3.0)), zones=(nest,)))
+    page = render(
+        write(tmp_path / "z.liex", WalkingMouse(steady(12.0), rear_s=(2.0, 3.0)), zones=(nest,))
+    )
     assert "nest &lt;1&gt;" in page
     assert "nest <1>" not in page
     assert "rear to walk: 1 times, 100%" in page
@@ -140,7 +169,9 @@ def test_a_measure_around_an_onset_is_what_the_frames_say():
     time = np.arange(0, 50, 1 / 30)
     speed = np.where((time % 10) >= 5.0, 90.0, 10.0)
     moved = pd.DataFrame({"time_s": time, "speed_mm_s": speed})
-    bouts = pd.DataFrame({"action": ["run"] * 5 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 45.0, 1.0]})
+    bouts = pd.DataFrame(
+        {"action": ["run"] * 5 + ["walk"], "start_s": [5.0, 15.0, 25.0, 35.0, 45.0, 1.0]}
+    )
     found = around_onsets(moved, bouts, "run", "speed_mm_s")
     assert found is not None
     assert found.n == 5
@@ -151,7 +182,9 @@ def test_a_measure_around_an_onset_is_what_the_frames_say():
 
 def test_a_fish_has_a_report_of_its_own(tmp_path):
     """Its curves are the tail's, and what a slow camera cannot measure is said."""
-    session = write(tmp_path / "fish.liex", WalkingMouse(steady(3.0), skeleton=Skeleton.load("fish")))
+    session = write(
+        tmp_path / "fish.liex", WalkingMouse(steady(3.0), skeleton=Skeleton.load("fish"))
+    )
     page = render(session)
     assert "Tail beat" in page
     assert "Nose height" not in page
@@ -161,7 +194,15 @@ def test_a_fish_has_a_report_of_its_own(tmp_path):
 
 def test_the_methods_state_what_was_done(session):
     text = " ".join(methods(session))
-    for said in ("liex_lab", "model mouse", "abababab", "112 of 114", "6 further frames", "40 mm", "0.33 s"):
+    for said in (
+        "liex_lab",
+        "model mouse",
+        "abababab",
+        "112 of 114",
+        "6 further frames",
+        "40 mm",
+        "0.33 s",
+    ):
         assert said in text, said
 
 
@@ -174,12 +215,19 @@ def test_walls_zones_and_what_was_undone_are_shown(tmp_path):
     session = write(tmp_path / "c.liex", MOUSE, optics=optics, arena=bowl, zones=(nest,))
     page = render(session)
     assert page.count('<polygon class="outline"') == 2
-    for said in ("round, radius 250 mm; zones: nest", "kannala_brandt 0.125", "450 mm below the lens", "<title>nest"):
+    for said in (
+        "round, radius 250 mm; zones: nest",
+        "kannala_brandt 0.125",
+        "450 mm below the lens",
+        "<title>nest",
+    ):
         assert said in page, said
     assert "ideal camera in air" in " ".join(methods(session))
 
 
-@pytest.mark.parametrize("archive", sorted((REPOSITORY / "tests" / "golden").glob("*.tar.gz")), ids=lambda a: a.stem)
+@pytest.mark.parametrize(
+    "archive", sorted((REPOSITORY / "tests" / "golden").glob("*.tar.gz")), ids=lambda a: a.stem
+)
 def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp_path, archive):
     with tarfile.open(archive) as packed:
         packed.extractall(tmp_path, filter="data")
@@ -199,7 +247,11 @@ def test_a_session_without_behaviour_has_a_report_too(tmp_path):
 
 
 def test_a_session_without_any_pose_has_a_report_too(tmp_path):
-    session = write(tmp_path / "lost.liex", WalkingMouse(steady(1.0), lost=tuple(range(30))), report=write_report)
+    session = write(
+        tmp_path / "lost.liex",
+        WalkingMouse(steady(1.0), lost=tuple(range(30))),
+        report=write_report,
+    )
     assert "0.0%" in (session.path / "report.html").read_text()
 
 

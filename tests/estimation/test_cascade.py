@@ -26,23 +26,36 @@ def drawn_truth(skeleton: Skeleton, rng: np.random.Generator, bend: float = 0.3)
     return Truth(frames.rotation, frames.translation, scale)
 
 
-def off_the_truth(skeleton: Skeleton, truth: Truth, rng: np.random.Generator, size: np.ndarray) -> Candidates:
+def off_the_truth(
+    skeleton: Skeleton, truth: Truth, rng: np.random.Generator, size: np.ndarray
+) -> Candidates:
     """Candidates whose base is somewhere else, turned by anything up to pi."""
     twist = rng.normal(0, 1, (N, 6))
-    twist[:, :3] *= rng.uniform(0, np.pi, (N, 1)) / np.linalg.norm(twist[:, :3], axis=1, keepdims=True)
+    twist[:, :3] *= rng.uniform(0, np.pi, (N, 1)) / np.linalg.norm(
+        twist[:, :3], axis=1, keepdims=True
+    )
     twist[:, 3:] *= 20.0
     base = SE3(truth.rotations[:, 0], truth.positions[:, 0]) @ SE3.exp(twist)
     return Candidates.start(
-        skeleton, np.arange(N, dtype=np.int32), base.rotation, base.translation, rng.uniform(0.8, 1.2, N), size
+        skeleton,
+        np.arange(N, dtype=np.int32),
+        base.rotation,
+        base.translation,
+        rng.uniform(0.8, 1.2, N),
+        size,
     )
 
 
 def with_true_base(skeleton: Skeleton, truth: Truth, size: float = 1.0) -> Candidates:
     """Candidates whose base is exact; the other joints are yet to come."""
     return Candidates.start(
-        skeleton, np.arange(N, dtype=np.int32), truth.rotations[:, 0], truth.positions[:, 0], truth.scale,
+        skeleton,
+        np.arange(N, dtype=np.int32),
+        truth.rotations[:, 0],
+        truth.positions[:, 0],
+        truth.scale,
         np.full(N, size),
-    )  # fmt: skip
+    )
 
 
 def apply_exactly(cascade: Cascade, candidates: Candidates, joint: int, values: Any) -> None:
@@ -55,7 +68,9 @@ def test_the_label_of_the_base_moves_it_onto_the_truth(variant):
     rng = np.random.default_rng(1)
     skeleton, method = Skeleton.load("mouse"), METHODS[variant]
     truth = drawn_truth(skeleton, rng)
-    candidates = off_the_truth(skeleton, truth, rng, rng.uniform(0.8, 1.2, N) if method.session_size else np.ones(N))
+    candidates = off_the_truth(
+        skeleton, truth, rng, rng.uniform(0.8, 1.2, N) if method.session_size else np.ones(N)
+    )
     before = candidates.scale.copy()
     cascade = Cascade(skeleton, method, [])
     labels, _ = cascade.labels(candidates, 0, truth)
@@ -63,7 +78,9 @@ def test_the_label_of_the_base_moves_it_onto_the_truth(variant):
     apply_exactly(cascade, candidates, 0, labels)
     np.testing.assert_allclose(candidates.rotations[:, 0], truth.rotations[:, 0], atol=1e-9)
     np.testing.assert_allclose(candidates.positions[:, 0], truth.positions[:, 0], atol=1e-8)
-    np.testing.assert_allclose(candidates.scale, truth.scale if method.regress_scale else before, rtol=1e-12)
+    np.testing.assert_allclose(
+        candidates.scale, truth.scale if method.regress_scale else before, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
@@ -78,7 +95,9 @@ def test_the_papers_label_of_a_joint_is_the_turn_that_remains(animal):
         assert labels.shape == (N, cascade.n_values(joint))
         assert keep.all()
         apply_exactly(cascade, candidates, joint, labels)
-        np.testing.assert_allclose(candidates.rotations[:, joint], truth.rotations[:, joint], atol=1e-9)
+        np.testing.assert_allclose(
+            candidates.rotations[:, joint], truth.rotations[:, joint], atol=1e-9
+        )
     cascade.place_ends(candidates)
     np.testing.assert_allclose(candidates.positions, truth.positions, atol=1e-7)
 
@@ -91,7 +110,9 @@ def test_a_label_that_points_aims_the_bone_at_the_true_next_joint(animal):
     candidates, cascade = with_true_base(skeleton, truth), Cascade(skeleton, METHODS["default"], [])
     for joint in skeleton.solved[1:]:
         cascade.place(candidates, joint)
-        candidates.positions[:, joint] += 1.5 * rng.normal(0, 1, (N, 1)) * candidates.rotations[:, joint, :, 0]
+        candidates.positions[:, joint] += (
+            1.5 * rng.normal(0, 1, (N, 1)) * candidates.rotations[:, joint, :, 0]
+        )
         labels, _ = cascade.labels(candidates, joint, truth)
         apply_exactly(cascade, candidates, joint, labels)
         child = skeleton.next_joint[joint]

@@ -28,9 +28,14 @@ def columns(estimates: Estimates) -> dict[str, np.ndarray]:
     pose = estimates.chosen.pose
     crops = {f.name: getattr(estimates.crops, f.name) for f in fields(estimates.crops)}
     return {
-        **chosen, **crops, "found": estimates.found, "rotation": pose.root.rotation,
-        "translation": pose.root.translation, "angles": pose.angles, "scale": pose.scale,
-    }  # fmt: skip
+        **chosen,
+        **crops,
+        "found": estimates.found,
+        "rotation": pose.root.rotation,
+        "translation": pose.root.translation,
+        "angles": pose.angles,
+        "scale": pose.scale,
+    }
 
 
 @pytest.mark.parametrize("variant", [*VARIANTS, "seen"])
@@ -41,7 +46,9 @@ def test_all_candidates_agree_with_the_slow_twin_of_algorithm_1(variant):
     looks = SCENE.looks(crops, model.method.camera_view)
     rotations, positions, scales, scores = estimator.candidates(crops, looks, size)
     for i in range(4):
-        picture = algorithm1.Picture(crops.heights[i], looks[i], crops.moments[i], size, model.method.reach_mm)
+        picture = algorithm1.Picture(
+            crops.heights[i], looks[i], crops.moments[i], size, model.method.reach_mm
+        )
         for k in range(scores.shape[1]):
             drawn = estimator._starts[0, k]
             begun = (
@@ -50,8 +57,12 @@ def test_all_candidates_agree_with_the_slow_twin_of_algorithm_1(variant):
                 else algorithm1.start(model, crops.moments[i], k, drawn, size)
             )
             twin = algorithm1.solve(model, picture, begun)
-            np.testing.assert_allclose(rotations[i, k], [joint[:3, :3] for joint in twin.joints], atol=1e-9)
-            np.testing.assert_allclose(positions[i, k], [joint[:3, 3] for joint in twin.joints], atol=1e-7)
+            np.testing.assert_allclose(
+                rotations[i, k], [joint[:3, :3] for joint in twin.joints], atol=1e-9
+            )
+            np.testing.assert_allclose(
+                positions[i, k], [joint[:3, 3] for joint in twin.joints], atol=1e-7
+            )
             assert scales[i, k] == pytest.approx(twin.scale, rel=1e-12)
             assert scores[i, k] == pytest.approx(twin.score, rel=1e-9)
 
@@ -73,7 +84,9 @@ def test_the_mode_of_votes_agrees_with_the_slow_twin_and_ignores_an_outlier():
 def test_one_thread_and_many_give_the_same_numbers(variant):
     estimator = PoseEstimator(trained(variant).model)
     depths = unseen().depths[:12]
-    one, many = (columns(estimator.estimate(depths, SCENE, 1.0, parallel)) for parallel in (False, True))
+    one, many = (
+        columns(estimator.estimate(depths, SCENE, 1.0, parallel)) for parallel in (False, True)
+    )
     for name, values in one.items():
         np.testing.assert_array_equal(values, many[name], err_msg=name)
 
@@ -86,10 +99,13 @@ def test_a_frame_does_not_know_with_which_others_it_came(parts):
     whole = columns(estimator.estimate(depths, SCENE, 1.0))
     stops = np.cumsum(parts)
     pieces = [
-        columns(estimator.estimate(depths[stop - n : stop], SCENE, 1.0)) for n, stop in zip(parts, stops, strict=True)
+        columns(estimator.estimate(depths[stop - n : stop], SCENE, 1.0))
+        for n, stop in zip(parts, stops, strict=True)
     ]
     for name, values in whole.items():
-        np.testing.assert_array_equal(values, np.concatenate([piece[name] for piece in pieces]), err_msg=name)
+        np.testing.assert_array_equal(
+            values, np.concatenate([piece[name] for piece in pieces]), err_msg=name
+        )
 
 
 def test_frames_without_an_animal_are_rows_of_nan_among_the_others():
@@ -109,7 +125,9 @@ def test_frames_without_an_animal_are_rows_of_nan_among_the_others():
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_recording_in_which_nothing_is_found_is_all_nan_and_no_error(variant):
     estimator = PoseEstimator(trained(variant).model)
-    estimates = estimator.estimate(np.zeros((3, CAMERA.height, CAMERA.width), np.float32), SCENE, 1.0)
+    estimates = estimator.estimate(
+        np.zeros((3, CAMERA.height, CAMERA.width), np.float32), SCENE, 1.0
+    )
     assert not estimates.found.any()
     assert estimates.chosen.error_mm.shape == (3,)
     assert np.isnan(estimates.chosen.pose.joints(estimator.skeleton)).all()
@@ -120,7 +138,9 @@ def test_poses_come_out_in_the_camera_frame_near_the_truth(variant, limit_mm):
     toy, estimator = unseen(), PoseEstimator(trained(variant).model)
     estimates = estimator.estimate(toy.depths, SCENE, 1.0)
     true = FLOOR.T_arena_camera.inverse() @ toy.joints
-    off = np.linalg.norm(estimates.chosen.pose.joints(estimator.skeleton) - true, axis=-1).mean(axis=1)
+    off = np.linalg.norm(estimates.chosen.pose.joints(estimator.skeleton) - true, axis=-1).mean(
+        axis=1
+    )
     assert np.median(off) < limit_mm
 
 
@@ -138,7 +158,9 @@ def test_the_size_of_an_animal_is_found_from_its_frames(true_size):
     toy = toy_mice(60, 5, size=(true_size, true_size))
     estimator = PoseEstimator(trained("default").model)
     area = float(np.median(SCENE.extract(toy.depths, 1.0).moments[:, 1]))
-    assert estimator.find_size(toy.depths, replace(SCENE, area_mm2=area)) == pytest.approx(true_size, rel=0.06)
+    assert estimator.find_size(toy.depths, replace(SCENE, area_mm2=area)) == pytest.approx(
+        true_size, rel=0.06
+    )
 
 
 def pruned_model(survivors: int):
@@ -169,13 +191,20 @@ def test_survivors_are_better_than_those_that_do_not_go_on_and_cost_little():
     true = FLOOR.T_arena_camera.inverse() @ unseen().joints
     crops = SCENE.extract(depths, 1.0)
     looks = SCENE.looks(crops)
-    few, all_of_them = (PoseEstimator(model, unpruned=u).candidates(crops, looks, 1.0) for u in (False, True))
+    few, all_of_them = (
+        PoseEstimator(model, unpruned=u).candidates(crops, looks, 1.0) for u in (False, True)
+    )
     assert few[3].mean() < all_of_them[3].mean()
     off = [
-        np.linalg.norm(PoseEstimator(model, unpruned=u).estimate(depths, SCENE, 1.0).chosen.pose.joints(model.skeleton)
-                       - true, axis=-1).mean()
+        np.linalg.norm(
+            PoseEstimator(model, unpruned=u)
+            .estimate(depths, SCENE, 1.0)
+            .chosen.pose.joints(model.skeleton)
+            - true,
+            axis=-1,
+        ).mean()
         for u in (False, True)
-    ]  # fmt: skip
+    ]
     assert off[0] < 1.15 * off[1]
 
 
@@ -199,7 +228,10 @@ def test_more_candidates_may_be_asked_for_than_the_model_was_made_with():
     for n in (0, 2, 24):
         estimator = PoseEstimator(model, n)
         crops = SCENE.extract(depths, 1.0)
-        assert estimator.candidates(crops, SCENE.looks(crops), 1.0)[3].shape == (40, n or model.method.n_candidates)
+        assert estimator.candidates(crops, SCENE.looks(crops), 1.0)[3].shape == (
+            40,
+            n or model.method.n_candidates,
+        )
         joints = estimator.estimate(depths, SCENE, 1.0).chosen.pose.joints(model.skeleton)
         off.append(np.linalg.norm(joints - true, axis=-1).mean())
     assert off[2] < off[1]
@@ -209,11 +241,15 @@ def test_of_two_things_of_the_animals_size_the_one_that_looks_like_it_is_taken()
     toy, estimator = unseen(), PoseEstimator(trained("default").model)
     middle = toy.joints[:30, 2]
     box = np.where(middle[:, :1] > 0, [-75.0, 0.0], [75.0, 0.0])
-    depths = np.stack([with_box(depth, *place) for depth, place in zip(toy.depths, box, strict=False)])
+    depths = np.stack(
+        [with_box(depth, *place) for depth, place in zip(toy.depths, box, strict=False)]
+    )
     bare = FLOOR.depth(CAMERA.width, CAMERA.height)
     box_area = SCENE.extract(with_box(bare, 75.0, 0.0)[None], 1.0).moments[0, 1]
     volume = float(np.median(SCENE.extract(toy.depths, 1.0).moments[:, 2]))
-    scene = replace(SCENE, area_mm2=float(box_area), volume_mm3=volume)  # by area alone the box is the likelier one
+    scene = replace(
+        SCENE, area_mm2=float(box_area), volume_mm3=volume
+    )  # by area alone the box is the likelier one
 
     def off(moments: np.ndarray) -> np.ndarray:
         return np.linalg.norm(moments[:, 3:5] - middle[:, :2], axis=1)
@@ -270,11 +306,21 @@ def test_the_mean_weighs_by_score_and_leaves_out_what_lies_far_from_the_best():
     method = replace(METHODS["default"], top_k=3, top_tau=1.0, top_radius_mm=15.0)
     moved = np.zeros((1, 4, 1, 3))
     moved[0, :, 0, 0] = [0.0, 4.0, 60.0, 8.0]
-    scores = np.array([[2.0, 2.0 + np.log(3.0), 2.5, 9.0]])  # the last one is not among the best three
+    scores = np.array(
+        [[2.0, 2.0 + np.log(3.0), 2.5, 9.0]]
+    )  # the last one is not among the best three
     picked = choose(
-        skeleton, method, Calibration(), 1.0, np.repeat(rotations, 4, 1), np.repeat(positions, 4, 1) + moved, scores
+        skeleton,
+        method,
+        Calibration(),
+        1.0,
+        np.repeat(rotations, 4, 1),
+        np.repeat(positions, 4, 1) + moved,
+        scores,
     )
-    np.testing.assert_allclose(picked.pose.joints(skeleton)[0] - positions[0, 0], [[1.0, 0.0, 0.0]] * 5, atol=1e-9)
+    np.testing.assert_allclose(
+        picked.pose.joints(skeleton)[0] - positions[0, 0], [[1.0, 0.0, 0.0]] * 5, atol=1e-9
+    )
     assert picked.score[0] == pytest.approx(2.0 + 0.25 * np.log(3.0))
     assert picked.spread[0] == pytest.approx(np.sqrt(0.75 * 1.0 + 0.25 * 9.0))
 
@@ -285,7 +331,9 @@ def test_the_expected_error_is_a_straight_line_through_score_and_spread_and_grow
     share = (0.5, 0.8, 1.0, 1.2, 1.5)
     calibration = Calibration(offset=0.3, slope=0.6, spread_slope=0.2, joint_share=share)
     for size in (1.0, 1.7):
-        picked = choose(skeleton, METHODS["default"], calibration, size, rotations, positions, scores)
+        picked = choose(
+            skeleton, METHODS["default"], calibration, size, rotations, positions, scores
+        )
         expected = size * (0.3 + 0.6 * picked.score + 0.2 * picked.spread)
         np.testing.assert_allclose(picked.error_mm, expected)
         np.testing.assert_allclose(picked.sd_mm, expected[:, None] * share / np.sqrt(3.0))
@@ -297,7 +345,12 @@ def test_doubts_say_how_good_a_candidate_of_the_opposite_direction_is():
     both = np.concatenate([positions, backwards], axis=1)
     for order in ([0, 1], [0, 0]):
         picked = choose(
-            skeleton, METHODS["paper"], Calibration(), 1.0, np.repeat(rotations, 2, 1), both[:, order],
+            skeleton,
+            METHODS["paper"],
+            Calibration(),
+            1.0,
+            np.repeat(rotations, 2, 1),
+            both[:, order],
             np.array([[2.0, 3.5]]),
-        )  # fmt: skip
+        )
         assert picked.doubts[0, 1] == (3.5 if order == [0, 1] else 40.0)

@@ -51,7 +51,9 @@ def test_a_corrected_pose_keeps_the_proportions_of_the_bones():
     pose = PoseEstimator(corrected_model()).estimate(unseen().depths[:20], SCENE, 1.0).chosen.pose
     bones = np.linalg.norm(np.diff(pose.joints(skeleton), axis=1), axis=-1)
     home = np.linalg.norm(skeleton.offsets[1:], axis=-1)
-    np.testing.assert_allclose(bones / bones.sum(1, keepdims=True), np.tile(home / home.sum(), (20, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        bones / bones.sum(1, keepdims=True), np.tile(home / home.sum(), (20, 1)), atol=1e-9
+    )
 
 
 def test_the_correction_comes_back_from_a_model_file(tmp_path: Path):

@@ -17,6 +17,8 @@ def test_gestures_are_measured_from_the_pictures_alone() -> None:
     found = estimator.estimate(sample, scene, size)
     assert found.found.all()
     assert abs(size * estimator.skeleton.length / gestures.spine_mm - 1.0) < 0.12
-    off = np.linalg.norm(found.chosen.pose.joints(estimator.skeleton) - gestures.joints_camera, axis=-1).mean(axis=1)
+    off = np.linalg.norm(
+        found.chosen.pose.joints(estimator.skeleton) - gestures.joints_camera, axis=-1
+    ).mean(axis=1)
     assert np.median(off) < 15.0
     assert (found.chosen.pose.scale > 0).all()

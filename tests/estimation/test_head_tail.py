@@ -29,7 +29,9 @@ def mice():
 def network(mice) -> Network:
     images, right, wrong, size = mice
     skeleton = toy_mice(1, seed=0).skeleton
-    pictures = np.concatenate([laid_along(skeleton, images, joints, size) for joints in (right, wrong)])
+    pictures = np.concatenate(
+        [laid_along(skeleton, images, joints, size) for joints in (right, wrong)]
+    )
     return Facing.fit(pictures, np.repeat([True, False], N), seed=3)
 
 
@@ -51,7 +53,9 @@ def test_the_picture_lies_along_the_animal_whatever_its_heading_and_size(mice):
     images, right, _, size = mice
     skeleton = toy_mice(1, seed=0).skeleton
     shown = laid_along(skeleton, images, right, size) > 0
-    straight = np.flatnonzero(np.ptp(np.arctan2(*np.diff(right, axis=1)[..., 1::-1].transpose(2, 0, 1)), axis=1) < 0.3)
+    straight = np.flatnonzero(
+        np.ptp(np.arctan2(*np.diff(right, axis=1)[..., 1::-1].transpose(2, 0, 1)), axis=1) < 0.3
+    )
     length = shown[straight].any(axis=2).sum(axis=1)
     width = shown[straight].any(axis=1).sum(axis=1)
     assert np.median(length) > 1.8 * np.median(width)
@@ -61,7 +65,10 @@ def test_the_picture_lies_along_the_animal_whatever_its_heading_and_size(mice):
 def test_a_network_tells_mice_that_it_has_not_seen(network):
     data = training_set(toy_mice(100, seed=77), METHODS["default"])
     right = data.truth.positions
-    said = [facing(network).logits(data.images, np.ascontiguousarray(j), 1.0) for j in (right, right[:, ::-1])]
+    said = [
+        facing(network).logits(data.images, np.ascontiguousarray(j), 1.0)
+        for j in (right, right[:, ::-1])
+    ]
     assert np.mean(said[0] > said[1]) > 0.97
 
 
@@ -79,9 +86,17 @@ def test_the_word_counts_where_scores_are_near_and_only_there(mice, network):
     one = int(np.argmin(np.abs(size - 1.0)))
     seen = type(images)(*(np.repeat(v[one : one + 1], 4, axis=0) for v in vars(images).values()))
     # two candidates for each way; the wrong way is ahead by a little, by much, not at all, and alone
-    positions = np.repeat(np.stack([wrong[one], wrong[one], right[one], right[one]])[None], 4, axis=0)
-    scores = np.array([[3.0, 4.0, 5.0, 6.0], [3.0, 4.0, 3.0 + 1.1 * UNSURE_MM, 40.0], [5.0, 6.0, 3.0, 4.0],
-                       [3.0, 4.0, np.inf, np.inf]])  # fmt: skip
+    positions = np.repeat(
+        np.stack([wrong[one], wrong[one], right[one], right[one]])[None], 4, axis=0
+    )
+    scores = np.array(
+        [
+            [3.0, 4.0, 5.0, 6.0],
+            [3.0, 4.0, 3.0 + 1.1 * UNSURE_MM, 40.0],
+            [5.0, 6.0, 3.0, 4.0],
+            [3.0, 4.0, np.inf, np.inf],
+        ]
+    )
     judged = facing(network).judged(seen, positions, scores, 1.0)
     assert judged[0].argmin() == 2
     np.testing.assert_array_equal(judged[0, 2:], scores[0, 2:])
@@ -95,7 +110,9 @@ def test_an_estimator_with_it_measures_as_before_where_it_was_sure(network):
     toy = toy_mice(24, seed=91)
     plain = PoseEstimator(model)
     told = PoseEstimator(replace(model, facing=network))
-    before, after = (e.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(e.skeleton) for e in (plain, told))
+    before, after = (
+        e.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(e.skeleton) for e in (plain, told)
+    )
     sight = plain._look(toy.depths, SCENE, 1.0, True)[0]
     sure = ~(both_ways(sight.positions, sight.scores, plain.skeleton.tip)[2] < UNSURE_MM)
     assert sure.any()
@@ -123,7 +140,12 @@ def test_it_comes_out_of_the_model_file_as_it_went_in(network, tmp_path):
 def test_it_is_learned_again_with_the_same_bits(mice, network):
     images, right, wrong, size = mice
     skeleton = toy_mice(1, seed=0).skeleton
-    pictures = np.concatenate([laid_along(skeleton, images, joints, size) for joints in (right, wrong)])
+    pictures = np.concatenate(
+        [laid_along(skeleton, images, joints, size) for joints in (right, wrong)]
+    )
     again = Facing.fit(pictures, np.repeat([True, False], N), seed=3)
-    assert all(np.array_equal(a, b) for one, other in zip(again.layers, network.layers, strict=True)
-               for a, b in zip(one, other, strict=True))  # fmt: skip
+    assert all(
+        np.array_equal(a, b)
+        for one, other in zip(again.layers, network.layers, strict=True)
+        for a, b in zip(one, other, strict=True)
+    )

@@ -22,32 +22,46 @@ class Window:
 
     def __init__(self, camera: Camera, tilt_deg: float, step: int, camera_view: bool) -> None:
         tilt = np.radians(tilt_deg)
-        floor = Floor.from_plane(np.array([np.sin(tilt), -0.4 * np.sin(tilt), np.cos(tilt)]), 700.0, camera)
+        floor = Floor.from_plane(
+            np.array([np.sin(tilt), -0.4 * np.sin(tilt), np.cos(tilt)]), 700.0, camera
+        )
         scene = Scene.from_floor(camera, floor)
         distance = 655.0 if camera_view else floor.distance_mm
         origin = np.array([[camera.width // 2 - 30, camera.height // 2 - 70]], np.int32)
         crops = Crops(
-            np.zeros((1, 96, 96), np.int16), origin, np.array([step], np.int32), np.ones(1, np.int64),
-            np.zeros((1, 8)), np.array([distance]), np.ones(1, np.int64),
-        )  # fmt: skip
+            np.zeros((1, 96, 96), np.int16),
+            origin,
+            np.array([step], np.int32),
+            np.ones(1, np.int64),
+            np.zeros((1, 8)),
+            np.array([distance]),
+            np.ones(1, np.int64),
+        )
         self.look = scene.looks(crops, camera_view)[0]
         self.camera, self.origin, self.step = camera, origin[0], step
-        self.T_camera_view = SE3(scene.view_rotation(camera_view), np.array([0.0, 0.0, distance])).inverse()
+        self.T_camera_view = SE3(
+            scene.view_rotation(camera_view), np.array([0.0, 0.0, distance])
+        ).inverse()
 
     def crop_pixel(self, p_view: np.ndarray) -> np.ndarray:
         """Crop pixels (..., 2) under points (..., 3) mm of the view frame."""
         return (self.camera.project(self.T_camera_view @ p_view) - self.origin) / self.step
 
-    def view(self, rotation: np.ndarray, position: np.ndarray, size: float = 1.0, reach: float = REACH) -> np.ndarray:
+    def view(
+        self, rotation: np.ndarray, position: np.ndarray, size: float = 1.0, reach: float = REACH
+    ) -> np.ndarray:
         view = np.empty(VIEW)
         kernels.fill_view(rotation, position, self.look, size, reach, view)
         return view
 
 
 CASES = (
-    (PRIMESENSE, 0.0, 1, False), (PRIMESENSE, 9.0, 2, False), (KINECT_V2, 5.0, 1, False),
-    (Camera(900.0, 850.0, 500.0, 420.0, 1024, 1024), 12.0, 3, False), (KINECT_V2, 7.0, 2, True),
-)  # fmt: skip
+    (PRIMESENSE, 0.0, 1, False),
+    (PRIMESENSE, 9.0, 2, False),
+    (KINECT_V2, 5.0, 1, False),
+    (Camera(900.0, 850.0, 500.0, 420.0, 1024, 1024), 12.0, 3, False),
+    (KINECT_V2, 7.0, 2, True),
+)
 WINDOWS = [Window(*case) for case in CASES]
 
 
@@ -74,7 +88,9 @@ def test_offsets_move_over_the_crop_as_the_exact_projection_does_to_first_order(
         unit = REACH * size / 127.0
         for k in range(3):
             h = 1e-3
-            ahead, behind = (window.crop_pixel(position + sign * h * unit * rotation[:, k]) for sign in (1, -1))
+            ahead, behind = (
+                window.crop_pixel(position + sign * h * unit * rotation[:, k]) for sign in (1, -1)
+            )
             np.testing.assert_allclose(matrix[:, k], (ahead - behind) / (2 * h), atol=1e-8)
 
 
@@ -97,19 +113,36 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
     window, n = WINDOWS[1], 7
     rotations, positions = so3.exp(rng.normal(0, 1, (n, 3, 3))), rng.uniform(-50, 50, (n, 3, 3))
     moments = rng.uniform(10, 100, (2, 8))
-    size, scale, image = rng.uniform(0.8, 1.2, n), rng.uniform(0.8, 1.2, n), np.arange(n, dtype=np.int32) % 2
+    size, scale, image = (
+        rng.uniform(0.8, 1.2, n),
+        rng.uniform(0.8, 1.2, n),
+        np.arange(n, dtype=np.int32) % 2,
+    )
     views, scalars = np.empty((n, 2, VIEW)), np.empty((n, kernels.N_SCALARS))
     reach = np.full(2, REACH)
     kernels.look_all(
-        np.array([2, 0]), np.stack([window.look] * 2), moments, image, size, reach, rotations, positions, scale, views,
+        np.array([2, 0]),
+        np.stack([window.look] * 2),
+        moments,
+        image,
+        size,
+        reach,
+        rotations,
+        positions,
+        scale,
+        views,
         scalars,
-    )  # fmt: skip
+    )
     for s in range(n):
         own = np.empty(kernels.N_SCALARS)
-        kernels.fill_scalars(rotations[s, 2], positions[s, 2], scale[s], moments[image[s]], size[s], own)
+        kernels.fill_scalars(
+            rotations[s, 2], positions[s, 2], scale[s], moments[image[s]], size[s], own
+        )
         np.testing.assert_array_equal(scalars[s], own)
         for v, joint in enumerate((2, 0)):
-            np.testing.assert_array_equal(views[s, v], window.view(rotations[s, joint], positions[s, joint], size[s]))
+            np.testing.assert_array_equal(
+                views[s, v], window.view(rotations[s, joint], positions[s, joint], size[s])
+            )
 
 
 @pytest.mark.parametrize(("turned", "grown"), [(0.7, 1.0), (-2.9, 1.0), (0.0, 1.6), (2.0, 0.7)])
@@ -121,12 +154,36 @@ def test_the_numbers_about_the_whole_animal_do_not_change_when_it_turns_or_grows
     kernels.fill_scalars(rotation, position, 0.95, moments, 1.0, before)
     turn = so3.exp(np.array([0.0, 0.0, turned]))
     centre = grown * turn[:2, :2] @ moments[3:5]
-    moved = moments * [1, grown**2, grown**3, 0, 0, 1, grown, grown, 1] + [0, 0, 0, *centre, turned, 0, 0, 0]
-    kernels.fill_scalars(turn @ rotation, grown * turn @ position, 0.95 * grown, moved, grown, after)
+    moved = moments * [1, grown**2, grown**3, 0, 0, 1, grown, grown, 1] + [
+        0,
+        0,
+        0,
+        *centre,
+        turned,
+        0,
+        0,
+        0,
+    ]
+    kernels.fill_scalars(
+        turn @ rotation, grown * turn @ position, 0.95 * grown, moved, grown, after
+    )
     np.testing.assert_allclose(after, before, atol=1e-8)
 
 
-TURNS = [0.0, 1e-12, 1e-7, 0.99e-4, 1.01e-4, 0.99e-3, 1.01e-3, 0.3, 2.0, np.pi - 1e-9, np.pi, np.pi + 0.4]
+TURNS = [
+    0.0,
+    1e-12,
+    1e-7,
+    0.99e-4,
+    1.01e-4,
+    0.99e-3,
+    1.01e-3,
+    0.3,
+    2.0,
+    np.pi - 1e-9,
+    np.pi,
+    np.pi + 0.4,
+]
 
 
 @pytest.mark.parametrize("angle", TURNS)
@@ -151,7 +208,9 @@ def test_corrections_of_a_batch_count_in_levers_and_leave_the_scale_alone_withou
     values = rng.normal(0, 5, (4, 7)).astype(np.float32)
     for width in (6, 7):
         got_rotation, got_position, got_scale = rotations.copy(), positions.copy(), scale.copy()
-        kernels.correct_base_all(got_rotation, got_position, got_scale, values[:, :width], np.array([30.0, 50.0]), size)
+        kernels.correct_base_all(
+            got_rotation, got_position, got_scale, values[:, :width], np.array([30.0, 50.0]), size
+        )
         twist = values[:, :6].astype(float) * (1 / 30.0, 1 / 30.0, 1 / 30.0, 1, 1, 1)
         twist[:, 3:] *= size[:, None]
         expected = SE3(rotations[:, 0], positions[:, 0]) @ SE3.exp(twist)
@@ -189,7 +248,9 @@ def test_joints_placed_and_turned_one_after_the_other_give_the_forward_kinematic
     home = (skeleton.parents, skeleton.offsets, skeleton.rest, scale, rotations, positions)
     for joint in skeleton.solved[1:]:
         kernels.place_joint(joint, *home)
-        kernels.correct_joint(rotations[joint], skeleton.axes[joint], angles[joint][skeleton.axes[joint]], 1.0)
+        kernels.correct_joint(
+            rotations[joint], skeleton.axes[joint], angles[joint][skeleton.axes[joint]], 1.0
+        )
     solved = (rotations.copy(), positions.copy())
     kernels.place_rest(np.array(skeleton.solved), *home)
     np.testing.assert_allclose(rotations, expected[0], atol=1e-12)

@@ -27,8 +27,12 @@ VARIANTS = ["default", "paper"]
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    calibration = Calibration(0.25, 0.75, 0.125, (0.5, 1.75), (0.5, 1.0, 1.5, 0.75, 2.0), 4.5, 1111.0)
-    return replace(trained("default").model, calibration=calibration, card={"animal": "mouse", "seed": 20})
+    calibration = Calibration(
+        0.25, 0.75, 0.125, (0.5, 1.75), (0.5, 1.0, 1.5, 0.75, 2.0), 4.5, 1111.0
+    )
+    return replace(
+        trained("default").model, calibration=calibration, card={"animal": "mouse", "seed": 20}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +42,10 @@ def content(model: Model) -> bytes:
 
 def forests_of(model: Model) -> list[Forest]:
     expectation = [model.expectation] if model.expectation else []
-    return [forest for rounds in model.cascade.forests for forest in rounds] + [model.metric, *expectation]
+    return [forest for rounds in model.cascade.forests for forest in rounds] + [
+        model.metric,
+        *expectation,
+    ]
 
 
 def repacked(content: bytes, change: Callable[[dict[str, Any]], None], without: str = "") -> bytes:
@@ -51,7 +58,9 @@ def repacked(content: bytes, change: Callable[[dict[str, Any]], None], without: 
                 head = json.loads(np.lib.format.read_array(io.BytesIO(data)).tobytes())
                 change(head)
                 packed = io.BytesIO()
-                np.lib.format.write_array(packed, np.frombuffer(json.dumps(head).encode(), np.uint8))
+                np.lib.format.write_array(
+                    packed, np.frombuffer(json.dumps(head).encode(), np.uint8)
+                )
                 data = packed.getvalue()
             if not (without and name.startswith(without)):
                 new.writestr(name, data)
@@ -103,7 +112,9 @@ def test_an_estimator_measures_the_same_with_the_model_read_back(tmp_path, model
         estimator.estimate(unseen().depths[:8], SCENE, 1.0).chosen
         for estimator in (PoseEstimator(model), PoseEstimator.load(tmp_path / "toy.npz"))
     )
-    np.testing.assert_array_equal(after.pose.joints(model.skeleton), before.pose.joints(model.skeleton))
+    np.testing.assert_array_equal(
+        after.pose.joints(model.skeleton), before.pose.joints(model.skeleton)
+    )
     np.testing.assert_array_equal(after.error_mm, before.error_mm)
 
 
@@ -170,7 +181,9 @@ def test_a_damaged_file_is_refused(tmp_path, content, seed):
 def test_a_file_that_lacks_a_part_is_refused(tmp_path, content):
     refusal(tmp_path, repacked(content, lambda head: None, without="003_leaves"))
     refusal(tmp_path, repacked(content, lambda head: None, without="head"))
-    assert "holds 8 forests" in refusal(tmp_path, repacked(content, lambda head: None, without="008"))
+    assert "holds 8 forests" in refusal(
+        tmp_path, repacked(content, lambda head: None, without="008")
+    )
 
 
 @pytest.mark.parametrize("section", ["method", "skeleton", "calibration", "card"])
@@ -218,9 +231,13 @@ def foreign_head() -> bytes:
 
 
 FOREIGN = {
-    "npz": foreign_npz(), "npy": foreign_npy(), "zip": foreign_zip(), "head": foreign_head(),
-    "text": b"a mouse of 65 mm\n", "png": b"\x89PNG\r\n\x1a\n" + bytes(range(256)),
-}  # fmt: skip
+    "npz": foreign_npz(),
+    "npy": foreign_npy(),
+    "zip": foreign_zip(),
+    "head": foreign_head(),
+    "text": b"a mouse of 65 mm\n",
+    "png": b"\x89PNG\r\n\x1a\n" + bytes(range(256)),
+}
 
 
 @pytest.mark.parametrize("kind", FOREIGN)

@@ -64,10 +64,16 @@ def alone(pose: Pose) -> Pose:
 
 def refined(pose: Pose, heights: np.ndarray, looks: np.ndarray, size: float, n_steps: int) -> Pose:
     after = REFINER.refine(alone(pose), heights, looks, size, n_steps)
-    return Pose(SE3(after.root.rotation[:, 0], after.root.translation[:, 0]), after.angles[:, 0], after.scale[:, 0])
+    return Pose(
+        SE3(after.root.rotation[:, 0], after.root.translation[:, 0]),
+        after.angles[:, 0],
+        after.scale[:, 0],
+    )
 
 
-def fit_of(pose: Pose, heights: np.ndarray, looks: np.ndarray, moments: np.ndarray, size: float) -> np.ndarray:
+def fit_of(
+    pose: Pose, heights: np.ndarray, looks: np.ndarray, moments: np.ndarray, size: float
+) -> np.ndarray:
     return REFINER.fit(alone(pose), heights, looks, moments, size)[:, 0]
 
 
@@ -115,19 +121,30 @@ def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> No
     crops, looks, true = hands()
     poses = [alone(shaken(true, 5, 6.0)), alone(true), alone(shaken(true, 6, 6.0))]
     both = Pose(
-        SE3(*(np.concatenate([getattr(p.root, name) for p in poses], axis=1) for name in ("rotation", "translation"))),
-        np.concatenate([p.angles for p in poses], axis=1), np.concatenate([p.scale for p in poses], axis=1),
-    )  # fmt: skip
+        SE3(
+            *(
+                np.concatenate([getattr(p.root, name) for p in poses], axis=1)
+                for name in ("rotation", "translation")
+            )
+        ),
+        np.concatenate([p.angles for p in poses], axis=1),
+        np.concatenate([p.scale for p in poses], axis=1),
+    )
     best, fit = REFINER.best(both, ImageSet(crops.heights, looks, crops.moments), 1.0, 2)
     near = refined(refined(true, crops.heights, looks, 1.0, 1), crops.heights, looks, 1.0, 1)
     taken = off(best, near) < 1e-9
     assert taken.mean() > 0.9
-    np.testing.assert_allclose(fit[taken], fit_of(near, crops.heights, looks, crops.moments, 1.0)[taken])
+    np.testing.assert_allclose(
+        fit[taken], fit_of(near, crops.heights, looks, crops.moments, 1.0)[taken]
+    )
 
 
 def test_the_true_pose_explains_the_picture_best() -> None:
     crops, looks, true = hands()
-    fit, wrong = (fit_of(pose, crops.heights, looks, crops.moments, 1.0) for pose in (true, shaken(true, 3, 2.0)))
+    fit, wrong = (
+        fit_of(pose, crops.heights, looks, crops.moments, 1.0)
+        for pose in (true, shaken(true, 3, 2.0))
+    )
     worse = wrong[:, [0, 1, 4, 5]] > fit[:, [0, 1, 4, 5]]
     assert (worse.mean(axis=0) > 0.9).all()
 
@@ -137,15 +154,25 @@ def test_explanations_agree_with_the_slow_twin() -> None:
     pose = shaken(true, 4)
     fit, frames = fit_of(pose, crops.heights, looks, crops.moments, 1.07), pose.frames(HAND)
     for k in range(4):
-        slow = explained(crops.heights[k], looks[k], crops.moments[k, 5], BALLS, frames.rotation[k],
-                         frames.translation[k], float(pose.scale[k]), 1.07)  # fmt: skip
+        slow = explained(
+            crops.heights[k],
+            looks[k],
+            crops.moments[k, 5],
+            BALLS,
+            frames.rotation[k],
+            frames.translation[k],
+            float(pose.scale[k]),
+            1.07,
+        )
         np.testing.assert_allclose(fit[k], slow, rtol=1e-4, atol=1e-3)
 
 
 def middles(root: SE3, angles: np.ndarray, scale: float) -> np.ndarray:
     """Middles (B, 3) of the balls of one pose, by the kernels' own forward kinematics."""
     rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(REFINER.tree, root.rotation, root.translation, angles, scale, rotations, positions)
+    kernels.forward(
+        REFINER.tree, root.rotation, root.translation, angles, scale, rotations, positions
+    )
     out = np.empty((len(BALLS.radius), 3))
     place_balls(rotations, positions, scale, REFINER.body, out)
     return out
@@ -154,8 +181,15 @@ def middles(root: SE3, angles: np.ndarray, scale: float) -> np.ndarray:
 def test_forward_kinematics_agrees_with_the_bodys_own() -> None:
     _, _, pose = hands()
     rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(REFINER.tree, pose.root.rotation[3], pose.root.translation[3], pose.angles[3], 1.1, rotations,
-                    positions)  # fmt: skip
+    kernels.forward(
+        REFINER.tree,
+        pose.root.rotation[3],
+        pose.root.translation[3],
+        pose.angles[3],
+        1.1,
+        rotations,
+        positions,
+    )
     frames = Pose(pose.root, pose.angles, np.full(len(pose.scale), 1.1)).frames(HAND)
     np.testing.assert_allclose(rotations, frames.rotation[3], atol=1e-12)
     np.testing.assert_allclose(positions, frames.translation[3], atol=1e-9)
@@ -166,7 +200,9 @@ def test_slopes_are_those_of_small_steps(k: int) -> None:
     _, _, pose = hands()
     root, angles = SE3(pose.root.rotation[k], pose.root.translation[k]), pose.angles[k]
     rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(REFINER.tree, root.rotation, root.translation, angles, 1.0, rotations, positions)
+    kernels.forward(
+        REFINER.tree, root.rotation, root.translation, angles, 1.0, rotations, positions
+    )
     balls, free = middles(root, angles, 1.0), REFINER.tree.free
     axes = np.empty((len(free), 3))
     kernels.turning_axes(free, angles, rotations, axes)
@@ -180,7 +216,9 @@ def test_slopes_are_those_of_small_steps(k: int) -> None:
     numeric = (np.stack(ahead, axis=-1) - balls[..., None]) / step
     slope = np.empty((3, 7 + len(free)))
     for b in range(BALLS.n_own):
-        kernels.ball_slope(b, balls[b], REFINER.body, REFINER.tree, axes, rotations, positions, 1.0, slope)
+        kernels.ball_slope(
+            b, balls[b], REFINER.body, REFINER.tree, axes, rotations, positions, 1.0, slope
+        )
         np.testing.assert_allclose(slope, numeric[b], atol=2e-3)
 
 
@@ -216,5 +254,7 @@ def test_a_chain_is_refined_as_well() -> None:
     turned = so3.exp(np.zeros((2, 3)))
     pose = Pose(SE3(turned, np.zeros((2, 3))), np.zeros((2, mouse.n_joints, 3)), np.ones(2))
     empty = np.zeros((2, 96, 96), np.int16)
-    looks = np.tile([300.0, 300.0, 0.0, 0.0, *np.diag([1.0, -1.0, -1.0]).ravel(), 600.0, 0.0, 0.0, 1.0], (2, 1))
+    looks = np.tile(
+        [300.0, 300.0, 0.0, 0.0, *np.diag([1.0, -1.0, -1.0]).ravel(), 600.0, 0.0, 0.0, 1.0], (2, 1)
+    )
     assert np.isfinite(refiner.refine(alone(pose), empty, looks, 1.0, 3).joints(mouse)).all()

@@ -25,7 +25,9 @@ THICK_MM, HALF_WIDTH_MM = 2.0, 2.0
 def look() -> np.ndarray:
     """How the toy's maps are cut: an upright camera DISTANCE above the view's origin, the origin in the middle."""
     middle = (SIDE - 1) / 2.0
-    return np.array([FOCAL, FOCAL, middle, middle, 1, 0, 0, 0, -1, 0, 0, 0, -1, DISTANCE, 0, 0, STEP])
+    return np.array(
+        [FOCAL, FOCAL, middle, middle, 1, 0, 0, 0, -1, 0, 0, 0, -1, DISTANCE, 0, 0, STEP]
+    )
 
 
 def fish(n: int, seed: int) -> Pose:
@@ -35,7 +37,9 @@ def fish(n: int, seed: int) -> Pose:
     angles[:, 1:-1, 2] = np.radians(rng.uniform(-4, 4, (n, 1)))
     turn = np.stack([np.zeros(n), np.zeros(n), rng.uniform(-np.pi, np.pi, n)], 1)
     lift = np.stack([np.zeros(n), rng.normal(0, 0.08, n), np.zeros(n)], 1)
-    pose = Pose(SE3(so3.exp(turn) @ so3.exp(lift), np.zeros((n, 3))), angles, rng.uniform(0.8, 1.2, n))
+    pose = Pose(
+        SE3(so3.exp(turn) @ so3.exp(lift), np.zeros((n, 3))), angles, rng.uniform(0.8, 1.2, n)
+    )
     pose.root.translation[:] = np.array([0.0, 0.0, 20.0]) - pose.joints(FISH).mean(axis=1)
     return pose
 
@@ -45,7 +49,10 @@ def maps(pose: Pose) -> np.ndarray:
     grid = (np.arange(SIDE) - (SIDE - 1) / 2.0) / FOCAL
     out = np.zeros((len(pose.scale), SIDE, SIDE), np.int16)
     for i, joints in enumerate(pose.joints(FISH)):
-        fine = np.stack([np.interp(np.linspace(0, 20, 201), np.arange(21), joints[:, k]) for k in range(3)], axis=1)
+        fine = np.stack(
+            [np.interp(np.linspace(0, 20, 201), np.arange(21), joints[:, k]) for k in range(3)],
+            axis=1,
+        )
         x, y = np.meshgrid(grid, -grid)
         z = DISTANCE - fine[:, 2]
         off = np.hypot(x[..., None] * z - fine[:, 0], y[..., None] * z - fine[:, 1])
@@ -61,7 +68,9 @@ def wrong(pose: Pose, seed: int) -> tuple[Pose, np.ndarray]:
     size = pose.scale * np.exp(rng.normal(0, 0.05, n))
     lift = np.stack([np.zeros(n), rng.normal(0, 0.05, n), np.zeros(n)], 1)
     off = Pose(SE3(pose.root.rotation @ so3.exp(lift), np.zeros((n, 3))), pose.angles, size)
-    middle = pose.joints(FISH).mean(axis=1) + np.stack([np.zeros(n), np.zeros(n), rng.normal(0, 0.6, n)], 1)
+    middle = pose.joints(FISH).mean(axis=1) + np.stack(
+        [np.zeros(n), np.zeros(n), rng.normal(0, 0.6, n)], 1
+    )
     off.root.translation[:] = middle - off.joints(FISH).mean(axis=1)
     return off, size
 

@@ -21,7 +21,18 @@ from liex_lab.estimation.training import (
     train_metric,
 )
 from liex_lab.evaluation.pose import rank_correlation
-from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, tiny, toy_mice, trained, training_set, unseen, with_box
+from tests.estimation.toy import (
+    CAMERA,
+    FLOOR,
+    SCENE,
+    Toy,
+    tiny,
+    toy_mice,
+    trained,
+    training_set,
+    unseen,
+    with_box,
+)
 
 VARIANTS = ["default", "paper"]
 
@@ -41,7 +52,9 @@ def all_candidates(variant: str, toy: Toy) -> tuple[np.ndarray, np.ndarray]:
     model = trained(variant).model
     truth = training_set(toy, model.method).truth
     crops = SCENE.extract(toy.depths, 1.0, camera_view=model.method.camera_view)
-    _, positions, _, scores = PoseEstimator(model).candidates(crops, SCENE.looks(crops, model.method.camera_view), 1.0)
+    _, positions, _, scores = PoseEstimator(model).candidates(
+        crops, SCENE.looks(crops, model.method.camera_view), 1.0
+    )
     return scores, np.linalg.norm(positions - truth.positions[:, None], axis=-1).mean(axis=-1)
 
 
@@ -57,7 +70,9 @@ def initial_error(variant: str, toy: Toy) -> np.ndarray:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_chosen_pose_of_an_unseen_mouse_is_far_better_than_where_it_started(variant):
-    trial = run_on(trained(variant).model, training_set(unseen(), tiny(variant)), np.random.default_rng(0))
+    trial = run_on(
+        trained(variant).model, training_set(unseen(), tiny(variant)), np.random.default_rng(0)
+    )
     started, ended = initial_error(variant, unseen()), trial.joint_error.mean(axis=1)
     assert np.median(started) > 20.0
     assert np.median(ended) < 0.1 * np.median(started)
@@ -85,7 +100,9 @@ def test_every_solved_joint_gets_a_forest_for_each_round(variant):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_leaves_hold_what_the_model_file_can_hold(variant):
     model = trained(variant).model
-    for forest in [forest for rounds in model.cascade.forests for forest in rounds] + [model.metric]:
+    for forest in [forest for rounds in model.cascade.forests for forest in rounds] + [
+        model.metric
+    ]:
         np.testing.assert_array_equal(forest.leaves, forest.leaves.astype(np.float16))
 
 
@@ -93,8 +110,12 @@ def test_training_starts_both_ways_along_the_animal_and_is_unsure_of_its_size():
     data, method = trained("default").data, replace(tiny("default"), training_candidates=8)
     skeleton = trained("default").model.skeleton
     starts = start_candidates(data, skeleton, method, np.random.default_rng(3))
-    true_heading = data.truth.positions[starts.image, -1, :2] - data.truth.positions[starts.image, 0, :2]
-    along = np.sum(true_heading * starts.rotations[:, 0, :2, 0], axis=1) / np.linalg.norm(true_heading, axis=1)
+    true_heading = (
+        data.truth.positions[starts.image, -1, :2] - data.truth.positions[starts.image, 0, :2]
+    )
+    along = np.sum(true_heading * starts.rotations[:, 0, :2, 0], axis=1) / np.linalg.norm(
+        true_heading, axis=1
+    )
     assert (along > 0).mean() == pytest.approx(0.5, abs=0.02)
     assert np.median(np.abs(along)) > 0.9
     off = np.log(starts.size / data.size[starts.image])
@@ -121,7 +142,9 @@ def test_perturbed_truth_is_a_pose_with_the_animals_own_bones_up_to_badly_off(va
     assert np.bincount(examples.image).tolist() == [8] * len(learned.data.size)
     bones = np.linalg.norm(np.diff(examples.positions, axis=1), axis=-1)
     home = np.linalg.norm(skeleton.offsets[1:], axis=1)
-    np.testing.assert_allclose(bones, learned.data.truth.scale[examples.image][:, None] * home, rtol=1e-9)
+    np.testing.assert_allclose(
+        bones, learned.data.truth.scale[examples.image][:, None] * home, rtol=1e-9
+    )
     error = joint_error(examples, learned.data.truth)
     assert np.quantile(error, 0.02) < 2.0
     assert np.quantile(error, 0.98) > 15.0
@@ -141,7 +164,9 @@ def test_what_is_no_animal_teaches_the_metric_and_not_the_regressors():
     rng = np.random.default_rng(4)
     frames = np.stack([with_box(bare, *rng.uniform([-70, -45], [70, 45])) for _ in range(160)])
     other = training_set(replace(toy_mice(160, 22), depths=frames), method)
-    far = replace(other.truth, positions=other.truth.positions + 500.0)  # a box that was taken for an animal elsewhere
+    far = replace(
+        other.truth, positions=other.truth.positions + 500.0
+    )  # a box that was taken for an animal elsewhere
     boxes = replace(other, truth=far, animal=np.zeros(160, np.bool_))
     data = TrainingSet.join([mice, boxes])
     assert data.animal.tolist() == [True] * 200 + [False] * 160
@@ -152,14 +177,19 @@ def test_what_is_no_animal_teaches_the_metric_and_not_the_regressors():
     metric = train_metric(data, cascade, candidates, rng)
     estimator = PoseEstimator(replace(trained("default").model, cascade=cascade, metric=metric))
     best = []
-    for depths in (unseen().depths[:60], frames[:60] + rng.normal(0, 1, frames[:60].shape).astype(np.float32)):
+    for depths in (
+        unseen().depths[:60],
+        frames[:60] + rng.normal(0, 1, frames[:60].shape).astype(np.float32),
+    ):
         crops = SCENE.extract(depths, 1.0)
         best.append(estimator.candidates(crops, SCENE.looks(crops), 1.0)[3].min(axis=1))
     assert np.quantile(best[0], 0.95) < 10.0 < 20.0 < np.quantile(best[1], 0.05)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_calibrated_intervals_hold_nine_tenths_of_their_own_images_and_about_as_many_others(variant, held_out):
+def test_calibrated_intervals_hold_nine_tenths_of_their_own_images_and_about_as_many_others(
+    variant, held_out
+):
     method, rng = tiny(variant), np.random.default_rng(0)
     model = calibrate(trained(variant).model, training_set(held_out, method), rng)
     low, high = model.calibration.quantiles
@@ -168,8 +198,12 @@ def test_calibrated_intervals_hold_nine_tenths_of_their_own_images_and_about_as_
         data = training_set(toy, method)
         crops = SCENE.extract(toy.depths, 1.0, camera_view=method.camera_view)
         _, positions, _, _ = found = PoseEstimator(model).candidates(crops, data.images.looks, 1.0)
-        picked = choose(model.skeleton, method, model.calibration, 1.0, found[0], positions, found[3])
-        expected = with_expected_error(picked, model, data.images.moments, data.images.looks, 1.0).error_mm
+        picked = choose(
+            model.skeleton, method, model.calibration, 1.0, found[0], positions, found[3]
+        )
+        expected = with_expected_error(
+            picked, model, data.images.moments, data.images.looks, 1.0
+        ).error_mm
         joints = picked.pose.joints(model.skeleton)
         error = np.linalg.norm(joints - data.truth.positions, axis=-1).mean(axis=1)
         inside = (error >= low * expected) & (error <= high * expected)
@@ -194,5 +228,7 @@ def test_without_an_expectation_forest_the_straight_line_stays():
     crops = SCENE.extract(toy.depths[:5], 1.0)
     looks = SCENE.looks(crops)
     rotations, positions, _, scores = PoseEstimator(model).candidates(crops, looks, 1.0)
-    picked = choose(model.skeleton, model.method, model.calibration, 1.0, rotations, positions, scores)
+    picked = choose(
+        model.skeleton, model.method, model.calibration, 1.0, rotations, positions, scores
+    )
     assert with_expected_error(picked, model, crops.moments, looks, 1.0) is picked

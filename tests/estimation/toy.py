@@ -44,7 +44,9 @@ class Toy:
         return self.pose.joints(self.skeleton)
 
 
-def toy_mice(n: int, seed: int, noise_mm: float | np.ndarray = 1.0, size: tuple[float, float] = (0.9, 1.1)) -> Toy:
+def toy_mice(
+    n: int, seed: int, noise_mm: float | np.ndarray = 1.0, size: tuple[float, float] = (0.9, 1.1)
+) -> Toy:
     """Mice that look anywhere, bend a little and lift their noses a little; noise_mm of all readings, or (n,)."""
     rng = np.random.default_rng(seed)
     skeleton = Skeleton.load("mouse")
@@ -55,7 +57,9 @@ def toy_mice(n: int, seed: int, noise_mm: float | np.ndarray = 1.0, size: tuple[
     rotation = rotation @ so3.exp(np.stack([zero, -np.abs(rng.normal(0, 0.15, n)), zero], 1))
     pose = Pose(SE3(rotation, np.zeros((n, 3))), angles, scale)
     middle = pose.joints(skeleton).mean(axis=1)
-    place = np.stack([rng.uniform(-70, 70, n), rng.uniform(-45, 45, n), 14.0 * scale + middle[:, 2]], 1)
+    place = np.stack(
+        [rng.uniform(-70, 70, n), rng.uniform(-45, 45, n), 14.0 * scale + middle[:, 2]], 1
+    )
     pose = Pose(SE3(rotation, place - middle), angles, scale)
     depths = rendered(skeleton, pose)
     noise = np.broadcast_to(noise_mm, n)[:, None, None] * rng.normal(0, 1, depths.shape)
@@ -63,15 +67,24 @@ def toy_mice(n: int, seed: int, noise_mm: float | np.ndarray = 1.0, size: tuple[
 
 
 def rendered(
-    skeleton: Skeleton, pose: Pose, girth: float = 1.0, camera: Camera = CAMERA, floor: Floor = FLOOR
+    skeleton: Skeleton,
+    pose: Pose,
+    girth: float = 1.0,
+    camera: Camera = CAMERA,
+    floor: Floor = FLOOR,
 ) -> NDArray[np.float32]:
     """Depth (n, H, W) mm of the default body in poses (n), arena frame, on the floor."""
     n, surface = len(pose.scale), Surface.of(skeleton)
     T_camera_arena = floor.T_arena_camera.inverse()
-    T = SE3(np.repeat(T_camera_arena.rotation[None], n, 0), np.repeat(T_camera_arena.translation[None], n, 0))
+    T = SE3(
+        np.repeat(T_camera_arena.rotation[None], n, 0),
+        np.repeat(T_camera_arena.translation[None], n, 0),
+    )
     vertices = surface.vertices(pose, girth=girth * pose.scale)
     lens = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (n, 1))
-    body = render_meshes(vertices, surface.faces, T, lens, np.zeros((n, 2)), (camera.width, camera.height))
+    body = render_meshes(
+        vertices, surface.faces, T, lens, np.zeros((n, 2)), (camera.width, camera.height)
+    )
     bare = floor.depth(camera.width, camera.height)
     return np.where((body > 0) & (body < bare), body, bare)
 
@@ -98,9 +111,11 @@ def training_set(toy: Toy, method: Method) -> TrainingSet:
     frames = pose.frames(toy.skeleton)
     assert crops.found.all()
     return TrainingSet(
-        ImageSet(crops.heights, looks, crops.moments), Truth(frames.rotation, frames.translation, pose.scale),
-        pose.scale.copy(), np.ones(n, np.bool_),
-    )  # fmt: skip
+        ImageSet(crops.heights, looks, crops.moments),
+        Truth(frames.rotation, frames.translation, pose.scale),
+        pose.scale.copy(),
+        np.ones(n, np.bool_),
+    )
 
 
 def tiny(variant: str) -> Method:
@@ -109,15 +124,28 @@ def tiny(variant: str) -> Method:
     """
     if variant == "seen":
         proposals = GrowthPlan(4, 12, 4, 60, 0.3, 0.15, 0.3, 0.63)
-        return replace(tiny("default"), proposals=proposals, proposal_reach_mm=40.0, base_rounds=3, explains=True,
-                       refine_steps=3, refined=2)  # fmt: skip
+        return replace(
+            tiny("default"),
+            proposals=proposals,
+            proposal_reach_mm=40.0,
+            base_rounds=3,
+            explains=True,
+            refine_steps=3,
+            refined=2,
+        )
     method = METHODS[variant]
     return replace(
-        method, rounds=2, n_candidates=8, training_candidates=4,
+        method,
+        rounds=2,
+        n_candidates=8,
+        training_candidates=4,
         regressors=replace(method.regressors, n_trees=4, max_depth=12, min_leaf=5, n_tests=60),
         metric=replace(method.metric, n_trees=12, max_depth=8, min_leaf=8, n_tests=60),
-        metric_shrinkage=0.4 if method.metric_shrinkage else 0.0, survivors=0, pruner=None, corrector=None,
-    )  # fmt: skip
+        metric_shrinkage=0.4 if method.metric_shrinkage else 0.0,
+        survivors=0,
+        pruner=None,
+        corrector=None,
+    )
 
 
 @dataclass(frozen=True)
@@ -137,7 +165,9 @@ def train(toy: Toy, method: Method, seed: int = 0) -> Trained:
     metric = train_metric(data, cascade, candidates, rng)
     table = tomllib.loads((PRESETS / "mouse.toml").read_text(encoding="utf-8"))
     area = float(np.median(data.images.moments[:, 1] / data.size**2))
-    return Trained(Model(cascade, metric, None, table, Calibration(area_mm2=area)), data, candidates)
+    return Trained(
+        Model(cascade, metric, None, table, Calibration(area_mm2=area)), data, candidates
+    )
 
 
 @cache

@@ -12,8 +12,12 @@ import pytest
 from liex_lab.evaluation.nyu import nyu_errors
 from liex_lab.recordings.formats.images.nyu_labels import PALM, POINTS, NyuReference
 
-PAPER = {"liex": (14.507, 15.62), "v2v_posenet": (8.419, 8.586), "deepprior": (20.75, 21.49),
-         "generalized_feedback": (10.894, 11.517)}  # fmt: skip
+PAPER = {
+    "liex": (14.507, 15.62),
+    "v2v_posenet": (8.419, 8.586),
+    "deepprior": (20.75, 21.49),
+    "generalized_feedback": (10.894, 11.517),
+}
 
 
 @pytest.fixture(scope="module")
@@ -27,25 +31,36 @@ def reference(folder: Path) -> NyuReference:
 
 
 @pytest.mark.parametrize("method", PAPER)
-def test_published_answers_have_the_published_errors(method: str, folder: Path, reference: NyuReference) -> None:
+def test_published_answers_have_the_published_errors(
+    method: str, folder: Path, reference: NyuReference
+) -> None:
     expected: dict[str, Any] = json.loads((folder / "expected.json").read_text())["results"][method]
     found = nyu_errors(reference.answers[method], reference.truth)
-    assert found["root_estimated_mm_14"] == pytest.approx(expected["mean_joint_error_mm_14"], abs=1e-5)
-    assert found["root_estimated_mm_13"] == pytest.approx(expected["mean_joint_error_mm_13_without_palm"], abs=1e-5)
+    assert found["root_estimated_mm_14"] == pytest.approx(
+        expected["mean_joint_error_mm_14"], abs=1e-5
+    )
+    assert found["root_estimated_mm_13"] == pytest.approx(
+        expected["mean_joint_error_mm_13_without_palm"], abs=1e-5
+    )
     moved = expected["mean_joint_error_mm_13_after_moving_palm_onto_palm"]
     assert found["root_given_mm_13"] == pytest.approx(moved, abs=1e-5)
     assert found["median_mm_14"] == pytest.approx(expected["median_joint_error_mm_14"], abs=1e-5)
-    np.testing.assert_allclose(list(found["per_point_mm"].values()), expected["per_joint_mean_mm"], atol=1e-5)
+    np.testing.assert_allclose(
+        list(found["per_point_mm"].values()), expected["per_joint_mean_mm"], atol=1e-5
+    )
     for name, theirs in (("max", "max"), ("mean", "mean")):
         shares = expected[f"fraction_of_frames_{theirs}_error_below_mm"]
         assert found[f"share_{name}_error_below_mm"] == pytest.approx(shares, abs=1e-5)
-    assert (round(found["root_estimated_mm_14"], 3), round(found["root_estimated_mm_13"], 2)) == pytest.approx(
-        PAPER[method], abs=0.006
-    )
+    assert (
+        round(found["root_estimated_mm_14"], 3),
+        round(found["root_estimated_mm_13"], 2),
+    ) == pytest.approx(PAPER[method], abs=0.006)
 
 
 def random_hands(n: int) -> np.ndarray:
-    return np.random.default_rng(0).normal(0.0, 60.0, (n, len(POINTS), 3)) + np.array([0.0, 0.0, 800.0])
+    return np.random.default_rng(0).normal(0.0, 60.0, (n, len(POINTS), 3)) + np.array(
+        [0.0, 0.0, 800.0]
+    )
 
 
 def test_given_the_root_a_shift_of_the_whole_hand_costs_nothing() -> None:
@@ -61,7 +76,9 @@ def test_the_palm_alone_counts_only_where_it_is_counted() -> None:
     answer = truth.copy()
     answer[:, PALM] += [0.0, 0.0, 14.0]
     found = nyu_errors(answer, truth)
-    assert (found["root_estimated_mm_14"], found["root_estimated_mm_13"]) == pytest.approx((1.0, 0.0))
+    assert (found["root_estimated_mm_14"], found["root_estimated_mm_13"]) == pytest.approx(
+        (1.0, 0.0)
+    )
     assert found["root_given_mm_13"] == pytest.approx(14.0)
 
 

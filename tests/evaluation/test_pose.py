@@ -5,12 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.evaluation.pose import PoseErrors, angle_between_axes, count_reversals, rank_correlation
+from liex_lab.evaluation.pose import (
+    PoseErrors,
+    angle_between_axes,
+    count_reversals,
+    rank_correlation,
+)
 
 KEYS = [
-    "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm", "flip_rate", "lost_rate",
-    "spearman_predicted_error", "interval90_coverage",
-]  # fmt: skip
+    "mean_joint_error_mm",
+    "median_joint_error_mm",
+    "p95_joint_error_mm",
+    "flip_rate",
+    "lost_rate",
+    "spearman_predicted_error",
+    "interval90_coverage",
+]
 
 
 def line(*x: float, n_joints: int = 3) -> np.ndarray:
@@ -49,7 +59,9 @@ def test_the_summary_agrees_with_hand_computed_numbers():
     assert summary["flip_rate"] == 0.25
     assert summary["lost_rate"] == pytest.approx(0.2)
     assert summary["interval90_coverage"] == 0.75  # 2 mm lies below its interval
-    assert summary["spearman_predicted_error"] == pytest.approx(0.8)  # ranks 1 3 2 4 against 1 2 3 4
+    assert summary["spearman_predicted_error"] == pytest.approx(
+        0.8
+    )  # ranks 1 3 2 4 against 1 2 3 4
     assert all(isinstance(value, float) for value in summary.values())
 
 
@@ -58,26 +70,43 @@ def test_errors_of_two_recordings_join_into_one():
     both = PoseErrors.join([one, two])
     np.testing.assert_array_equal(both.error_mm, np.concatenate([one.error_mm, two.error_mm]))
     assert both.joint_mm.shape == (10, 3)
-    assert both.summary()["mean_joint_error_mm"] == pytest.approx(one.summary()["mean_joint_error_mm"])
+    assert both.summary()["mean_joint_error_mm"] == pytest.approx(
+        one.summary()["mean_joint_error_mm"]
+    )
 
 
 def test_the_summary_of_a_recording_without_a_measured_frame_has_the_same_names():
     nothing = np.full((4, 3, 3), np.nan)
-    errors = PoseErrors.compare(nothing, line(0, 0, 0, 0), 2, np.full(4, np.nan), np.array([0.5, 2.0]))
+    errors = PoseErrors.compare(
+        nothing, line(0, 0, 0, 0), 2, np.full(4, np.nan), np.array([0.5, 2.0])
+    )
     summary = errors.summary()
     assert list(summary) == KEYS
     assert summary.pop("lost_rate") == 1.0
     assert set(summary.values()) == {None}
 
 
-@pytest.mark.parametrize(("b", "rho"), [([1, 4, 9, 16], 1.0), ([16, 9, 4, 1], -1.0), ([2, 1, 4, 3], 0.6)])
+@pytest.mark.parametrize(
+    ("b", "rho"), [([1, 4, 9, 16], 1.0), ([16, 9, 4, 1], -1.0), ([2, 1, 4, 3], 0.6)]
+)
 def test_rank_correlation_looks_at_order_alone(b, rho):
-    assert rank_correlation(np.array([1.0, 2.0, 3.0, 4.0]), np.array(b, float)) == pytest.approx(rho)
+    assert rank_correlation(np.array([1.0, 2.0, 3.0, 4.0]), np.array(b, float)) == pytest.approx(
+        rho
+    )
 
 
 @pytest.mark.parametrize(
     ("a", "b", "degrees"),
-    [(0, 0, 0), (0, 180, 0), (10, 350, 20), (10, 170, 20), (0, 90, 90), (5, 94, 89), (-100, 85, 5), (725, 7, 2)],
+    [
+        (0, 0, 0),
+        (0, 180, 0),
+        (10, 350, 20),
+        (10, 170, 20),
+        (0, 90, 90),
+        (5, 94, 89),
+        (-100, 85, 5),
+        (725, 7, 2),
+    ],
 )
 def test_two_axes_differ_by_a_right_angle_at_most(a, b, degrees):
     both = np.radians([a]), np.radians([b])

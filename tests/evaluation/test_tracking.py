@@ -27,7 +27,9 @@ def test_errors_ratios_and_losses_are_counted_over_the_right_frames():
     mine[:2], mine[2:4] = np.nan, 9.0
     result = figures([followed(mine)], [followed(alone)], [[]], 40.0)
     assert result["mean_joint_error_mm"] == pytest.approx(np.nanmean(mine))
-    assert result["ratio_to_single"] == pytest.approx(0.25), "frames that the single frames lost do not count there"
+    assert result["ratio_to_single"] == pytest.approx(0.25), (
+        "frames that the single frames lost do not count there"
+    )
     assert result["lost_rate"] == pytest.approx(2 / N)
     assert result["longest_flip_frames"] == 0
     assert result["recovery_frames"] is None
@@ -55,7 +57,9 @@ def test_recovery_counts_from_the_end_of_the_worst_occlusion():
 
 
 def test_a_row_that_never_finds_the_animal_has_only_that_to_say():
-    assert figures([followed(np.full(N, np.nan))], [followed(np.zeros(N))], [[]], 40.0) == {"lost_rate": 1.0}
+    assert figures([followed(np.full(N, np.nan))], [followed(np.zeros(N))], [[]], 40.0) == {
+        "lost_rate": 1.0
+    }
 
 
 def test_who_gives_up_frames_in_view_gains_nothing_by_it():

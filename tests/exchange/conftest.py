@@ -18,7 +18,9 @@ collect_ignore = [] if find_spec("movement") and find_spec("sleap_io") else ["te
 @pytest.fixture(scope="package")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     """Four seconds before an uneven clock, frames dropped, two lost, a rear in between."""
-    times = np.delete(steady(4.0) + np.random.default_rng(2).uniform(-0.003, 0.003, 120), slice(70, 74))
+    times = np.delete(
+        steady(4.0) + np.random.default_rng(2).uniform(-0.003, 0.003, 120), slice(70, 74)
+    )
     mouse = WalkingMouse(times - times[0], rear_s=(1.0, 2.2), lost=(20, 21))
     folder: Path = tmp_path_factory.mktemp("exchange") / "circle.liex"
     subject = {"subject_id": "m01", "group": "control", "sex": "female"}

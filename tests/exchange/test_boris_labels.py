@@ -13,11 +13,17 @@ from liex_lab.errors import LiexError
 from liex_lab.exchange.boris_labels import boris_export_labels, boris_labels
 
 EVENTS = [
-    [0.5, "m01", "rear", "", "", 15], [1.2, "m01", "rear", "", "", 36], [1.2, "m01", "walk", "", "", 36],
-    [2.0, "m01", "walk", "", "", 60], [2.5, "m01", "sneeze", "", "", 75],
-]  # fmt: skip
+    [0.5, "m01", "rear", "", "", 15],
+    [1.2, "m01", "rear", "", "", 36],
+    [1.2, "m01", "walk", "", "", 36],
+    [2.0, "m01", "walk", "", "", 60],
+    [2.5, "m01", "sneeze", "", "", 75],
+]
 PROJECT = {
-    "behaviors_conf": {"0": {"type": "State event", "code": "rear"}, "1": {"type": "Point event", "code": "sneeze"}},
+    "behaviors_conf": {
+        "0": {"type": "State event", "code": "rear"},
+        "1": {"type": "Point event", "code": "sneeze"},
+    },
     "observations": {"ses-01": {"events": EVENTS, "time offset": 0.0, "my own key": 1}},
 }
 
@@ -27,9 +33,12 @@ def test_state_events_are_labels_of_a_human_and_points_are_none(pack, tmp_path: 
     path = tmp_path / "a.boris"
     path.write_bytes(pack(json.dumps(PROJECT).encode()))
     labels = boris_labels(path)
-    assert labels[["session_id", "individual", "action", "start_s", "stop_s", "source"]].to_numpy().tolist() == [
-        ["ses-01", "m01", "rear", 0.5, 1.2, "human"], ["ses-01", "m01", "walk", 1.2, 2.0, "human"],
-    ]  # fmt: skip
+    assert labels[
+        ["session_id", "individual", "action", "start_s", "stop_s", "source"]
+    ].to_numpy().tolist() == [
+        ["ses-01", "m01", "rear", 0.5, 1.2, "human"],
+        ["ses-01", "m01", "walk", 1.2, 2.0, "human"],
+    ]
 
 
 def test_the_time_offset_of_an_observation_is_taken_off(tmp_path: Path) -> None:
@@ -42,10 +51,15 @@ def test_the_time_offset_of_an_observation_is_taken_off(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("events", "complaint"),
-    [([[1.0, "m", "dig", "", ""]], "starts at 1 s and never stops"), ([["x", "m", "dig", "", ""]], "cannot be read"),
-     ([[1.0, "m"]], "cannot be read")],
-)  # fmt: skip
-def test_events_that_make_no_bouts_are_one_sentence(events: list, complaint: str, tmp_path: Path) -> None:
+    [
+        ([[1.0, "m", "dig", "", ""]], "starts at 1 s and never stops"),
+        ([["x", "m", "dig", "", ""]], "cannot be read"),
+        ([[1.0, "m"]], "cannot be read"),
+    ],
+)
+def test_events_that_make_no_bouts_are_one_sentence(
+    events: list, complaint: str, tmp_path: Path
+) -> None:
     path = tmp_path / "a.boris"
     path.write_text(json.dumps({"observations": {"o": {"events": events}}}))
     with pytest.raises(LiexError, match=complaint):
@@ -62,9 +76,15 @@ def test_what_is_no_project_is_one_sentence(content: bytes, tmp_path: Path) -> N
 
 def test_an_export_of_aggregated_events_gives_its_states(tmp_path: Path) -> None:
     path = tmp_path / "events.tsv"
-    pd.DataFrame({
-        "Observation id": ["o", "o"], "Subject": ["m", "m"], "Behavior": ["dig", "sneeze"],
-        "Behavior type": ["STATE", "POINT"], "Start (s)": [1.0, 3.0], "Stop (s)": [2.0, 3.0],
-    }).to_csv(path, sep="\t", index=False)  # fmt: skip
+    pd.DataFrame(
+        {
+            "Observation id": ["o", "o"],
+            "Subject": ["m", "m"],
+            "Behavior": ["dig", "sneeze"],
+            "Behavior type": ["STATE", "POINT"],
+            "Start (s)": [1.0, 3.0],
+            "Stop (s)": [2.0, 3.0],
+        }
+    ).to_csv(path, sep="\t", index=False)
     (row,) = boris_export_labels(path).itertuples()
     assert (row.session_id, row.action, row.start_s, row.stop_s) == ("o", "dig", 1.0, 2.0)

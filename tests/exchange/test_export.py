@@ -44,8 +44,13 @@ def test_every_table_comes_back_from_csv_as_it_was(session, out):
         again = pd.read_csv(folder / f"{name}.csv", keep_default_na=True)
         stored = session.table(name)
         numbers = stored.select_dtypes("number").columns
-        np.testing.assert_array_equal(again[numbers].to_numpy(float), stored[numbers].to_numpy(float))
-    described = {(entry["table"], entry["name"]) for entry in json.loads((folder / "columns.json").read_text())}
+        np.testing.assert_array_equal(
+            again[numbers].to_numpy(float), stored[numbers].to_numpy(float)
+        )
+    described = {
+        (entry["table"], entry["name"])
+        for entry in json.loads((folder / "columns.json").read_text())
+    }
     assert ("bouts", "path_mm") in described
 
 
@@ -57,7 +62,9 @@ def test_deeplabcut_s_tables_have_its_header_and_a_row_for_every_frame(session, 
     flat = pd.read_csv(folder / "poses_2d.csv", header=[0, 1, 2], index_col=0)
     poses = Poses.of(session)
     np.testing.assert_array_equal(solid["liex_lab"]["nose"].to_numpy(), poses.xyz_mm[:, -1])
-    np.testing.assert_array_equal(flat["liex_lab"]["nose"][["x", "y"]].to_numpy(), poses.uv_px[:, -1])
+    np.testing.assert_array_equal(
+        flat["liex_lab"]["nose"][["x", "y"]].to_numpy(), poses.uv_px[:, -1]
+    )
     assert list(flat["liex_lab"]["nose"].columns) == ["x", "y", "likelihood"]
     assert solid["liex_lab"]["rump"].iloc[20].isna().all()
     times = pd.read_csv(folder / "times.csv")
@@ -134,14 +141,22 @@ def test_pynwb_reads_poses_times_rotations_and_actions(session, nwb):
         np.testing.assert_array_equal(actions["stop_time"], session.bouts["stop_s"])
         assert list(actions["label"]) == list(session.bouts["action"])
         assert read.session_start_time == datetime.fromisoformat("2026-08-21T10:00:00+02:00")
-        assert (read.subject.subject_id, read.subject.species, read.subject.sex) == ("m01", "Mus musculus", "F")
+        assert (read.subject.subject_id, read.subject.species, read.subject.sex) == (
+            "m01",
+            "Mus musculus",
+            "F",
+        )
 
 
 def test_nwbinspector_finds_nothing_that_would_be_refused(nwb):
     light = Importance.BEST_PRACTICE_SUGGESTION.value
-    grave = [message for message in inspect_nwbfile(nwbfile_path=nwb) if message.importance.value > light]
+    grave = [
+        message for message in inspect_nwbfile(nwbfile_path=nwb) if message.importance.value > light
+    ]
     # the animal's age is not ours to know; the archive for which it matters asks for it on upload
-    assert [message.check_function_name for message in grave if "age" not in message.check_function_name] == []
+    assert [
+        message.check_function_name for message in grave if "age" not in message.check_function_name
+    ] == []
 
 
 def test_nwb_is_refused_without_a_beginning(tmp_path):
@@ -173,7 +188,9 @@ def test_missing_packages_are_named(session, tmp_path, monkeypatch):
 
 
 def test_the_verb_writes_beside_the_session_or_where_it_is_told(session, tmp_path):
-    ran = CliRunner().invoke(cli.app, ["export", str(session.path), "--to", "csv", "--out", str(tmp_path)])
+    ran = CliRunner().invoke(
+        cli.app, ["export", str(session.path), "--to", "csv", "--out", str(tmp_path)]
+    )
     assert ran.exit_code == 0, ran.output
     assert (tmp_path / "circle_csv" / "poses.csv").is_file()
     assert set(TARGETS) == {"nwb", "boris", "dlc", "movement", "sleap", "csv"}
@@ -181,8 +198,9 @@ def test_the_verb_writes_beside_the_session_or_where_it_is_told(session, tmp_pat
 
 def test_a_session_without_any_pose_can_be_exported(tmp_path):
     session = write(
-        tmp_path / "lost.liex", WalkingMouse(steady(0.5), lost=tuple(range(15))),
+        tmp_path / "lost.liex",
+        WalkingMouse(steady(0.5), lost=tuple(range(15))),
         session_start_time="2026-08-21T10:00:00+02:00",
-    )  # fmt: skip
+    )
     for target in TARGETS:
         assert export(session, target, tmp_path).exists()

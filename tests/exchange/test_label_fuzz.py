@@ -23,9 +23,13 @@ from tests.exchange.test_boris_labels import PROJECT
 _OURS = ["session_id", "individual", "action", "start_s", "stop_s", "x"]
 _BORIS = ["Observation id", "Subject", "Behavior", "Behavior type", "Start (s)", "Stop (s)"]
 _CELLS = st.one_of(
-    st.floats().map(str), st.integers().map(str), st.text(max_size=6),
-    st.sampled_from(["", "rear", "STATE", "1.5", "nan", "1e999", "true", '"', "2020-01-01", "0x1", "1_0", "\0"]),
-)  # fmt: skip
+    st.floats().map(str),
+    st.integers().map(str),
+    st.text(max_size=6),
+    st.sampled_from(
+        ["", "rear", "STATE", "1.5", "nan", "1e999", "true", '"', "2020-01-01", "0x1", "1_0", "\0"]
+    ),
+)
 
 
 def read(content: bytes, name: str) -> None:
@@ -52,19 +56,35 @@ def test_any_json_instead_of_a_boris_project(document: Any) -> None:
 
 
 @settings(max_examples=100, deadline=None)
-@given(head=st.lists(st.sampled_from([*_OURS, *_BORIS]), min_size=1, max_size=8),
-       rows=st.lists(st.lists(_CELLS, max_size=8), max_size=5), whole=st.sampled_from([_OURS, _BORIS, []]),
-       tabs=st.booleans())  # fmt: skip
-def test_any_table_of_labels(head: list[str], rows: list[list[str]], whole: list[str], tabs: bool) -> None:
+@given(
+    head=st.lists(st.sampled_from([*_OURS, *_BORIS]), min_size=1, max_size=8),
+    rows=st.lists(st.lists(_CELLS, max_size=8), max_size=5),
+    whole=st.sampled_from([_OURS, _BORIS, []]),
+    tabs=st.booleans(),
+)
+def test_any_table_of_labels(
+    head: list[str], rows: list[list[str]], whole: list[str], tabs: bool
+) -> None:
     between = "\t" if tabs else ","
     text = "\n".join(between.join(row) for row in [whole or head, *rows])
     check(lambda: read(text.encode("utf-8", "surrogatepass"), "a.tsv" if tabs else "a.csv"))
 
 
 @settings(max_examples=100, deadline=None)
-@given(content=st.binary(max_size=60), name=st.sampled_from(["a.boris", "a.csv", "a.tsv", "a.parquet", "a.boris.gz"]),
-       head=st.sampled_from([b"", b"\x1f\x8b", b"\x1f\x8b\x08\0\0\0\0\0", b"action,start_s,stop_s\n", b"PAR1",
-                             b"Observation id\tSubject\tBehavior\tStart (s)\tStop (s)\n"]))  # fmt: skip
+@given(
+    content=st.binary(max_size=60),
+    name=st.sampled_from(["a.boris", "a.csv", "a.tsv", "a.parquet", "a.boris.gz"]),
+    head=st.sampled_from(
+        [
+            b"",
+            b"\x1f\x8b",
+            b"\x1f\x8b\x08\0\0\0\0\0",
+            b"action,start_s,stop_s\n",
+            b"PAR1",
+            b"Observation id\tSubject\tBehavior\tStart (s)\tStop (s)\n",
+        ]
+    ),
+)
 @example(content=b"\xff" * 20, name="a.boris", head=b"\x1f\x8b\x08\0\0\0\0\0")
 @example(content=b"[" * 60, name="a.boris", head=b"")
 def test_any_bytes_instead_of_labels(content: bytes, name: str, head: bytes) -> None:

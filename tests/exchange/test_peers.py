@@ -24,16 +24,21 @@ def test_movement_takes_the_netcdf_for_its_own(session, tmp_path):
 def test_movement_reads_our_deeplabcut_sleap_and_nwb_files(session, tmp_path):
     poses = Poses.of(session)
     dlc = load_poses.from_dlc_file(export(session, "dlc", tmp_path) / "poses_2d.csv")
-    np.testing.assert_allclose(dlc["position"][..., 0].transpose("time", "keypoints", "space"), poses.uv_px, rtol=1e-6)
+    np.testing.assert_allclose(
+        dlc["position"][..., 0].transpose("time", "keypoints", "space"), poses.uv_px, rtol=1e-6
+    )
     sleap = load_poses.from_sleap_file(export(session, "sleap", tmp_path))
     np.testing.assert_allclose(
         sleap["position"][..., 0].transpose("time", "keypoints", "space"), poses.uv_px, rtol=1e-6
     )
     nwb = load_poses.from_nwb_file(export(session, "nwb", tmp_path))
     np.testing.assert_allclose(
-        nwb["position"].sel(keypoints=list(poses.joints))[..., 0].transpose("time", "keypoints", "space"),
-        poses.xyz_mm, rtol=1e-6,
-    )  # fmt: skip
+        nwb["position"]
+        .sel(keypoints=list(poses.joints))[..., 0]
+        .transpose("time", "keypoints", "space"),
+        poses.xyz_mm,
+        rtol=1e-6,
+    )
 
 
 def test_sleap_io_reads_the_analysis_file(session, tmp_path):

@@ -19,10 +19,14 @@ SPINES = (40.0, 115.0)
 
 def tilted(degrees: float, distance: float = 600.0) -> Floor:
     angle = np.radians(degrees)
-    return Floor.from_plane(np.array([np.sin(angle), 0.3 * np.sin(angle), np.cos(angle)]), distance, CAMERA)
+    return Floor.from_plane(
+        np.array([np.sin(angle), 0.3 * np.sin(angle), np.cos(angle)]), distance, CAMERA
+    )
 
 
-def with_box(floor: Floor, centre: tuple[int, int], half: tuple[int, int] = (12, 6), high: float = 25.0) -> np.ndarray:
+def with_box(
+    floor: Floor, centre: tuple[int, int], half: tuple[int, int] = (12, 6), high: float = 25.0
+) -> np.ndarray:
     depth = floor.depth(CAMERA.width, CAMERA.height)
     u, v = centre
     depth[v - half[1] : v + half[1], u - half[0] : u + half[0]] -= high
@@ -33,9 +37,12 @@ def recording_of(frames: list[np.ndarray]) -> Recording:
     rng = np.random.default_rng(0)
     noisy = [np.maximum(f + rng.normal(0, 1.0, f.shape), 1).astype(np.float32) for f in frames]
     return Recording(
-        name="boxes", format="synthetic", camera=CAMERA, times_ns=np.arange(len(frames)) * 33_000_000,
+        name="boxes",
+        format="synthetic",
+        camera=CAMERA,
+        times_ns=np.arange(len(frames)) * 33_000_000,
         read=lambda k: noisy[k],
-    )  # fmt: skip
+    )
 
 
 def test_the_arena_frame_stands_on_the_floor_with_z_up():
@@ -109,7 +116,9 @@ def test_the_animal_is_told_from_a_larger_thing_that_comes_and_goes():
 def test_heights_are_true_whatever_the_tilt_and_holes_are_filled():
     floor = tilted(10.0)
     T = floor.T_arena_camera
-    camera_points = CAMERA.unproject(np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), -1), 1.0)
+    camera_points = CAMERA.unproject(
+        np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), -1), 1.0
+    )
     ray_up = camera_points @ T.rotation[2]
     roof = ((20.0 - floor.distance_mm) / ray_up).astype(np.float32)  # a plane 20 mm above the floor
     depth = floor.depth(160, 120)
@@ -123,7 +132,9 @@ def test_heights_are_true_whatever_the_tilt_and_holes_are_filled():
 def test_an_empty_frame_is_not_found_and_costs_nothing_else():
     floor = tilted(2.0)
     scene = Scene.from_floor(CAMERA, floor)
-    stack = np.stack([floor.depth(160, 120), with_box(floor, (60, 60)), np.zeros((120, 160), np.float32)])
+    stack = np.stack(
+        [floor.depth(160, 120), with_box(floor, (60, 60)), np.zeros((120, 160), np.float32)]
+    )
     assert scene.extract(stack, 1.0).found.tolist() == [False, True, False]
 
 
@@ -139,10 +150,14 @@ def test_serial_and_parallel_extraction_agree():
 def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
     floor = tilted(3.0)
     alone = with_box(floor, (50, 60))
-    beside = np.where(alone < with_box(floor, (110, 60), (10, 6)), alone, with_box(floor, (110, 60), (10, 6)))
+    beside = np.where(
+        alone < with_box(floor, (110, 60), (10, 6)), alone, with_box(floor, (110, 60), (10, 6))
+    )
     scene = replace(Scene.from_floor(CAMERA, floor), area_mm2=24 * 12 * (575.0 / 300.0) ** 2)
     first, second = scene.extract_both(np.stack([alone, beside]), 1.0)
-    np.testing.assert_array_equal(first.heights, scene.extract(np.stack([alone, beside]), 1.0).heights)
+    np.testing.assert_array_equal(
+        first.heights, scene.extract(np.stack([alone, beside]), 1.0).heights
+    )
     assert first.n_blobs.tolist() == second.n_blobs.tolist() == [1, 2]
     assert second.found.tolist() == [False, True]
     only_other = scene.extract(with_box(floor, (110, 60), (10, 6))[None], 1.0)
@@ -159,12 +174,17 @@ def test_the_long_axis_and_area_of_a_box_are_its_own():
     assert abs(np.sin(angle)) < 0.02
 
 
-@pytest.mark.parametrize(("n", "depth_mm", "says"), [(1, 700, "1 frame cannot tell"), (30, 0, "no depth was read")])
+@pytest.mark.parametrize(
+    ("n", "depth_mm", "says"), [(1, 700, "1 frame cannot tell"), (30, 0, "no depth was read")]
+)
 def test_a_recording_that_shows_no_background_is_told_why(n: int, depth_mm: int, says: str) -> None:
     pictures = np.full((60, 80), depth_mm, np.float32)
     still = Recording(
-        name="still", format="test", camera=Camera(80.0, 80.0, 40.0, 30.0, 80, 60),
-        times_ns=np.arange(n, dtype=np.int64) * 10**8, read=lambda row: pictures,
-    )  # fmt: skip
+        name="still",
+        format="test",
+        camera=Camera(80.0, 80.0, 40.0, 30.0, 80, 60),
+        times_ns=np.arange(n, dtype=np.int64) * 10**8,
+        read=lambda row: pictures,
+    )
     with pytest.raises(EstimationError, match=says):
         Scene.learn(still, (40.0, 115.0))

@@ -32,9 +32,14 @@ def bar(rise: float = 0.0, turned: float = 0.3) -> np.ndarray:
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     z = FLOOR.distance_mm - HIGH
     x, y = (u - CAMERA.cx) / CAMERA.fx * z, -(v - CAMERA.cy) / CAMERA.fy * z
-    along, across = np.cos(turned) * x + np.sin(turned) * y, -np.sin(turned) * x + np.cos(turned) * y
+    along, across = (
+        np.cos(turned) * x + np.sin(turned) * y,
+        -np.sin(turned) * x + np.cos(turned) * y,
+    )
     inside = (np.abs(along) < 30.0) & (np.abs(across) < 4.0)
-    return np.where(inside, z - rise * along, FLOOR.depth(CAMERA.width, CAMERA.height)).astype(np.float32)
+    return np.where(inside, z - rise * along, FLOOR.depth(CAMERA.width, CAMERA.height)).astype(
+        np.float32
+    )
 
 
 def test_heights_are_measured_from_behind_the_mean_of_what_is_kept():
@@ -53,7 +58,9 @@ def test_the_height_map_does_not_tell_the_size_for_which_it_was_cut():
 
 def test_what_hangs_together_with_the_animal_but_lies_far_behind_it_is_left_out():
     frame = bar()
-    frame[85:95, 185:200] = FLOOR.distance_mm - 4.0  # something low on the floor, seen beside the animal
+    frame[85:95, 185:200] = (
+        FLOOR.distance_mm - 4.0
+    )  # something low on the floor, seen beside the animal
     crops = scene("camera").extract(frame[None], 1.0, camera_view=True)
     assert crops.distance[0] == pytest.approx(FLOOR.distance_mm - HIGH + BEHIND, abs=0.2)
 
@@ -66,7 +73,9 @@ def under_a_beam(thing: float, columns: slice) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("columns", [slice(40, 70), slice(150, 230)])
-def test_a_thing_far_before_the_animal_is_taken_for_unread_though_they_touch_in_the_picture(columns):
+def test_a_thing_far_before_the_animal_is_taken_for_unread_though_they_touch_in_the_picture(
+    columns,
+):
     known = replace(scene("camera"), area_mm2=480.0)
     frame, unread = under_a_beam(150.0, columns)
     crops, alone = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
@@ -131,7 +140,9 @@ def test_the_slope_of_the_back_is_told_in_spite_of_gross_errors(rise, wrong_shar
     frame = bar(rise)
     body = frame < FLOOR.distance_mm - 20.0
     wrong = body & (rng.random(frame.shape) < wrong_share)
-    frame[wrong] -= rng.uniform(3.0, 12.0, int(wrong.sum())).astype(np.float32) * (np.nonzero(wrong)[1] > CAMERA.cx)
+    frame[wrong] -= rng.uniform(3.0, 12.0, int(wrong.sum())).astype(np.float32) * (
+        np.nonzero(wrong)[1] > CAMERA.cx
+    )
     crops = scene("camera").extract(frame[None], 1.0, camera_view=True)
     assert np.cos(crops.moments[0, 5] - 0.3) == pytest.approx(1.0, abs=0.01)
     assert crops.moments[0, 8] == pytest.approx(rise, abs=0.03)
@@ -142,23 +153,34 @@ def test_the_slope_of_the_back_is_told_in_spite_of_gross_errors(rise, wrong_shar
 def test_an_animal_of_the_camera_view_starts_as_steep_as_its_back_both_ways(rise):
     moments = scene("camera").extract(bar(rise)[None], 1.0, camera_view=True).moments
     starts = draw_starts(np.random.default_rng(1), 1, 8)
-    rotation, position, _ = start_poses(moments, starts, np.ones((1, 8)), 60.0, True, True, camera_view=True)
+    rotation, position, _ = start_poses(
+        moments, starts, np.ones((1, 8)), 60.0, True, True, camera_view=True
+    )
     forward = rotation[0, :, :, 0]
     slope = forward[:, 2] / np.hypot(forward[:, 0], forward[:, 1])
     ahead = np.sign(forward[:, 0])  # the bar's front points to the right
     np.testing.assert_allclose(slope * ahead, rise, atol=0.08)
     assert {-1.0, 1.0} == set(ahead)
-    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), (1, 8, 3, 3)),
-                               atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, -1, -2),
+        np.broadcast_to(np.eye(3), (1, 8, 3, 3)),
+        atol=1e-12,
+    )
     tip = position[0, :, 2] - moments[0, 2] / moments[0, 1]
-    assert (np.sign(tip + 0.05 * 60.0) == np.sign(forward[:, 2])).all()  # the base is the front here
+    assert (
+        np.sign(tip + 0.05 * 60.0) == np.sign(forward[:, 2])
+    ).all()  # the base is the front here
 
 
 def test_a_large_picture_is_looked_at_as_finely_as_the_smallest_animal_needs():
     def recording(camera: Camera, depth_mm: float) -> Recording:
         depth = np.full((camera.height, camera.width), depth_mm, np.float32)
         return Recording(
-            name="flat", format="synthetic", camera=camera, times_ns=np.arange(3) * 10, read=lambda k: depth
+            name="flat",
+            format="synthetic",
+            camera=camera,
+            times_ns=np.arange(3) * 10,
+            read=lambda k: depth,
         )
 
     large = Camera(2363.0, 2363.0, 511.5, 511.5, 1024, 1024)

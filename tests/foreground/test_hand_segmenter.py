@@ -27,7 +27,9 @@ KINECT = Camera(363.9, 363.9, 255.4, 206.3, 512, 424)
 
 
 def scene_of(camera: Camera) -> NearestScene:
-    return NearestScene(camera, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1000.0, camera), HAND.view)
+    return NearestScene(
+        camera, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1000.0, camera), HAND.view
+    )
 
 
 @cache
@@ -39,7 +41,10 @@ def people() -> tuple[HandSession, np.ndarray]:
 
 def joints_in_view(session: HandSession, looks: np.ndarray) -> np.ndarray:
     T = view_of(looks)
-    return np.einsum("nij,nkj->nki", T.rotation, session.joints_camera[: len(looks)]) + T.translation[:, None]
+    return (
+        np.einsum("nij,nkj->nki", T.rotation, session.joints_camera[: len(looks)])
+        + T.translation[:, None]
+    )
 
 
 def test_the_hand_is_what_is_cut_out() -> None:
@@ -53,7 +58,9 @@ def test_the_hand_is_what_is_cut_out() -> None:
     assert np.median(off) < 40.0
 
 
-def drawn_arm(wrist: tuple[int, int], elbow: tuple[int, int], hand_mm: float, body: bool) -> np.ndarray:
+def drawn_arm(
+    wrist: tuple[int, int], elbow: tuple[int, int], hand_mm: float, body: bool
+) -> np.ndarray:
     """A picture (480, 640) mm: four fingers and a palm beyond the wrist, a forearm that ends at the elbow, a chest."""
     depth = np.zeros((480, 640), np.float32)
     if body:
@@ -64,21 +71,29 @@ def drawn_arm(wrist: tuple[int, int], elbow: tuple[int, int], hand_mm: float, bo
     cv2.circle(depth, tuple(palm.astype(int).tolist()), 34, hand_mm, -1)
     for turn in np.linspace(-0.6, 0.6, 4):
         way = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ along
-        cv2.line(depth, palm.astype(int).tolist(), (palm + 85.0 * way).astype(int).tolist(), hand_mm, 11)
+        cv2.line(
+            depth, palm.astype(int).tolist(), (palm + 85.0 * way).astype(int).tolist(), hand_mm, 11
+        )
     return depth
 
 
 @pytest.mark.parametrize(
     ("wrist", "elbow", "body"),
     [
-        ((320, 100), (330, 320), False),  # the fingers touch the border of the picture, the elbow hangs free
+        (
+            (320, 100),
+            (330, 320),
+            False,
+        ),  # the fingers touch the border of the picture, the elbow hangs free
         ((540, 240), (330, 250), False),
         ((100, 200), (320, 330), False),
         ((320, 260), (400, 479), True),  # before the chest
         ((250, 300), (640, 340), True),
     ],
 )
-def test_it_is_the_hand_and_no_elbow_and_no_chest(wrist: tuple[int, int], elbow: tuple[int, int], body: bool) -> None:
+def test_it_is_the_hand_and_no_elbow_and_no_chest(
+    wrist: tuple[int, int], elbow: tuple[int, int], body: bool
+) -> None:
     depth = drawn_arm(wrist, elbow, 700.0, body)
     scene = scene_of(NYU_CAMERA)
     crops = scene.extract(depth[None], 1.0)
@@ -95,7 +110,9 @@ def test_the_hand_is_found_at_a_size_that_is_off() -> None:
     session, depths = people()
     scene = scene_of(session.camera)
     true = session.spine_mm / HAND.length
-    middles = [scene.middles(scene.extract(depths, size)) for size in (0.88 * true, true, 1.12 * true)]
+    middles = [
+        scene.middles(scene.extract(depths, size)) for size in (0.88 * true, true, 1.12 * true)
+    ]
     for other in (middles[0], middles[2]):
         assert (np.linalg.norm(other - middles[1], axis=1) < 60.0).mean() >= 0.95
 
@@ -127,7 +144,9 @@ def test_heights_are_the_readings_in_the_view_frame(camera_view: bool) -> None:
         view = view_of(looks[k : k + 1])
         height = (view.rotation[0] @ seen.T).T[:, 2] + view.translation[0, 2]
         read = depths[k][uv[:, 1], uv[:, 0]] > 0
-        assert np.median(np.abs(height - crops.heights[k][rows, columns] / 16.0)[read]) < 3.0  # it is smoothed
+        assert (
+            np.median(np.abs(height - crops.heights[k][rows, columns] / 16.0)[read]) < 3.0
+        )  # it is smoothed
         centre = T_camera_view.translation[k] / np.linalg.norm(T_camera_view.translation[k])
         if camera_view:
             np.testing.assert_allclose(view.rotation[0], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
@@ -140,7 +159,9 @@ def test_heights_are_the_readings_in_the_view_frame(camera_view: bool) -> None:
 def test_lines_of_sight_are_turned_upright() -> None:
     points = np.random.default_rng(0).uniform([-300, -300, 400], [300, 300, 1200], (50, 3))
     rotations = sight_rotations(points)
-    np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12
+    )
     assert np.linalg.det(rotations) == pytest.approx(1.0)
     turned = np.einsum("nij,nj->ni", rotations, points)
     np.testing.assert_allclose(turned[:, :2], 0.0, atol=1e-9)
@@ -156,14 +177,18 @@ def test_a_picture_without_a_hand_holds_none() -> None:
     crops = scene.extract(np.stack([empty, wall, speck]), 1.0)
     assert not crops.found.any()
     assert (crops.n_blobs == 0).all()
-    blank = Recording(name="wall", format="test", camera=NYU_CAMERA, times_ns=np.arange(3), read=lambda k: wall)
+    blank = Recording(
+        name="wall", format="test", camera=NYU_CAMERA, times_ns=np.arange(3), read=lambda k: wall
+    )
     with pytest.raises(EstimationError, match="no hand was found in 3 frames"):
         NearestScene.learn(blank, HAND.view)
 
 
 def test_one_core_finds_what_two_find() -> None:
     session, depths = people()
-    one, two = (scene_of(session.camera).extract(depths[:12], 1.0, parallel) for parallel in (False, True))
+    one, two = (
+        scene_of(session.camera).extract(depths[:12], 1.0, parallel) for parallel in (False, True)
+    )
     np.testing.assert_array_equal(one.heights, two.heights)
     np.testing.assert_array_equal(one.moments, two.moments)
 
@@ -199,13 +224,20 @@ def test_real_hands_before_real_people_are_found(reference_data: Path) -> None:
     depths = np.stack([read_picture(file) for file in files]).astype(np.float32)
     crops = scene_of(KINECT).extract(depths, 1.0)
     assert crops.found.all()
-    assert 11_000 < crops.moments[:, 1].min() < crops.moments[:, 1].max() < 21_000  # mm^2: a hand, no person, no arm
+    assert (
+        11_000 < crops.moments[:, 1].min() < crops.moments[:, 1].max() < 21_000
+    )  # mm^2: a hand, no person, no arm
     at = crops.origin + crops.step[:, None] * 48.0
-    assert np.linalg.norm(np.diff(at, axis=0), axis=1).max() < 40.0  # and it is the same one all along
+    assert (
+        np.linalg.norm(np.diff(at, axis=0), axis=1).max() < 40.0
+    )  # and it is the same one all along
     picture = read_picture(reference_data / "hand_nyu" / "depth_1_0000001.png")
     depth = (picture[..., 1].astype(np.float32) * 256 + picture[..., 0])[None]
     scene = scene_of(NYU_CAMERA)
     crops = scene.extract(depth, 1.1)
-    view, truth = view_of(scene.looks(crops)), NyuReference.load(reference_data / "hand_nyu").truth[0]
+    view, truth = (
+        view_of(scene.looks(crops)),
+        NyuReference.load(reference_data / "hand_nyu").truth[0],
+    )
     middle = truth.mean(axis=0) @ view.rotation[0].T + view.translation[0]
     assert np.linalg.norm(crops.moments[0, 3:5] - middle[:2]) < 25.0

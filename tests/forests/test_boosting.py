@@ -10,9 +10,15 @@ from liex_lab.forests.forest import Forest, Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest, grow_forest
 
 PLAN = GrowthPlan(
-    n_trees=20, max_depth=4, min_leaf=8, n_tests=40, one_probe_share=0.0, scalar_share=1.0, depth_share=0.3,
+    n_trees=20,
+    max_depth=4,
+    min_leaf=8,
+    n_tests=40,
+    one_probe_share=0.0,
+    scalar_share=1.0,
+    depth_share=0.3,
     bag_share=0.5,
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +29,12 @@ def numbers() -> tuple[Samples, np.ndarray]:
     scalars = rng.uniform(-300, 300, (n, 4)).astype(np.float32)
     label = 0.02 * scalars[:, 0] + 4.0 * np.sin(scalars[:, 1] / 60) + 7.0
     samples = Samples(
-        np.zeros((n, 1, 1), np.int16), np.arange(n, dtype=np.int32), np.ones(n, np.float32),
-        np.zeros((n, 1, kernels.VIEW), np.float32), scalars,
-    )  # fmt: skip
+        np.zeros((n, 1, 1), np.int16),
+        np.arange(n, dtype=np.int32),
+        np.ones(n, np.float32),
+        np.zeros((n, 1, kernels.VIEW), np.float32),
+        scalars,
+    )
     return samples, label[:, None].astype(np.float32)
 
 
@@ -48,7 +57,9 @@ def test_later_stages_are_grown_on_what_the_earlier_ones_left(numbers):
         forest = boost_forest(samples, labels, plan, 0.3, np.random.default_rng(3))
         left.append(float(np.std(predict(forest, samples) - labels)))
     assert left == sorted(left, reverse=True)
-    plain, _ = grow_forest(samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(3))
+    plain, _ = grow_forest(
+        samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(3)
+    )
     assert left[-1] < 0.7 * np.std(predict(plain, samples) - labels)
 
 
@@ -61,10 +72,15 @@ def test_with_no_trust_in_its_trees_it_predicts_the_mean(numbers):
 def test_joined_forests_predict_as_each_of_them_alone(numbers):
     samples, labels = numbers
     everything = np.ones(len(samples), bool)
-    parts = [grow_forest(samples, labels, everything, PLAN, np.random.default_rng(seed))[0] for seed in (5, 6, 7)]
+    parts = [
+        grow_forest(samples, labels, everything, PLAN, np.random.default_rng(seed))[0]
+        for seed in (5, 6, 7)
+    ]
     joined = Forest.join(parts)
     np.testing.assert_allclose(
-        predict(joined, samples), np.mean([predict(part, samples) for part in parts], axis=0), atol=1e-4
+        predict(joined, samples),
+        np.mean([predict(part, samples) for part in parts], axis=0),
+        atol=1e-4,
     )
     third = Forest(joined.nodes, joined.roots[2 * PLAN.n_trees :], joined.leaves)
     np.testing.assert_array_equal(predict(third, samples), predict(parts[2], samples))

@@ -16,9 +16,15 @@ from liex_lab.forests.grow import GrowthPlan, grow_forest
 from tests.oracles.forest import leaf_by_hand
 
 PLAN = GrowthPlan(
-    n_trees=4, max_depth=8, min_leaf=5, n_tests=60, one_probe_share=0.3, scalar_share=0.2, depth_share=0.3,
+    n_trees=4,
+    max_depth=8,
+    min_leaf=5,
+    n_tests=60,
+    one_probe_share=0.3,
+    scalar_share=0.2,
+    depth_share=0.3,
     bag_share=0.63,
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +46,10 @@ def bumps() -> tuple[Samples, np.ndarray]:
 
 
 def test_a_node_holds_offsets_and_threshold_of_any_sign():
-    for u, v, threshold in (((-127, 5, 0), (127, -1, -128 + 1), -32768), ((1, 2, 3), (-4, -5, -6), 32767)):
+    for u, v, threshold in (
+        ((-127, 5, 0), (127, -1, -128 + 1), -32768),
+        ((1, 2, 3), (-4, -5, -6), 32767),
+    ):
         word0, word1 = kernels.pack_offsets(np.array(u), np.array(v), threshold)
         assert [kernels.byte(word0, k) for k in range(4)] == [*u, v[0]]
         assert [kernels.byte(word1, k) for k in range(2)] == list(v[1:])
@@ -49,11 +58,20 @@ def test_a_node_holds_offsets_and_threshold_of_any_sign():
 
 def test_descents_agree_with_the_walk_a_reader_would_write(bumps):
     samples, labels = bumps
-    forest, _ = grow_forest(samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0))
+    forest, _ = grow_forest(
+        samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0)
+    )
     for s in range(0, 400, 7):
         for root in forest.roots:
-            scene = (samples.heights[s], samples.inverse_size[s], samples.views[s], samples.scalars[s])
-            assert kernels.descend(forest.nodes, root, *scene) == leaf_by_hand(forest.nodes, root, *scene)
+            scene = (
+                samples.heights[s],
+                samples.inverse_size[s],
+                samples.views[s],
+                samples.scalars[s],
+            )
+            assert kernels.descend(forest.nodes, root, *scene) == leaf_by_hand(
+                forest.nodes, root, *scene
+            )
 
 
 @njit
@@ -61,8 +79,22 @@ def walk_all(nodes, root, pixels, base, scalar_base, inverse, one, several, side
     """Leaves (2, n) of all lanes, for a forest of one view and for one that chooses among views."""
     n = base.size
     for first in range(0, n, LANES):
-        walk_one_view(nodes, root, pixels, base, scalar_base, inverse, one, n, side, leaves[0], first)
-        walk_views(nodes, root, pixels, base, scalar_base, inverse, several, several.size // n, side, leaves[1], first)
+        walk_one_view(
+            nodes, root, pixels, base, scalar_base, inverse, one, n, side, leaves[0], first
+        )
+        walk_views(
+            nodes,
+            root,
+            pixels,
+            base,
+            scalar_base,
+            inverse,
+            several,
+            several.size // n,
+            side,
+            leaves[1],
+            first,
+        )
 
 
 @pytest.mark.parametrize("n_views", [1, 3])
@@ -82,12 +114,24 @@ def test_sixteen_lanes_reach_the_leaves_that_one_sample_after_the_other_does(bum
     leaves = np.zeros((2, n), np.int32)
     for root in forest.roots:
         wanted = [
-            kernels.descend(forest.nodes, root, many.heights[s], many.inverse_size[s], views[s], many.scalars[s])
+            kernels.descend(
+                forest.nodes, root, many.heights[s], many.inverse_size[s], views[s], many.scalars[s]
+            )
             for s in range(n)
         ]
         one = np.ascontiguousarray(views[:n, 0].T).ravel()
-        walk_all(forest.nodes, root, pixels, base, scalar_base, many.inverse_size[:n].copy(), one,
-                 views[:n].ravel(), side, leaves)  # fmt: skip
+        walk_all(
+            forest.nodes,
+            root,
+            pixels,
+            base,
+            scalar_base,
+            many.inverse_size[:n].copy(),
+            one,
+            views[:n].ravel(),
+            side,
+            leaves,
+        )
         np.testing.assert_array_equal(leaves[1], wanted)
         if n_views == 1:
             np.testing.assert_array_equal(leaves[0], wanted)
@@ -95,7 +139,9 @@ def test_sixteen_lanes_reach_the_leaves_that_one_sample_after_the_other_does(bum
 
 def test_a_forest_learns_where_the_bump_is(bumps):
     samples, labels = bumps
-    forest, in_bag = grow_forest(samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0))
+    forest, in_bag = grow_forest(
+        samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0)
+    )
     off = np.linalg.norm(predict(forest, samples, in_bag) - labels, axis=1).mean()
     assert off < 0.5 * np.linalg.norm(labels - labels.mean(0), axis=1).mean()
 
@@ -103,7 +149,9 @@ def test_a_forest_learns_where_the_bump_is(bumps):
 def test_out_of_bag_predictions_use_only_trees_that_did_not_see_the_image(bumps):
     samples, labels = bumps
     plan = replace(PLAN, n_trees=1)
-    forest, in_bag = grow_forest(samples, labels, np.ones(len(samples), bool), plan, np.random.default_rng(0))
+    forest, in_bag = grow_forest(
+        samples, labels, np.ones(len(samples), bool), plan, np.random.default_rng(0)
+    )
     assert in_bag.sum() == round(0.63 * len(samples))
     two = np.concatenate([in_bag, ~in_bag])
     doubled = replace(forest, roots=np.repeat(forest.roots, 2))
@@ -125,11 +173,17 @@ def test_growth_does_not_depend_on_the_number_of_threads(bumps):
 def test_no_leaf_is_smaller_than_allowed(bumps):
     samples, labels = bumps
     forest, _ = grow_forest(
-        samples, labels, np.ones(len(samples), bool), replace(PLAN, bag_share=1.0), np.random.default_rng(1)
+        samples,
+        labels,
+        np.ones(len(samples), bool),
+        replace(PLAN, bag_share=1.0),
+        np.random.default_rng(1),
     )
     for root in forest.roots:
         reached = [
-            kernels.descend(forest.nodes, root, samples.heights[s], 1.0, samples.views[s], samples.scalars[s])
+            kernels.descend(
+                forest.nodes, root, samples.heights[s], 1.0, samples.views[s], samples.scalars[s]
+            )
             for s in range(len(samples))
         ]
         assert np.unique(reached, return_counts=True)[1].min() >= PLAN.min_leaf

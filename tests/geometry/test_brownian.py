@@ -19,7 +19,9 @@ def test_steps_have_the_covariance_asked_for() -> None:
     assert steps.shape == (40_000, 6)
     found = np.cov(steps.T)
     spread = np.sqrt(np.diag(COVARIANCE))
-    np.testing.assert_allclose(found / np.outer(spread, spread), COVARIANCE / np.outer(spread, spread), atol=0.03)
+    np.testing.assert_allclose(
+        found / np.outer(spread, spread), COVARIANCE / np.outer(spread, spread), atol=0.03
+    )
     assert brownian_steps(np.random.default_rng(1), COVARIANCE, 5, 2, 3).shape == (2, 3, 5, 6)
 
 
@@ -44,7 +46,9 @@ def test_between_the_steps_the_path_is_equation_7() -> None:
     for k, share in [(0, 0.25), (1, 0.5), (2, 0.9)]:
         t = (k + share) * DELTA
         by_hand = nodes.matrix[k] @ motion.exp((t - k * DELTA) / np.sqrt(DELTA) * steps[k])
-        np.testing.assert_allclose(brownian_path(START, steps, DELTA, t).matrix[0], by_hand, atol=1e-9)
+        np.testing.assert_allclose(
+            brownian_path(START, steps, DELTA, t).matrix[0], by_hand, atol=1e-9
+        )
 
 
 def test_the_path_is_continuous() -> None:
@@ -66,7 +70,9 @@ def test_the_motion_spreads_with_time_whatever_the_step() -> None:
 def test_the_motion_is_left_invariant() -> None:
     steps = brownian_steps(np.random.default_rng(7), COVARIANCE, 4)
     times = np.linspace(0, 4 * DELTA, 9)
-    from_start, from_origin = (brownian_path(g, steps, DELTA, times) for g in (START, SE3.identity()))
+    from_start, from_origin = (
+        brownian_path(g, steps, DELTA, times) for g in (START, SE3.identity())
+    )
     np.testing.assert_allclose(from_start.matrix, (START @ from_origin).matrix, atol=1e-9)
 
 

@@ -70,7 +70,9 @@ def test_log_undoes_exp_near_pi(below_pi: float) -> None:
     rng = np.random.default_rng(11)
     for _ in range(20):
         axis = rng.normal(size=3)
-        xi = np.concatenate([(np.pi - below_pi) * axis / np.linalg.norm(axis), rng.uniform(-50, 50, 3)])
+        xi = np.concatenate(
+            [(np.pi - below_pi) * axis / np.linalg.norm(axis), rng.uniform(-50, 50, 3)]
+        )
         assert_close(SE3.exp(xi).log(), xi)
 
 
@@ -128,8 +130,12 @@ def test_one_transform_moves_a_batch_and_a_batch_moves_one_point() -> None:
         one = SE3.exp(xis[k])
         np.testing.assert_allclose((batch @ points)[k], one @ points[k], atol=1e-14)
         np.testing.assert_allclose((batch @ points[0])[k], one @ points[0], atol=1e-14)
-        np.testing.assert_allclose((SE3.exp(xis[0]) @ batch).matrix[k], (SE3.exp(xis[0]) @ one).matrix, atol=1e-14)
-    np.testing.assert_array_equal(SE3.identity(2, 3).matrix, np.broadcast_to(np.eye(4), (2, 3, 4, 4)))
+        np.testing.assert_allclose(
+            (SE3.exp(xis[0]) @ batch).matrix[k], (SE3.exp(xis[0]) @ one).matrix, atol=1e-14
+        )
+    np.testing.assert_array_equal(
+        SE3.identity(2, 3).matrix, np.broadcast_to(np.eye(4), (2, 3, 4, 4))
+    )
 
 
 def test_a_twist_about_the_vertical_is_a_circle() -> None:

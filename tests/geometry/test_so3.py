@@ -64,14 +64,19 @@ def test_cross_is_numpys(a: Array, b: Array) -> None:
 
 @given(omega=rotation_vectors())
 def test_the_inverse_of_the_left_jacobian_is_its_inverse(omega: Array) -> None:
-    np.testing.assert_allclose(so3.left_jacobian(omega) @ so3.left_jacobian_inverse(omega), np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(
+        so3.left_jacobian(omega) @ so3.left_jacobian_inverse(omega), np.eye(3), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("function", [so3.exp, so3.left_jacobian, so3.left_jacobian_inverse])
 def test_series_and_formula_meet_where_they_part(function: object) -> None:
     assert callable(function)
     for limit in (1e-4, 1e-3):
-        below, above = function([0.0, 0.0, limit * (1 - 1e-9)]), function([0.0, 0.0, limit * (1 + 1e-9)])
+        below, above = (
+            function([0.0, 0.0, limit * (1 - 1e-9)]),
+            function([0.0, 0.0, limit * (1 + 1e-9)]),
+        )
         np.testing.assert_allclose(below, above, atol=1e-11)
 
 
@@ -113,4 +118,6 @@ def test_the_mean_lies_in_the_middle(omega: Array) -> None:
     centre = so3.exp(omega)
     bends = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.2, 0], [0, -0.2, 0]])
     np.testing.assert_allclose(so3.mean(centre @ so3.exp(bends)), centre, atol=1e-12)
-    np.testing.assert_allclose(so3.mean(so3.exp(bends), weights=[1, 0, 0, 0]), so3.exp(bends[0]), atol=1e-12)
+    np.testing.assert_allclose(
+        so3.mean(so3.exp(bends), weights=[1, 0, 0, 0]), so3.exp(bends[0]), atol=1e-12
+    )

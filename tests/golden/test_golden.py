@@ -16,7 +16,10 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from tests.golden.write import ARENA, CAMERA, HERE, TABLES, ZONES, contents
 
-NUMBERS = sorted(int(path.name.removeprefix("session_").removesuffix(".tar.gz")) for path in HERE.glob("*.tar.gz"))
+NUMBERS = sorted(
+    int(path.name.removeprefix("session_").removesuffix(".tar.gz"))
+    for path in HERE.glob("*.tar.gz")
+)
 
 
 @pytest.fixture(scope="module", params=NUMBERS)
@@ -36,7 +39,9 @@ def test_every_schema_has_its_golden_session() -> None:
 
 
 def test_every_table_is_read_with_its_columns_and_values(golden: Session) -> None:
-    expected = json.loads((HERE / f"session_{golden.metadata['schema_version']}.json").read_text(encoding="utf-8"))
+    expected = json.loads(
+        (HERE / f"session_{golden.metadata['schema_version']}.json").read_text(encoding="utf-8")
+    )
     found = contents(golden)
     assert list(expected) == list(TABLES)
     for name, table in expected.items():
@@ -44,7 +49,9 @@ def test_every_table_is_read_with_its_columns_and_values(golden: Session) -> Non
         for column, (kind, n_known, value) in table["columns"].items():
             now = found[name]["columns"][column]
             assert now[:2] == [kind, n_known], f"{name}.{column}"
-            assert now[2] == (value if kind == "text" else pytest.approx(value, rel=1e-12, abs=1e-12)), column
+            assert now[2] == (
+                value if kind == "text" else pytest.approx(value, rel=1e-12, abs=1e-12)
+            ), column
 
 
 def test_every_column_is_still_explained(golden: Session) -> None:

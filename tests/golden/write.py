@@ -24,9 +24,22 @@ from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, write
 
 HERE = Path(__file__).parent
-TABLES = ("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions", "summary")
+TABLES = (
+    "frames",
+    "poses",
+    "rotations",
+    "kinematics",
+    "bouts",
+    "gaps",
+    "flips",
+    "sessions",
+    "summary",
+)
 ARENA = Arena("round", (5.0, -3.0), 210.0, None, None, 0.4, 0.95, "wall")
-ZONES = (Zone("centre", (5.0, -3.0, 148.0)), Zone("east", polygon_mm=((0.0, -250.0), (250.0, -250.0), (0.0, 250.0))))
+ZONES = (
+    Zone("centre", (5.0, -3.0, 148.0)),
+    Zone("east", polygon_mm=((0.0, -250.0), (250.0, -250.0), (0.0, 250.0))),
+)
 WATER = Water(500.0)
 CAMERA = Camera(71.6, 71.6, 39.5, 29.5, 80, 60, source="typical PrimeSense, an eighth of its size")
 
@@ -36,7 +49,10 @@ def contents(session: Session) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in TABLES:
         table = getattr(session, name) if name != "sessions" else session.table("sessions")
-        found[name] = {"n_rows": len(table), "columns": {str(c): summed(table[c]) for c in table.columns}}
+        found[name] = {
+            "n_rows": len(table),
+            "columns": {str(c): summed(table[c]) for c in table.columns},
+        }
     return found
 
 
@@ -53,17 +69,28 @@ def main(number: int) -> None:
     archive, expected = HERE / f"session_{number}.tar.gz", HERE / f"session_{number}.json"
     if archive.exists():
         raise SystemExit(f"{archive} is there and is never written anew; see README.md beside it")
-    mouse = WalkingMouse(np.delete(np.arange(14) / 30, [5, 6]), rear_s=(0.15, 0.6), lost=(9,), camera=CAMERA)
+    mouse = WalkingMouse(
+        np.delete(np.arange(14) / 30, [5, 6]), rear_s=(0.15, 0.6), lost=(9,), camera=CAMERA
+    )
     with tempfile.TemporaryDirectory() as folder:
         session = write(
-            Path(folder) / f"session_{number}", mouse, chunk=5, plan_toml=Plan.load("mouse").to_toml(),
-            gaps=find_gaps(mouse.times_ns, median_step(mouse.times_ns)), problems=["written for a test"],
-            model={"name": "mouse", "sha256": "ab" * 32}, subject={"subject_id": "m01"},
-            session_start_time="2026-01-05T10:00:00+01:00", optics={"distortion": None, "water": WATER.to_dict()},
-            arena=ARENA, zones=ZONES,
-        )  # fmt: skip
+            Path(folder) / f"session_{number}",
+            mouse,
+            chunk=5,
+            plan_toml=Plan.load("mouse").to_toml(),
+            gaps=find_gaps(mouse.times_ns, median_step(mouse.times_ns)),
+            problems=["written for a test"],
+            model={"name": "mouse", "sha256": "ab" * 32},
+            subject={"subject_id": "m01"},
+            session_start_time="2026-01-05T10:00:00+01:00",
+            optics={"distortion": None, "water": WATER.to_dict()},
+            arena=ARENA,
+            zones=ZONES,
+        )
         archive.write_bytes(packed(session.path))
-        expected.write_text(json.dumps(contents(session), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        expected.write_text(
+            json.dumps(contents(session), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
 
 
 def packed(folder: Path) -> bytes:

@@ -70,7 +70,15 @@ def test_batches_keep_their_shape() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"fx": 0.0}, {"fy": -365.0}, {"fx": math.nan}, {"fx": math.inf}, {"cx": math.nan}, {"width": 0}, {"height": -1}],
+    [
+        {"fx": 0.0},
+        {"fy": -365.0},
+        {"fx": math.nan},
+        {"fx": math.inf},
+        {"cx": math.nan},
+        {"width": 0},
+        {"height": -1},
+    ],
 )
 def test_a_camera_that_cannot_be_is_refused_in_a_sentence(wrong: dict[str, Any]) -> None:
     with pytest.raises(LiexError, match=", got ") as caught:
@@ -116,10 +124,16 @@ def test_where_a_model_folds_back_nothing_is_seen() -> None:
 
 @pytest.mark.parametrize(
     ("model", "k", "says"),
-    [("mei", [0.1], "'mei' is not known"), ("plumb_bob", [0.1] * 12, "has up to 8 coefficients here, got 12"),
-     ("equidistant", [0.1] * 5, "has up to 4"), ("plumb_bob", [math.nan], "finite")],
-)  # fmt: skip
-def test_a_distortion_that_cannot_be_used_is_refused_in_a_sentence(model: str, k: list[float], says: str) -> None:
+    [
+        ("mei", [0.1], "'mei' is not known"),
+        ("plumb_bob", [0.1] * 12, "has up to 8 coefficients here, got 12"),
+        ("equidistant", [0.1] * 5, "has up to 4"),
+        ("plumb_bob", [math.nan], "finite"),
+    ],
+)
+def test_a_distortion_that_cannot_be_used_is_refused_in_a_sentence(
+    model: str, k: list[float], says: str
+) -> None:
     with pytest.raises(LiexError, match=says):
         Distortion.of(model, k)
 
@@ -133,14 +147,25 @@ def test_coefficients_of_zero_are_no_distortion(model: str, k: list[float]) -> N
 @pytest.mark.parametrize("lens", [None, *LENSES])
 def test_a_camera_of_any_lens_survives_its_own_table(lens: Distortion | None) -> None:
     camera = replace(PRIMESENSE, distortion=lens)
-    assert Camera.from_dict(json.loads(json.dumps(camera.to_dict())) | {"floor_distance_mm": 700.0}) == camera
+    assert (
+        Camera.from_dict(json.loads(json.dumps(camera.to_dict())) | {"floor_distance_mm": 700.0})
+        == camera
+    )
 
 
-@given(camera=cameras, stride=st.integers(1, 4), x=st.floats(-90, 90), y=st.floats(-90, 90), z=st.floats(150, 900))
+@given(
+    camera=cameras,
+    stride=st.integers(1, 4),
+    x=st.floats(-90, 90),
+    y=st.floats(-90, 90),
+    z=st.floats(150, 900),
+)
 def test_a_camera_of_every_other_pixel_sees_the_same_in_fewer_pixels(
     camera: Camera, stride: int, x: float, y: float, z: float
 ) -> None:
     coarse = camera.every(stride)
-    np.testing.assert_allclose(stride * coarse.project([x, y, z]), camera.project([x, y, z]), atol=1e-9)
+    np.testing.assert_allclose(
+        stride * coarse.project([x, y, z]), camera.project([x, y, z]), atol=1e-9
+    )
     assert coarse.width == len(range(0, camera.width, stride))
     assert coarse.height == len(range(0, camera.height, stride))

@@ -53,13 +53,17 @@ def test_the_angles_obey_snell() -> None:
 @pytest.mark.parametrize("ranging", ["light_field", "structured_light", "paraxial"])
 def test_straight_down_the_apparent_depth_is_the_true_one_over_n(ranging: str) -> None:
     water = Water(500.0, 1.333, ranging=ranging)
-    assert water.true_points([0.0, 0.0], 500.0 + 200.0 / 1.333) == pytest.approx([0.0, 0.0, 700.0], abs=1e-9)
+    assert water.true_points([0.0, 0.0], 500.0 + 200.0 / 1.333) == pytest.approx(
+        [0.0, 0.0, 700.0], abs=1e-9
+    )
 
 
 def test_light_takes_longer_under_water() -> None:
     """A time-of-flight camera sees the bottom farther away than it is, where the others see it nearer."""
     water = Water(500.0, 1.333, ranging="time_of_flight")
-    assert water.true_points([0.0, 0.0], 500.0 + 200.0 * 1.333) == pytest.approx([0.0, 0.0, 700.0], abs=1e-9)
+    assert water.true_points([0.0, 0.0], 500.0 + 200.0 * 1.333) == pytest.approx(
+        [0.0, 0.0, 700.0], abs=1e-9
+    )
 
 
 def test_two_eyes_that_are_not_infinitely_near_see_nearly_the_same() -> None:
@@ -82,11 +86,15 @@ def test_what_is_above_the_water_is_where_it_seems(ranging: str) -> None:
 def test_air_under_the_surface_changes_nothing(ranging: str) -> None:
     rays = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
     seeming = np.concatenate([rays, np.ones((50, 1))], axis=1) * 800.0
-    np.testing.assert_allclose(Water(500.0, 1.0, 0.1, 0.2, ranging).true_points(rays, 800.0), seeming, atol=1e-9)
+    np.testing.assert_allclose(
+        Water(500.0, 1.0, 0.1, 0.2, ranging).true_points(rays, 800.0), seeming, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.08, -0.05)])
-def test_the_camera_without_water_sees_everything_in_the_same_pixel(tilt: tuple[float, float]) -> None:
+def test_the_camera_without_water_sees_everything_in_the_same_pixel(
+    tilt: tuple[float, float],
+) -> None:
     """So neither is detail lost nor another side of the animal shown; off the perpendicular a point moves inwards."""
     water = Water(500.0, 1.333, *tilt)
     ideal = water.without(PRIMESENSE)
@@ -103,7 +111,13 @@ def test_the_camera_without_water_sees_everything_in_the_same_pixel(tilt: tuple[
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"height_mm": 0.0}, {"refractive_index": 0.9}, {"tilt_x_rad": 1.5}, {"ranging": "sonar"}, {"height_mm": np.nan}],
+    [
+        {"height_mm": 0.0},
+        {"refractive_index": 0.9},
+        {"tilt_x_rad": 1.5},
+        {"ranging": "sonar"},
+        {"height_mm": np.nan},
+    ],
 )
 def test_a_surface_that_cannot_be_is_refused_in_a_sentence(wrong: dict) -> None:
     with pytest.raises(LiexError, match=r"correct \[water\] in the plan"):

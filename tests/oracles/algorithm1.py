@@ -50,11 +50,17 @@ class Picture:
         """The nine numbers of a joint (4, 4): where it is, where offsets lead, how high it is."""
         h, place, unit = 1e-4, joint[:3, 3], self.reach_mm * self.size / 127.0
         columns = [
-            (self.pixel(place + h * unit * joint[:3, k]) - self.pixel(place - h * unit * joint[:3, k])) / (2 * h)
+            (
+                self.pixel(place + h * unit * joint[:3, k])
+                - self.pixel(place - h * unit * joint[:3, k])
+            )
+            / (2 * h)
             for k in range(3)
         ]
         matrix = np.stack(columns, axis=1)
-        return np.array([*self.pixel(place), *matrix[0], *matrix[1], 16.0 * place[2] / self.size], np.float32)
+        return np.array(
+            [*self.pixel(place), *matrix[0], *matrix[1], 16.0 * place[2] / self.size], np.float32
+        )
 
     def scalars(self, joint: Array, scale: float) -> NDArray[np.float32]:
         """The eleven numbers that describe the whole animal as a joint (4, 4) sees it."""
@@ -62,20 +68,33 @@ class Picture:
         size, place, forward = self.size, joint[:3, 3], joint[:3, 0]
         to_middle = np.array([x - place[0], y - place[1], 0.0])
         turned = axis - np.arctan2(forward[1], forward[0])
-        return np.array([
-            500 * np.log(max(area, 1) / size**2), 500 * np.log(max(volume, 1) / size**3),
-            16 * along / size, 16 * across / size,
-            16 * to_middle @ joint[:3, 0] / size, 16 * to_middle @ joint[:3, 1] / size, 16 * place[2] / size,
-            500 * joint[2, 0], 500 * joint[2, 1],
-            500 * np.sin(2 * turned) * (along - across) / max(along + across, 1e-6), 500 * np.log(scale / size),
-        ], np.float32)  # fmt: skip
+        return np.array(
+            [
+                500 * np.log(max(area, 1) / size**2),
+                500 * np.log(max(volume, 1) / size**3),
+                16 * along / size,
+                16 * across / size,
+                16 * to_middle @ joint[:3, 0] / size,
+                16 * to_middle @ joint[:3, 1] / size,
+                16 * place[2] / size,
+                500 * joint[2, 0],
+                500 * joint[2, 1],
+                500 * np.sin(2 * turned) * (along - across) / max(along + across, 1e-6),
+                500 * np.log(scale / size),
+            ],
+            np.float32,
+        )
 
 
-def votes_of(forest: Forest, picture: Picture, views: NDArray[np.float32], scalars: NDArray[np.float32]) -> Array:
+def votes_of(
+    forest: Forest, picture: Picture, views: NDArray[np.float32], scalars: NDArray[np.float32]
+) -> Array:
     """What each tree says (T, D)."""
     exact = views.astype(float)  # numpy would add float32 numbers as float32
     leaves = [
-        leaf_by_hand(forest.nodes, root, picture.heights, np.float32(1 / picture.size), exact, scalars)
+        leaf_by_hand(
+            forest.nodes, root, picture.heights, np.float32(1 / picture.size), exact, scalars
+        )
         for root in forest.roots
     ]
     return forest.leaves[leaves].astype(float)
@@ -101,8 +120,11 @@ def start(model: Model, moments: Array, number: int, drawn: Array, size: float) 
         heading = axis + (np.pi if number % 2 else 0.0) + spread * drawn[0]
         scale = size
         back = 0.42 * length * size
-        place = [x - back * np.cos(heading) + 2 * size * drawn[1], y - back * np.sin(heading) + 2 * size * drawn[2],
-                 0.2 * length * size]  # fmt: skip
+        place = [
+            x - back * np.cos(heading) + 2 * size * drawn[1],
+            y - back * np.sin(heading) + 2 * size * drawn[2],
+            0.2 * length * size,
+        ]
     else:
         heading, scale = np.pi * drawn[3], size * (1 + 0.1 * min(max(drawn[1] / 2, -1), 1))
         place = [x, y, volume / max(area, 1)]
@@ -144,12 +166,18 @@ def solve(model: Model, picture: Picture, candidate: Candidate) -> Candidate:
             candidate.joints[joint] = placed(model, candidate, joint)
         for forest in rounds:
             here = candidate.joints[joint]
-            votes = votes_of(forest, picture, picture.view(here)[None], picture.scalars(here, candidate.scale))
-            value = mode(votes, method.mean_shift_mm) if method.mean_shift_mm else votes.mean(axis=0)
+            votes = votes_of(
+                forest, picture, picture.view(here)[None], picture.scalars(here, candidate.scale)
+            )
+            value = (
+                mode(votes, method.mean_shift_mm) if method.mean_shift_mm else votes.mean(axis=0)
+            )
             twist = np.zeros(6)
             if joint == 0:
                 twist[:3], twist[3:] = value[:3] / method.base_lever_mm, value[3:6] * picture.size
-                candidate.scale *= np.exp(value[6] / method.scale_lever_mm) if method.regress_scale else 1.0
+                candidate.scale *= (
+                    np.exp(value[6] / method.scale_lever_mm) if method.regress_scale else 1.0
+                )
             else:
                 twist[:3][skeleton.axes[joint]] = value / method.joint_lever_mm
             candidate.joints[joint] = here @ motion.exp(twist)
@@ -160,8 +188,16 @@ def solve(model: Model, picture: Picture, candidate: Candidate) -> Candidate:
     scalars = picture.scalars(candidate.joints[0], candidate.scale)
     if method.explains:
         joints = np.array(candidate.joints)
-        fit = explained(picture.heights, picture.look, picture.moments[5], Balls.of(skeleton), joints[:, :3, :3],
-                        joints[:, :3, 3], candidate.scale, picture.size)  # fmt: skip
+        fit = explained(
+            picture.heights,
+            picture.look,
+            picture.moments[5],
+            Balls.of(skeleton),
+            joints[:, :3, :3],
+            joints[:, :3, 3],
+            candidate.scale,
+            picture.size,
+        )
         scalars = np.append(scalars, np.floor(np.clip(fit, -32768, 32767)).astype(np.float32))
     candidate.score = float(votes_of(model.metric, picture, views, scalars).mean())
     return candidate

@@ -18,7 +18,9 @@ def ends_by_hand(
     found = set()
     for k, (r, c) in enumerate(order):
         pass_ = _highest_pass(rank, hops, k)
-        sticks_out = (hops[k] - pass_) * BLOCK * blocks[r, c] / focal if pass_ is not None else np.inf
+        sticks_out = (
+            (hops[k] - pass_) * BLOCK * blocks[r, c] / focal if pass_ is not None else np.inf
+        )
         if sticks_out >= least_mm:
             found.add((int(r), int(c)))
     return found
@@ -29,7 +31,9 @@ def _highest_pass(rank: dict[tuple[int, int], int], hops: np.ndarray, start: int
     crossed, on the best way; None where there is no such block.
     """
     blocks = list(rank)
-    for lowest in range(start, -1, -1):  # only blocks at least this late in the order may be crossed
+    for lowest in range(
+        start, -1, -1
+    ):  # only blocks at least this late in the order may be crossed
         reached, queue = {blocks[start]}, [blocks[start]]
         while queue:
             r, c = queue.pop()

@@ -19,9 +19,15 @@ def placed(balls: Balls, rotations: np.ndarray, positions: np.ndarray, scale: fl
 
 
 def explained(
-    heights: np.ndarray, look: np.ndarray, axis: float, balls: Balls, rotations: np.ndarray, positions: np.ndarray,
-    scale: float, size: float,
-) -> np.ndarray:  # fmt: skip
+    heights: np.ndarray,
+    look: np.ndarray,
+    axis: float,
+    balls: Balls,
+    rotations: np.ndarray,
+    positions: np.ndarray,
+    scale: float,
+    size: float,
+) -> np.ndarray:
     """The eight numbers of `_explain.explain_pose`."""
     middles, radii = placed(balls, rotations, positions, scale), balls.radius * scale
     own, per_mm = balls.n_own, 1.0 / (size * balls.unit_mm)
@@ -52,8 +58,15 @@ def explained(
                 gaps.append(gap.min() * per_mm)
     gap = np.array(gaps)
     n, seen = max(len(gap), 1), max(len(over), 1)
-    return np.array([
-        1000 * beside / own, 50 * off.sum() / seen, 50 * out.sum() / seen, 1000 * (over > 12.0).sum() / own,
-        50 * np.clip(gap, 0, 30).sum() / n, 1000 * (gap > 8.0).sum() / n, 50 * np.clip(-gap, 0, 30).sum() / n,
-        1000 * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0]),
-    ])  # fmt: skip
+    return np.array(
+        [
+            1000 * beside / own,
+            50 * off.sum() / seen,
+            50 * out.sum() / seen,
+            1000 * (over > 12.0).sum() / own,
+            50 * np.clip(gap, 0, 30).sum() / n,
+            1000 * (gap > 8.0).sum() / n,
+            50 * np.clip(-gap, 0, 30).sum() / n,
+            1000 * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0]),
+        ]
+    )

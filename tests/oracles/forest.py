@@ -19,7 +19,9 @@ def leaf_by_hand(nodes, root, heights, inverse_size, views, scalars):
     """Index of the leaf that one sample reaches."""
     at = root
     while nodes[at][2] >= 0:
-        ux, uy, uz, vx, vy, vz, threshold = struct.unpack("<6bh", struct.pack("<2i", *nodes[at][:2].tolist()))
+        ux, uy, uz, vx, vy, vz, threshold = struct.unpack(
+            "<6bh", struct.pack("<2i", *nodes[at][:2].tolist())
+        )
         kind, channel = int(nodes[at][3]) % 4, int(nodes[at][3]) // 4
         if kind == 2:
             value = scalars[channel]
@@ -28,6 +30,8 @@ def leaf_by_hand(nodes, root, heights, inverse_size, views, scalars):
             if kind == 1:
                 value -= views[channel][8]
             else:
-                value -= np.float32(probe_by_hand(heights, views[channel], (vx, vy, vz))) * inverse_size
+                value -= (
+                    np.float32(probe_by_hand(heights, views[channel], (vx, vy, vz))) * inverse_size
+                )
         at = nodes[at][2] + (1 if value >= threshold else 0)
     return -int(nodes[at][2]) - 1

@@ -46,7 +46,9 @@ def plane(camera: Camera, water: Water | None, z: float) -> tuple[Array, Array]:
         return ray[..., :2] * z, np.where(np.isfinite(ray[..., 0]), z, 0.0)
     start, way = bent_down(ray, water)
     points = start + way * ((z - start[..., 2]) / way[..., 2])[..., None]
-    xy, apparent = seen(points, water.normal, water.height_mm, water.refractive_index, water.ranging, 0.01)
+    xy, apparent = seen(
+        points, water.normal, water.height_mm, water.refractive_index, water.ranging, 0.01
+    )
     assert np.nanmax(np.abs(xy - ray[..., :2])) < 1e-6, "the way back is the way there"
     return points[..., :2], np.nan_to_num(apparent)
 
@@ -57,5 +59,7 @@ def bent_down(ray: Array, water: Water) -> tuple[Array, Array]:
     down = water.normal
     cosine = (unit @ down)[..., None]
     meets = unit * (water.height_mm / cosine)
-    flat = (unit - cosine * down) / water.refractive_index  # the part along the surface, as long as the sine
+    flat = (
+        unit - cosine * down
+    ) / water.refractive_index  # the part along the surface, as long as the sine
     return meets, flat + np.sqrt(1.0 - (flat * flat).sum(axis=-1, keepdims=True)) * down

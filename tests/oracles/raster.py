@@ -9,7 +9,10 @@ from liex_lab.optics.camera import Camera
 
 
 def ray_cast_depth(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], camera: Camera, window: tuple[int, int, int, int]
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    camera: Camera,
+    window: tuple[int, int, int, int],
 ) -> NDArray[np.float64]:
     """Depth (H, W) mm of a mesh in the camera frame by Moeller and Trumbore's test; 0 where no triangle is hit."""
     u0, v0, width, height = window

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def ray_to(point: Array, lens: Array, normal: Array, distance_mm: float, n: float) -> tuple[Array, Array, Array]:
+def ray_to(
+    point: Array, lens: Array, normal: Array, distance_mm: float, n: float
+) -> tuple[Array, Array, Array]:
     """Unit ray (..., 3) with which light from `point` (..., 3) under the plane normal . p = distance_mm reaches
     `lens` (3,), and the lengths mm (...) of its way in air and in water.
     """

@@ -19,9 +19,15 @@ N_FRAMES = 40
 
 
 def pretended_run(
-    recording: str, plan: Plan, *, folder: Path, overwrite: bool, notes: dict[str, Any], crew: object,
+    recording: str,
+    plan: Plan,
+    *,
+    folder: Path,
+    overwrite: bool,
+    notes: dict[str, Any],
+    crew: object,
     progress: Progress,
-) -> Path:  # fmt: skip
+) -> Path:
     """Stands in for `run_session`."""
     from liex_lab.catalog import find_model, sha256
     from liex_lab.recordings.recording import file_digest
@@ -32,7 +38,9 @@ def pretended_run(
         file.write("x")
     progress(0, None, "learning the background")
     if name.startswith("empty"):
-        raise EstimationError("no animal was found in the sampled frames; check the depth unit and the plan")
+        raise EstimationError(
+            "no animal was found in the sampled frames; check the depth unit and the plan"
+        )
     for done in (16, 32, N_FRAMES):
         progress(done, N_FRAMES, "measuring poses")
         if name.startswith("torn") and done == 32:
@@ -48,14 +56,19 @@ def pretended_run(
     (folder / "failed.json").unlink(missing_ok=True)
     folder.mkdir(parents=True, exist_ok=True)
     document = {
-        "schema_version": SCHEMA_VERSION, "session_id": plan.session.name, "versions": versions(),
+        "schema_version": SCHEMA_VERSION,
+        "session_id": plan.session.name,
+        "versions": versions(),
         "plan": plan.model_dump(exclude_none=True),
         "model": {"sha256": sha256(find_model(plan.estimation.model))},
-        "input": {"sha256": file_digest([Path(recording)]), **notes["input"]}, "run_id": notes["run_id"],
-        "frames": {"n_frames": N_FRAMES, "n_observed": 39, "observed_s": 1.3}, "frames_per_s": 100.0,
-        "peak_memory_mb": 500.0, "threads": os.environ.get("NUMBA_NUM_THREADS"),
+        "input": {"sha256": file_digest([Path(recording)]), **notes["input"]},
+        "run_id": notes["run_id"],
+        "frames": {"n_frames": N_FRAMES, "n_observed": 39, "observed_s": 1.3},
+        "frames_per_s": 100.0,
+        "peak_memory_mb": 500.0,
+        "threads": os.environ.get("NUMBA_NUM_THREADS"),
         "shared": crew is not None,
-    }  # fmt: skip
+    }
     (folder / "session.json").write_text(json.dumps(document))
     return folder
 

@@ -40,7 +40,9 @@ def without_camera(kind: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["images", "moseq", "mcap"])
-def test_a_plan_with_all_intrinsics_opens_a_recording_that_has_none(tmp_path: Path, kind: str) -> None:
+def test_a_plan_with_all_intrinsics_opens_a_recording_that_has_none(
+    tmp_path: Path, kind: str
+) -> None:
     path = without_camera(kind, tmp_path)
     with pytest.raises(LiexError, match=r"camera\.toml"):
         build_recording(path, plan(*LENS[:3]))
@@ -55,7 +57,11 @@ def test_a_plan_with_all_intrinsics_opens_a_recording_that_has_none(tmp_path: Pa
 def test_a_plan_overrules_a_part_of_what_the_recording_states(tmp_path: Path) -> None:
     path = write_png_folder(tmp_path / "r", STORED)
     with build_recording(path, plan("camera.fx=70")) as recording:
-        assert (recording.camera.fx, recording.camera.fy, recording.camera.source) == (70.0, 61.0, "plan")
+        assert (recording.camera.fx, recording.camera.fy, recording.camera.source) == (
+            70.0,
+            61.0,
+            "plan",
+        )
     with open_recording(path) as opened, build_recording(opened, plan("camera.fx=70")) as recording:
         assert recording.camera.fx == 70.0
 
@@ -95,13 +101,17 @@ def test_what_a_file_says_of_its_lens_is_undone_and_the_plan_overrules_it(tmp_pa
     with build_recording(path, plan()) as recording:
         assert recording.camera.distortion is None
         assert recording.optics["distortion"]["coefficients"][:4] == BARREL
-        assert recording.frame(0).depth.shape == (recording.height, recording.width) != original.shape
+        assert (
+            recording.frame(0).depth.shape == (recording.height, recording.width) != original.shape
+        )
     with build_recording(path, plan("camera.distortion=[0.1]")) as recording:
         assert (recording.frame(0).depth != original).any()
     with build_recording(path, plan("camera.distortion=[]")) as recording:
         assert recording.optics == {}
         assert (recording.frame(0).depth == original).all()
-    with build_recording(path, plan(*LENS)) as recording:  # a camera that is stated as a whole is the whole camera
+    with build_recording(
+        path, plan(*LENS)
+    ) as recording:  # a camera that is stated as a whole is the whole camera
         assert recording.optics == {}
     with pytest.raises(LiexError, match="'mei' is not known"):
         build_recording(path, plan("camera.distortion=[0.1]", "camera.distortion_model=mei"))

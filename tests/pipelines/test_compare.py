@@ -26,7 +26,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_groups_of_a_folder_of_sessions_are_compared(study, tmp_path):
-    ran = CliRunner().invoke(cli.app, ["compare", str(study), "--out", str(tmp_path), "--measure", "mean_speed_mm_s"])
+    ran = CliRunner().invoke(
+        cli.app, ["compare", str(study), "--out", str(tmp_path), "--measure", "mean_speed_mm_s"]
+    )
     assert ran.exit_code == 0, ran.output
     stats = pd.read_parquet(tmp_path / "stats.parquet")
     assert list(stats["contrast"]) == ["fast - control"]
@@ -48,8 +50,12 @@ def test_the_usual_measures_are_those_with_values(study, tmp_path):
 
 def test_a_list_of_the_animals_overrules_the_sessions(study, tmp_path):
     table = tmp_path / "animals.csv"
-    table.write_text("subject_id,group,cage\n" + "".join(f"m{k},{'ab'[k % 2]},c{k // 2}\n" for k in range(10)))
-    row = compare_sessions([study], tmp_path / "out", ["distance_m"], animals=table)["stats"].iloc[0]
+    table.write_text(
+        "subject_id,group,cage\n" + "".join(f"m{k},{'ab'[k % 2]},c{k // 2}\n" for k in range(10))
+    )
+    row = compare_sessions([study], tmp_path / "out", ["distance_m"], animals=table)["stats"].iloc[
+        0
+    ]
     assert row["contrast"] == "b - a"
     # every cage holds one of each, so only those two change places
     assert "5 against 5 animals within their blocks can be arranged in 32 ways" in row["refused"]

@@ -122,7 +122,9 @@ def test_finer_steps_than_a_millimetre_are_found(tmp_path: Path, step_mm: float)
         np.testing.assert_array_equal([f.depth for f in after], [f.depth for f in before])
 
 
-def test_depth_that_16_bits_do_not_keep_is_refused_rounded_or_kept_as_floats(tmp_path: Path) -> None:
+def test_depth_that_16_bits_do_not_keep_is_refused_rounded_or_kept_as_floats(
+    tmp_path: Path,
+) -> None:
     source = float_pictures(tmp_path / "r", None)
     for target in ("new", "new.oni"):
         with pytest.raises(RecordingError, match=r"--step-mm 0\.1"):
@@ -130,7 +132,9 @@ def test_depth_that_16_bits_do_not_keep_is_refused_rounded_or_kept_as_floats(tmp
         done = convert(source, tmp_path / target, step_mm=0.1)
         assert any("rounded to whole steps of 0.1 mm" in note for note in done.notes)
         with open_recording(source) as before, open_recording(tmp_path / target) as after:
-            np.testing.assert_allclose([f.depth for f in after], [f.depth for f in before], atol=0.0501)
+            np.testing.assert_allclose(
+                [f.depth for f in after], [f.depth for f in before], atol=0.0501
+            )
     done = convert(source, tmp_path / "new.mcap")
     assert any("32-bit metres" in note for note in done.notes)
     with open_recording(source) as before, open_recording(tmp_path / "new.mcap") as after:
@@ -154,14 +158,22 @@ def test_what_is_whole_of_a_cut_recording_is_written_and_told(tmp_path: Path) ->
 def test_nothing_is_overwritten_unasked(tmp_path: Path, target: str) -> None:
     source = write_moseq_folder(tmp_path / "m", depth_frames(2, 512, 424))
     convert(source, tmp_path / target)
-    before = {name: (tmp_path / name).read_bytes() for name in listing(tmp_path) if (tmp_path / name).is_file()}
+    before = {
+        name: (tmp_path / name).read_bytes()
+        for name in listing(tmp_path)
+        if (tmp_path / name).is_file()
+    }
     with pytest.raises(RecordingError, match="--overwrite"):
         convert(source, tmp_path / target)
     other = write_png_folder(tmp_path / "other", STORED)
     convert(other, tmp_path / target, overwrite=True)
     with open_recording(tmp_path / target) as recording:
         assert len(recording) == 12
-    assert all((tmp_path / name).read_bytes() == data for name, data in before.items() if not name.startswith("new"))
+    assert all(
+        (tmp_path / name).read_bytes() == data
+        for name, data in before.items()
+        if not name.startswith("new")
+    )
 
 
 def test_a_folder_with_anything_else_in_it_is_never_replaced(tmp_path: Path) -> None:
@@ -185,7 +197,9 @@ def test_a_folder_with_anything_else_in_it_is_never_replaced(tmp_path: Path) -> 
         ("r.mcap", "is the recording itself"),
     ],
 )
-def test_a_target_that_cannot_be_is_told_before_anything_is_read(tmp_path: Path, target: str, says: str) -> None:
+def test_a_target_that_cannot_be_is_told_before_anything_is_read(
+    tmp_path: Path, target: str, says: str
+) -> None:
     (tmp_path / "folder.mcap").mkdir()
     (tmp_path / "file").write_text("")
     source = write_mcap(tmp_path / "r.mcap", STORED)
@@ -194,7 +208,9 @@ def test_a_target_that_cannot_be_is_told_before_anything_is_read(tmp_path: Path,
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_nothing_half_written_stays_behind(tmp_path: Path, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_half_written_stays_behind(
+    tmp_path: Path, target: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = write_mcap(tmp_path / "r.mcap", STORED)
 
     def interrupted(done: int, total: int | None, what: str) -> None:
@@ -214,7 +230,15 @@ def test_a_full_disk_is_a_sentence_and_leaves_nothing(tmp_path: Path, target: st
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, 9_000))
 
-    command = [sys.executable, "-m", "liex_lab", "convert", str(source), "--to", str(tmp_path / target)]
+    command = [
+        sys.executable,
+        "-m",
+        "liex_lab",
+        "convert",
+        str(source),
+        "--to",
+        str(tmp_path / target),
+    ]
     ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=bounded)
     assert ran.returncode == 1, ran.stderr
     assert len(ran.stderr.strip().splitlines()) == 1

@@ -32,7 +32,11 @@ MOUSE = WalkingMouse(np.arange(180) / 30.0, rear_s=(2.0, 3.5), lost=(20, 21))
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    return write(tmp_path_factory.mktemp("measured") / "circle.liex", MOUSE, plan_toml=Plan.load("mouse").to_toml())
+    return write(
+        tmp_path_factory.mktemp("measured") / "circle.liex",
+        MOUSE,
+        plan_toml=Plan.load("mouse").to_toml(),
+    )
 
 
 @pytest.fixture
@@ -46,18 +50,29 @@ def corrected(session: Session, *what: Correction, undo: Sequence[int] = ()) -> 
 
 def spans(session: Session) -> list[tuple[str, float, float, str]]:
     rows = session.bouts[["action", "start_s", "stop_s", "source"]].to_dict("records")
-    return [(str(b["action"]), round(b["start_s"], 3), round(b["stop_s"], 3), str(b["source"])) for b in rows]
+    return [
+        (str(b["action"]), round(b["start_s"], 3), round(b["stop_s"], 3), str(b["source"]))
+        for b in rows
+    ]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file() and p.name != "report.html"}
+    return {
+        p.name: p.read_bytes() for p in folder.iterdir() if p.is_file() and p.name != "report.html"
+    }
 
 
-def test_a_bout_is_renamed_recut_deleted_and_added_and_every_table_follows(session: Session) -> None:
+def test_a_bout_is_renamed_recut_deleted_and_added_and_every_table_follows(
+    session: Session,
+) -> None:
     before = contents(session.path)
     one = corrected(session, ask.recut_bout(session, 2.5, 2.2, 3.0))
     assert ("rear", 2.2, 3.0, "human") in spans(one)
-    two = corrected(one, ask.rename_bout(one, 2.5, "stretch_attend", new_word=True), ask.add_bout(one, "run", 4.0, 4.5))
+    two = corrected(
+        one,
+        ask.rename_bout(one, 2.5, "stretch_attend", new_word=True),
+        ask.add_bout(one, "run", 4.0, 4.5),
+    )
     assert ("stretch_attend", 2.2, 3.0, "human") in spans(two)
     assert not (two.bouts["action"] == "rear").any()
     assert {"stretch_attend", "run"} <= set(two.metadata["actions"])
@@ -72,15 +87,23 @@ def test_a_bout_is_renamed_recut_deleted_and_added_and_every_table_follows(sessi
     assert contents(session.path) == before, "the session's own files are as they were"
 
 
-def test_a_joint_that_is_moved_takes_the_chain_along_and_bones_keep_their_lengths(session: Session) -> None:
-    row, target = 100, session.poses.loc[100 * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float) + np.array([0, 0, 12.0])
+def test_a_joint_that_is_moved_takes_the_chain_along_and_bones_keep_their_lengths(
+    session: Session,
+) -> None:
+    row, target = (
+        100,
+        session.poses.loc[100 * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        + np.array([0, 0, 12.0]),
+    )
     found = corrected(session, ask.joint_move(session, row, "nose", target))
     was, now = track_of(session), track_of(found)
     assert np.linalg.norm(now.joints_mm[row, -1] - target) < 1.0
     others = np.delete(np.arange(180), row)
     np.testing.assert_array_equal(now.joints_mm[others], was.joints_mm[others])
     bones = np.linalg.norm(np.diff(now.joints_mm[row], axis=0), axis=1)
-    np.testing.assert_allclose(bones, np.linalg.norm(np.diff(was.joints_mm[row], axis=0), axis=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        bones, np.linalg.norm(np.diff(was.joints_mm[row], axis=0), axis=1), rtol=1e-9
+    )
     pose = Pose(now.root, now.angles_rad, now.scale)[np.array([row])]
     np.testing.assert_allclose(pose.joints(now.skeleton)[0], now.joints_mm[row], atol=1e-6)
     in_camera = found.T_arena_camera.inverse() @ now.joints_mm[row]
@@ -94,18 +117,28 @@ def test_a_joint_that_is_moved_takes_the_chain_along_and_bones_keep_their_length
     assert raised == pytest.approx(12.0, abs=1.0)
 
 
-def test_a_joint_under_a_pixel_lies_as_deep_under_the_skin_as_it_usually_does(session: Session) -> None:
+def test_a_joint_under_a_pixel_lies_as_deep_under_the_skin_as_it_usually_does(
+    session: Session,
+) -> None:
     row, chest = 60, 60 * 5 + 2
     uv = session.poses.loc[chest, ["u_px", "v_px"]].to_numpy(float)
     move = ask.joint_move_at_pixel(session, row, "chest", float(uv[0]), float(uv[1]))
     where = session.poses.loc[chest, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    assert np.linalg.norm(np.array([move.x_mm, move.y_mm, move.z_mm]) - where) < 6.0  # the pixels are 7 mm wide
+    assert (
+        np.linalg.norm(np.array([move.x_mm, move.y_mm, move.z_mm]) - where) < 6.0
+    )  # the pixels are 7 mm wide
 
 
-def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(session: Session) -> None:
+def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(
+    session: Session,
+) -> None:
     raw = session.poses
     place = raw.loc[4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    found = corrected(session, ask.joint_move(session, 0, "nose", place + 5.0), ask.add_bout(session, "run", 4.0, 4.5))
+    found = corrected(
+        session,
+        ask.joint_move(session, 0, "nose", place + 5.0),
+        ask.add_bout(session, "run", 4.0, 4.5),
+    )
     assert not found.poses.equals(raw)
     pd.testing.assert_frame_equal(Session.open(session.path, raw=True).poses, raw)
     back = corrected(found, undo=[1, 2])
@@ -113,13 +146,21 @@ def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(s
     pd.testing.assert_frame_equal(back.bouts, session.bouts)
     log = json.loads((session.path / "corrected" / "corrections.json").read_text())
     assert [(e["number"], e["kind"], e["author"]) for e in log["entries"]] == [
-        (1, "joint", "ada"), (2, "bout", "ada"), (3, "undo", "ada"), (4, "undo", "ada")]  # fmt: skip
+        (1, "joint", "ada"),
+        (2, "bout", "ada"),
+        (3, "undo", "ada"),
+        (4, "undo", "ada"),
+    ]
     assert all(e["made_at"].startswith("20") for e in log["entries"])
-    with pytest.raises(SessionError, match="there is no correction 1 to take back; those that stand are none"):
+    with pytest.raises(
+        SessionError, match="there is no correction 1 to take back; those that stand are none"
+    ):
         corrected(back, undo=[1])
 
 
-def test_an_edit_of_bouts_alone_leaves_no_copy_of_the_poses_and_measures_as_the_run_did(session: Session) -> None:
+def test_an_edit_of_bouts_alone_leaves_no_copy_of_the_poses_and_measures_as_the_run_did(
+    session: Session,
+) -> None:
     found = corrected(session, ask.rename_bout(session, 2.5, "rear"))  # which confirms it
     names = {path.name for path in (session.path / "corrected").iterdir()}
     assert "poses.parquet" not in names
@@ -129,7 +170,9 @@ def test_an_edit_of_bouts_alone_leaves_no_copy_of_the_poses_and_measures_as_the_
     pd.testing.assert_frame_equal(found.summary, session.summary)
 
 
-def test_a_corrected_session_is_no_damaged_one_and_damage_to_its_corrections_is_told(session: Session) -> None:
+def test_a_corrected_session_is_no_damaged_one_and_damage_to_its_corrections_is_told(
+    session: Session,
+) -> None:
     corrected(session, ask.add_bout(session, "run", 4.0, 4.5))
 
     def said() -> list[tuple[str, str]]:
@@ -138,12 +181,20 @@ def test_a_corrected_session_is_no_damaged_one_and_damage_to_its_corrections_is_
     assert not [sentence for state, sentence in said() if state == "wrong"]
     assert any("1 corrections (ada) stand beside it" in sentence for _, sentence in said())
     (session.path / "corrected" / "bouts.parquet").write_bytes(b"PAR1")
-    assert any(state == "wrong" and "bouts.parquet was changed" in sentence for state, sentence in said())
+    assert any(
+        state == "wrong" and "bouts.parquet was changed" in sentence for state, sentence in said()
+    )
     correct_session(session.path)  # makes them again
     assert not [sentence for state, sentence in said() if state == "wrong"]
     log = session.path / "corrected" / "corrections.json"
     whole = json.loads(log.read_text())
-    wrong = {"facts": {"frames": {"n_frames": "x"}}, "entries": [7], "files": None, "schema_version": 1e999, "sum": "0"}
+    wrong = {
+        "facts": {"frames": {"n_frames": "x"}},
+        "entries": [7],
+        "files": None,
+        "schema_version": 1e999,
+        "sum": "0",
+    }
     for name, value in wrong.items():
         log.write_text(json.dumps({**whole, name: value}))
         with pytest.raises(SessionError, match="is damaged"):
@@ -205,14 +256,23 @@ MISTAKES: dict[str, tuple[Callable[[Session], object], str]] = {
     "no word": (lambda s: ask.add_bout(s, "  ", 1.0, 2.0), "an action is a word"),
     "a span backwards": (lambda s: ask.add_bout(s, "rear", 2.0, 1.0), "from a time to a later one"),
     "no time": (lambda s: ask.add_bout(s, "rear", float("nan"), 1.0), "from a time to a later one"),
-    "no bout there": (lambda s: ask.rename_bout(s, 99.0, "rear"), r"no bout holds 99 s; the nearest are"),
+    "no bout there": (
+        lambda s: ask.rename_bout(s, 99.0, "rear"),
+        r"no bout holds 99 s; the nearest are",
+    ),
     "no such frame": (lambda s: ask.joint_move(s, 999, "nose", [0, 0, 0]), "there is no frame 999"),
     "no such joint": (lambda s: ask.joint_move(s, 1, "snout", [0, 0, 0]), "known are rump"),
     "no pose": (lambda s: ask.joint_move(s, 20, "nose", [0, 0, 0]), "frame 20 has no pose"),
     "far away": (lambda s: ask.joint_move(s, 1, "nose", [900, 0, 0]), "the animal is 90 mm long"),
     "no place": (lambda s: ask.joint_move(s, 1, "nose", [1, 2]), "x, y and z in mm"),
-    "beside the picture": (lambda s: ask.joint_move_at_pixel(s, 1, "nose", -3, 5), "a pixel is a column and a row"),
-    "no frames": (lambda s: ask.flip_span(s, 50, 60), "a span to flip is from a time to a later one"),
+    "beside the picture": (
+        lambda s: ask.joint_move_at_pixel(s, 1, "nose", -3, 5),
+        "a pixel is a column and a row",
+    ),
+    "no frames": (
+        lambda s: ask.flip_span(s, 50, 60),
+        "a span to flip is from a time to a later one",
+    ),
     "nothing to do again": (lambda s: correct_session(s.path), "has no corrections to apply"),
 }
 
@@ -233,11 +293,17 @@ def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> Non
         return ran.output
 
     place = session.path
-    assert "corrected: rear of" in liex("bout", place, "--at", 2.5, "--action", "run", "--by", "ada")
+    assert "corrected: rear of" in liex(
+        "bout", place, "--at", 2.5, "--action", "run", "--by", "ada"
+    )
     x, y, z = session.poses.loc[24, ["x_mm", "y_mm", "z_mm"]] + 4.0
-    assert "corrected: nose of frame 4" in liex("joint", place, "--frame", 4, "--joint", "nose", "--to-mm", x, y, z)
+    assert "corrected: nose of frame 4" in liex(
+        "joint", place, "--frame", 4, "--joint", "nose", "--to-mm", x, y, z
+    )
     labels = place.parent / "labels.csv"
-    pd.DataFrame({"action": ["stroll"], "start_s": [1.0], "stop_s": [2.0]}).to_csv(labels, index=False)
+    pd.DataFrame({"action": ["stroll"], "start_s": [1.0], "stop_s": [2.0]}).to_csv(
+        labels, index=False
+    )
     liex("bout", place, "--labels", labels)
     assert spans(Session.open(place)) == [("stroll", 1.0, 2.0, "human")]
     liex("undo", place, 3, 4, 5)
@@ -246,7 +312,9 @@ def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> Non
     assert listed.count("taken back") >= 3
     assert "run" in set(Session.open(place).bouts["action"])
     liex("redo", place)
-    assert "corrections were made by hand by ada" in (place / "report.html").read_text(encoding="utf-8")
+    assert "corrections were made by hand by ada" in (place / "report.html").read_text(
+        encoding="utf-8"
+    )
     for words in (("bout", place, "--at", 2.5), ("joint", place, "--frame", 4, "--joint", "nose")):
         with pytest.raises(LiexError, match=r"one edit at a time|given in one way"):
             liex(*words)

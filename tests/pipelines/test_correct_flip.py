@@ -28,7 +28,9 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 @pytest.fixture(scope="module")
 def flipped(tracked: Session, tmp_path_factory: pytest.TempPathFactory) -> Session:
-    folder = Path(shutil.copytree(tracked.path, tmp_path_factory.mktemp("flipped") / tracked.path.name))
+    folder = Path(
+        shutil.copytree(tracked.path, tmp_path_factory.mktemp("flipped") / tracked.path.name)
+    )
     return Session.open(correct_session(folder, [flip_span(tracked, FROM_S, TO_S)]))
 
 
@@ -58,7 +60,9 @@ def test_every_table_follows(tracked, flipped):
     assert (row.start_frame, row.stop_frame, row.applied) == (SPAN.start, SPAN.stop, True)
 
 
-def test_what_was_measured_is_as_it_was_and_the_correction_can_be_taken_back(tracked, flipped, tmp_path):
+def test_what_was_measured_is_as_it_was_and_the_correction_can_be_taken_back(
+    tracked, flipped, tmp_path
+):
     folder = Path(shutil.copytree(flipped.path, tmp_path / flipped.path.name))
     pd.testing.assert_frame_equal(Session.open(folder, raw=True).poses, tracked.poses)
     assert (folder / "poses.parquet").read_bytes() == (tracked.path / "poses.parquet").read_bytes()

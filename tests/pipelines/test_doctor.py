@@ -33,11 +33,38 @@ from tests.recordings.writers import (
 )
 
 KEYS = [
-    "format", "n_frames", "duration_s", "rate_hz", "jitter_ms", "n_gaps", "n_missing", "n_time_faults", "width",
-    "height", "fx", "fy", "cx", "cy", "intrinsics_source", "distortion", "water", "depth_min_mm", "depth_max_mm",
-    "unread_share", "floor_unread_share", "noise_mm", "floor_mm", "floor_tilt_rad", "water_depth_mm", "arena",
-    "animal_length_mm", "animal_area_mm2", "animal_share", "animal_sits_still", "problems",
-]  # fmt: skip
+    "format",
+    "n_frames",
+    "duration_s",
+    "rate_hz",
+    "jitter_ms",
+    "n_gaps",
+    "n_missing",
+    "n_time_faults",
+    "width",
+    "height",
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "intrinsics_source",
+    "distortion",
+    "water",
+    "depth_min_mm",
+    "depth_max_mm",
+    "unread_share",
+    "floor_unread_share",
+    "noise_mm",
+    "floor_mm",
+    "floor_tilt_rad",
+    "water_depth_mm",
+    "arena",
+    "animal_length_mm",
+    "animal_area_mm2",
+    "animal_share",
+    "animal_sits_still",
+    "problems",
+]
 CAMERA = Camera(140.0, 141.0, 79.5, 59.5, 160, 120)
 
 
@@ -58,10 +85,19 @@ def problems(path: Path, *settings: str) -> str:
     return " | ".join(examined(path, *settings)["problems"])
 
 
-def plates(folder: Path, plates: list[Plate], water: Water | None = None, camera: Camera = CAMERA, **more: Any) -> Path:
+def plates(
+    folder: Path,
+    plates: list[Plate],
+    water: Water | None = None,
+    camera: Camera = CAMERA,
+    **more: Any,
+) -> Path:
     """A recording of a square plate that goes from place to place, with a little noise."""
     rng = np.random.default_rng(0)
-    pictures = [plate.depth(camera, water) + rng.normal(0, 0.7, (camera.height, camera.width)) for plate in plates]
+    pictures = [
+        plate.depth(camera, water) + rng.normal(0, 0.7, (camera.height, camera.width))
+        for plate in plates
+    ]
     return write_png_folder(folder, np.rint(pictures).astype(np.uint16), camera, **more)
 
 
@@ -71,8 +107,18 @@ def walk(side_mm: float = 60.0, floor_mm: float = 600.0, n: int = 20) -> list[Pl
 
 def test_a_sound_recording_has_its_facts_told_and_no_problem(tmp_path: Path) -> None:
     findings = examined(write_mcap(tmp_path / "r.mcap", frames(), CAMERA))
-    assert (findings["format"], findings["n_frames"], findings["n_gaps"], findings["n_missing"]) == ("mcap", 12, 0, 0)
-    assert (findings["width"], findings["height"], findings["fx"], findings["cy"]) == (160, 120, 140.0, 59.5)
+    assert (
+        findings["format"],
+        findings["n_frames"],
+        findings["n_gaps"],
+        findings["n_missing"],
+    ) == ("mcap", 12, 0, 0)
+    assert (findings["width"], findings["height"], findings["fx"], findings["cy"]) == (
+        160,
+        120,
+        140.0,
+        59.5,
+    )
     assert findings["rate_hz"] == pytest.approx(30, rel=1e-4)
     assert findings["duration_s"] == pytest.approx(11 / 30, rel=1e-4)
     assert findings["jitter_ms"] == pytest.approx(0, abs=1e-3)
@@ -81,7 +127,11 @@ def test_a_sound_recording_has_its_facts_told_and_no_problem(tmp_path: Path) -> 
     assert findings["floor_mm"] == pytest.approx(700, abs=1)
     assert findings["floor_tilt_rad"] == pytest.approx(0, abs=0.01)
     assert findings["intrinsics_source"] == "CameraCalibration on /camera/calibration"
-    assert (findings["distortion"], findings["water"], findings["water_depth_mm"]) == (None, None, None)
+    assert (findings["distortion"], findings["water"], findings["water_depth_mm"]) == (
+        None,
+        None,
+        None,
+    )
     assert findings["arena"]["kind"] == "open"
     assert findings["problems"] == []
 
@@ -120,7 +170,9 @@ def test_an_empty_arena_is_told(tmp_path: Path) -> None:
 
 
 def test_a_slip_in_the_zones_is_told(tmp_path: Path) -> None:
-    (tmp_path / "zones.toml").write_text('[[zones]]\nname = "a"\ncircle = { centre = [0, 0], radius = -1 }')
+    (tmp_path / "zones.toml").write_text(
+        '[[zones]]\nname = "a"\ncircle = { centre = [0, 0], radius = -1 }'
+    )
     path = plates(tmp_path / "r", walk(60.0))
     assert "a positive number, got -1" in problems(path, f"arena.zones={tmp_path / 'zones.toml'}")
     assert "there is no file" in problems(path, "arena.zones=none.toml")
@@ -143,7 +195,9 @@ def test_what_the_clock_did_is_told(tmp_path: Path) -> None:
     assert (findings["n_gaps"], findings["n_time_faults"]) == (0, 2)
     told = " ".join(findings["problems"])
     assert "1 of 30 are repeated or out of order" in told
-    assert "the camera was stopped, or its clock set, in 1 places, the first before frame 15" in told
+    assert (
+        "the camera was stopped, or its clock set, in 1 places, the first before frame 15" in told
+    )
 
 
 def test_a_primesense_recording_says_where_its_intrinsics_come_from(tmp_path: Path) -> None:
@@ -167,7 +221,10 @@ def test_dropped_frames_are_counted(tmp_path: Path) -> None:
     path = write_png_folder(tmp_path / "r", frames(), CAMERA, times)
     findings = examined(path)
     assert findings["n_gaps"] == 1
-    assert "left out about 3 frames (20.0%) in 1 gap; the longest time between two frames is 0.13 s" in problems(path)
+    assert (
+        "left out about 3 frames (20.0%) in 1 gap; the longest time between two frames is 0.13 s"
+        in problems(path)
+    )
 
 
 def test_guesses_are_told(tmp_path: Path) -> None:
@@ -192,7 +249,9 @@ def test_unread_pixels_count_where_the_animal_can_be(tmp_path: Path) -> None:
     beside[:, :60] = 0
     among[np.random.default_rng(0).random(among.shape) < 0.3] = 0
     assert "unread" not in problems(write_png_folder(tmp_path / "r", beside, CAMERA))
-    assert "of the pixels on the floor are unread" in problems(write_png_folder(tmp_path / "s", among, CAMERA))
+    assert "of the pixels on the floor are unread" in problems(
+        write_png_folder(tmp_path / "s", among, CAMERA)
+    )
 
 
 def test_a_lens_that_is_bent_is_told_and_undone(tmp_path: Path) -> None:
@@ -240,7 +299,9 @@ def test_a_camera_that_looks_from_the_side_is_told(tmp_path: Path) -> None:
     pictures = np.repeat(np.rint(floor.depth(160, 120))[None], 6, axis=0).astype(np.uint16)
     findings = examined(write_png_folder(tmp_path / "r", pictures, CAMERA))
     assert findings["floor_tilt_rad"] == pytest.approx(0.4, abs=0.01)
-    assert any("looks down at 23 degrees from straight" in problem for problem in findings["problems"])
+    assert any(
+        "looks down at 23 degrees from straight" in problem for problem in findings["problems"]
+    )
 
 
 def test_a_noisy_camera_is_told(tmp_path: Path) -> None:
@@ -251,8 +312,14 @@ def test_a_noisy_camera_is_told(tmp_path: Path) -> None:
 
 
 def test_a_recording_of_nothing_has_no_numbers_but_a_sentence(tmp_path: Path) -> None:
-    findings = examined(write_png_folder(tmp_path / "r", np.zeros((3, 120, 160), np.uint16), CAMERA))
-    assert (findings["depth_min_mm"], findings["depth_max_mm"], findings["floor_mm"]) == (None, None, None)
+    findings = examined(
+        write_png_folder(tmp_path / "r", np.zeros((3, 120, 160), np.uint16), CAMERA)
+    )
+    assert (findings["depth_min_mm"], findings["depth_max_mm"], findings["floor_mm"]) == (
+        None,
+        None,
+        None,
+    )
     assert any("none of the 3 frames" in problem for problem in findings["problems"])
 
 
@@ -265,7 +332,12 @@ def test_empty_frames_are_counted_apart_from_unread_pixels(tmp_path: Path) -> No
 
 
 def test_where_no_floor_is_it_says_so(tmp_path: Path) -> None:
-    rough = np.random.default_rng(0).integers(400, 4000, (1, 120, 160)).repeat(4, axis=0).astype(np.uint16)
+    rough = (
+        np.random.default_rng(0)
+        .integers(400, 4000, (1, 120, 160))
+        .repeat(4, axis=0)
+        .astype(np.uint16)
+    )
     findings = examined(write_png_folder(tmp_path / "r", rough, CAMERA))
     assert findings["floor_mm"] is None
     assert any("no floor" in problem for problem in findings["problems"])

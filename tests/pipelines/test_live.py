@@ -29,7 +29,10 @@ def test_a_replay_sends_every_frame_as_it_is_and_not_before_its_time():
     came = list(arriving.frames)
     assert [arrival.frame.time_ns for arrival in came] == recording.times_ns.tolist()
     np.testing.assert_array_equal(came[7].frame.depth, recording.frame(7).depth)
-    assert came[-1].at_s - came[0].at_s > 0.8 * (recording.times_ns[-1] - recording.times_ns[0]) * 1e-9 / 8.0
+    assert (
+        came[-1].at_s - came[0].at_s
+        > 0.8 * (recording.times_ns[-1] - recording.times_ns[0]) * 1e-9 / 8.0
+    )
 
 
 def test_skeletons_are_told_as_frames_come_and_the_whole_track_at_the_end():
@@ -44,7 +47,9 @@ def test_skeletons_are_told_as_frames_come_and_the_whole_track_at_the_end():
             closed.append(True)
 
     # long enough that the mouse leaves the place where it stood when the background was learned
-    arriving = open_live("synthetic:walk?seed=3&frames=48&sensor=kinect-v2&spine_mm=70", PLAN, replay=True)
+    arriving = open_live(
+        "synthetic:walk?seed=3&frames=48&sensor=kinect-v2&spine_mm=70", PLAN, replay=True
+    )
     numbers, tracked = follow_live(arriving, PLAN, learn_frames=36, viewer=lambda *_: View())
     assert closed == [True]
     assert [index for index, _ in shown] == list(range(48))
@@ -60,8 +65,13 @@ def test_a_recording_that_grows_is_read_as_it_grows_and_over_when_nothing_comes(
 
     def reopen() -> Recording:
         n = there[0]
-        return Recording(name="growing", format="test", camera=whole.camera, times_ns=whole.times_ns[:n],
-                         read=lambda index: whole.frame(index).depth)  # fmt: skip
+        return Recording(
+            name="growing",
+            format="test",
+            camera=whole.camera,
+            times_ns=whole.times_ns[:n],
+            read=lambda index: whole.frame(index).depth,
+        )
 
     def write() -> None:
         for n in (5, 9, 12):
@@ -109,13 +119,22 @@ def test_a_first_frame_that_is_long_in_the_making_ends_nothing(monkeypatch):
             time.sleep(0.5)
         return whole.frame(index).depth
 
-    slow = Recording(name="slow", format="test", camera=whole.camera, times_ns=whole.times_ns[:5].copy(), read=read)
+    slow = Recording(
+        name="slow",
+        format="test",
+        camera=whole.camera,
+        times_ns=whole.times_ns[:5].copy(),
+        read=read,
+    )
     came = list(replayed(slow, speed=4.0).frames)
     assert [arrival.frame.index for arrival in came] == list(range(5))
     assert came[-1].at_s - came[0].at_s > 0.8 * slow.duration_s / 4.0, "nor is its pace lost"
 
 
 def test_frames_go_to_and_fro_and_keep_the_time_when_they_came():
-    frames = [Arrival(DepthFrame(k, k, np.zeros((2, 2), np.float32)), at) for k, at in enumerate((0.0, 0.1, 0.2))]
+    frames = [
+        Arrival(DepthFrame(k, k, np.zeros((2, 2), np.float32)), at)
+        for k, at in enumerate((0.0, 0.1, 0.2))
+    ]
     assert [_to_and_fro(k, 3) for k in range(8)] == [0, 1, 2, 2, 1, 0, 0, 1]
     assert [arrival.at_s for arrival in _stamped(iter(frames))] == [0.0, 0.1, 0.2]

@@ -49,7 +49,9 @@ def times_ns() -> list[int]:
 
 @pytest.fixture(scope="module")
 def folder(mouse, pictures, times_ns, tmp_path_factory):
-    return write_png_folder(tmp_path_factory.mktemp("recording") / "walk", pictures, mouse.camera, times_ns)
+    return write_png_folder(
+        tmp_path_factory.mktemp("recording") / "walk", pictures, mouse.camera, times_ns
+    )
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,9 @@ def test_every_delivered_frame_is_a_row_of_every_table(session, times_ns):
     assert (len(session.poses), len(session.rotations)) == (n * n_joints, n * (n_joints + 1))
     assert session.frames["frame_index"].tolist() == list(range(n))
     assert session.frames["time_ns"].tolist() == times_ns
-    np.testing.assert_allclose(session.frames["time_s"], (KEPT - KEPT[0]) * FRAME_NS * 1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        session.frames["time_s"], (KEPT - KEPT[0]) * FRAME_NS * 1e-9, atol=1e-9
+    )
 
 
 def test_no_frame_is_lost_without_a_flag(session):
@@ -102,7 +106,9 @@ def test_joints_are_near_the_truth(session, mouse):
     assert np.nanquantile(error, 0.9) < 12.0
     inside = np.linalg.norm(joints_of(session) - mouse.joints_arena[KEPT], axis=-1).mean(axis=1)
     assert np.nanmedian(inside) < 7.0  # the arena frame itself is measured, too
-    forward, true_forward = (joints[:, 4] - joints[:, 0] for joints in (in_camera, mouse.joints_camera[KEPT]))
+    forward, true_forward = (
+        joints[:, 4] - joints[:, 0] for joints in (in_camera, mouse.joints_camera[KEPT])
+    )
     agreement = np.sum(forward * true_forward, axis=1)
     assert (agreement[np.isfinite(agreement)] > 0).all()
 
@@ -111,7 +117,9 @@ def test_the_animals_size_and_the_floor_are_measured(session, mouse):
     animal = session.metadata["animal"]
     assert animal["spine_mm"] == pytest.approx(SPINE_MM, rel=0.12)
     assert np.nanmedian(session.frames["spine_mm"]) == pytest.approx(SPINE_MM, rel=0.12)
-    assert session.metadata["camera"]["floor_distance_mm"] == pytest.approx(mouse.floor.distance_mm, abs=5.0)
+    assert session.metadata["camera"]["floor_distance_mm"] == pytest.approx(
+        mouse.floor.distance_mm, abs=5.0
+    )
     assert np.nanmedian(session.frames["residual_mm"]) < 5.0
 
 
@@ -119,30 +127,43 @@ def test_gaps_are_kept(session):
     dropped = session.gaps[session.gaps["reason"] == "camera_dropped"]
     assert dropped["n_frames_missing"].tolist() == [2, 1]
     assert dropped["start_frame"].tolist() == [15, 29]
-    np.testing.assert_allclose(dropped["stop_s"], [17 * FRAME_NS * 1e-9, 32 * FRAME_NS * 1e-9], atol=1e-9)
+    np.testing.assert_allclose(
+        dropped["stop_s"], [17 * FRAME_NS * 1e-9, 32 * FRAME_NS * 1e-9], atol=1e-9
+    )
     blank = session.gaps[session.gaps["reason"] == "no_depth"]
-    assert blank[["start_frame", "stop_frame", "n_frames_missing"]].to_numpy().tolist() == [[BLANK, BLANK + 1, 1]]
+    assert blank[["start_frame", "stop_frame", "n_frames_missing"]].to_numpy().tolist() == [
+        [BLANK, BLANK + 1, 1]
+    ]
     assert session.frames["gap_before"][[15, 29]].tolist() == [2, 1]
     assert session.frames["gap_before"].sum() == 3
 
 
 def test_running_again_gives_the_same_tables_byte_for_byte(session, folder, tmp_path):
-    assert tables_of(Session.open(run_session(folder, Plan.load("mouse"), tmp_path))) == tables_of(session)
+    assert tables_of(Session.open(run_session(folder, Plan.load("mouse"), tmp_path))) == tables_of(
+        session
+    )
 
 
 @pytest.mark.parametrize("chunk", [7])
-def test_tables_do_not_depend_on_how_many_frames_are_in_memory(session, folder, tmp_path, monkeypatch, chunk):
+def test_tables_do_not_depend_on_how_many_frames_are_in_memory(
+    session, folder, tmp_path, monkeypatch, chunk
+):
     monkeypatch.setattr(job, "CHUNK", chunk)
-    assert tables_of(Session.open(run_session(folder, Plan.load("mouse"), tmp_path))) == tables_of(session)
+    assert tables_of(Session.open(run_session(folder, Plan.load("mouse"), tmp_path))) == tables_of(
+        session
+    )
 
 
 def test_the_same_frames_give_the_same_poses_from_a_recording_that_is_open_already(
     session, mouse, pictures, times_ns, tmp_path
 ):
     opened = Recording(
-        name="walk", format="images", camera=mouse.camera, times_ns=np.array(times_ns),
+        name="walk",
+        format="images",
+        camera=mouse.camera,
+        times_ns=np.array(times_ns),
         read=lambda k: pictures[k].astype(np.float32),
-    )  # fmt: skip
+    )
     again = Session.open(run_session(opened, out=tmp_path))
     for name in TABLES:
         pd.testing.assert_frame_equal(again.table(name), session.table(name))
@@ -171,7 +192,9 @@ def test_an_accident_midway_leaves_no_folder(folder, tmp_path, monkeypatch):
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_an_accident_midway_leaves_an_older_session_as_it_was(session, folder, tmp_path, monkeypatch):
+def test_an_accident_midway_leaves_an_older_session_as_it_was(
+    session, folder, tmp_path, monkeypatch
+):
     path = shutil.copytree(session.path, tmp_path / "walk.liex")
     monkeypatch.setattr(FrameTracker, "observe", lambda self, frames: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -180,15 +203,21 @@ def test_an_accident_midway_leaves_an_older_session_as_it_was(session, folder, t
     assert [entry.name for entry in tmp_path.iterdir()] == ["walk.liex"]
 
 
-def test_an_older_session_is_replaced_only_on_demand_and_that_is_said_at_once(session, folder, monkeypatch):
-    monkeypatch.setattr(job, "build_tracker", lambda *_: pytest.fail("minutes of work before the refusal"))
+def test_an_older_session_is_replaced_only_on_demand_and_that_is_said_at_once(
+    session, folder, monkeypatch
+):
+    monkeypatch.setattr(
+        job, "build_tracker", lambda *_: pytest.fail("minutes of work before the refusal")
+    )
     with pytest.raises(SessionError, match="overwrite"):
         run_session(folder, Plan.load("mouse"), session.path.parent)
 
 
 def test_a_recording_without_an_animal_is_refused_and_leaves_nothing(mouse, tmp_path):
     rng = np.random.default_rng(1)
-    bare = mouse.floor.depth(mouse.width, mouse.height) + rng.normal(0, 1, (12, mouse.height, mouse.width))
+    bare = mouse.floor.depth(mouse.width, mouse.height) + rng.normal(
+        0, 1, (12, mouse.height, mouse.width)
+    )
     folder = write_png_folder(tmp_path / "bare", bare.astype(np.uint16), mouse.camera)
     with pytest.raises(EstimationError, match="no animal was found") as error:
         run_session(folder, Plan.load("mouse"), tmp_path / "out")
@@ -207,13 +236,17 @@ def test_zones_are_drawn_in_a_file_that_the_plan_names(folder, session, tmp_path
         name = "east"
         polygon = [[0, -2000], [2000, -2000], [2000, 2000], [0, 2000]]
     """)
-    again = Session.open(run_session(folder, Plan.load("mouse").with_settings([f"arena.zones={drawn}"]), tmp_path))
+    again = Session.open(
+        run_session(folder, Plan.load("mouse").with_settings([f"arena.zones={drawn}"]), tmp_path)
+    )
     x = again.frames["centroid_x_mm"]
     expected = np.where(x.isna(), "", np.where(x < 0, "west", "east"))
     assert again.frames["zone"].tolist() == expected.tolist()
     row = again.summary.iloc[0]
     assert row["zone_west_s"] + row["zone_east_s"] == pytest.approx(row["observed_s"])
-    pd.testing.assert_frame_equal(again.frames.drop(columns="zone"), session.frames.drop(columns="zone"))
+    pd.testing.assert_frame_equal(
+        again.frames.drop(columns="zone"), session.frames.drop(columns="zone")
+    )
 
 
 def test_a_slip_in_the_zones_is_told_before_any_work(folder, tmp_path, monkeypatch):

@@ -34,7 +34,9 @@ class InTurn:
     def each(self, do: Callable[[Any], Any], works: Sequence[Any]) -> Iterator[Any]:
         for work in reversed(works):
             if self.left == 0:
-                raise SessionError("a worker process ended without a word; run the same command again")
+                raise SessionError(
+                    "a worker process ended without a word; run the same command again"
+                )
             self.left -= 1
             self.n_done += 1
             yield do(work)
@@ -51,19 +53,26 @@ def run(folder: Path, out: Path, **how: Any) -> Path:  # noqa: F811
 
 
 @pytest.mark.parametrize("n", [2, 4])
-def test_tables_do_not_depend_on_the_number_of_workers(n: int, session: Session, folder: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_tables_do_not_depend_on_the_number_of_workers(
+    n: int, session: Session, folder: Path, tmp_path: Path
+) -> None:  # noqa: F811
     shared = run(folder, tmp_path, crew=Processes(n))
     assert tables_of(shared) == tables_of(session.path)
     assert depth_messages(shared) == depth_messages(session.path)
     assert Session.open(shared).metadata["interruptions"] == 0
-    assert sorted(path.name for path in shared.iterdir()) == sorted(path.name for path in session.path.iterdir())
+    assert sorted(path.name for path in shared.iterdir()) == sorted(
+        path.name for path in session.path.iterdir()
+    )
     assert not [one.sentence for one in verify_session(shared, run_session) if one.state == "wrong"]
 
 
 @pytest.mark.parametrize("then", ["with a crew", "alone"])
 def test_after_an_accident_what_is_whole_is_not_done_again(
-    then: str, session: Session, folder: Path, tmp_path: Path  # noqa: F811
-) -> None:  # fmt: skip
+    then: str,
+    session: Session,
+    folder: Path,
+    tmp_path: Path,  # noqa: F811
+) -> None:
     with pytest.raises(SessionError, match="without a word"):
         run(folder, tmp_path, crew=InTurn(accident_after=3))
     assert not list(tmp_path.glob("*.liex"))
@@ -77,8 +86,11 @@ def test_after_an_accident_what_is_whole_is_not_done_again(
 
 
 def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
-    session: Session, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
-) -> None:  # fmt: skip
+    session: Session,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,  # noqa: F811
+) -> None:
     frame = Recording.frame
 
     def torn(self: Recording, row: int) -> Any:
@@ -100,8 +112,11 @@ def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
 
 
 def test_a_short_recording_and_one_that_is_open_are_looked_at_by_one(
-    session: Session, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
-) -> None:  # fmt: skip
+    session: Session,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,  # noqa: F811
+) -> None:
     monkeypatch.setattr(job, "LENGTH", 1000)
     crew = InTurn()
     assert tables_of(run(folder, tmp_path, crew=crew)) == tables_of(session.path)
@@ -114,7 +129,9 @@ def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:
     assert list(stretches._cuts(20, 20)) == []
 
 
-def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(mouse: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(
+    mouse: Any, tmp_path: Path
+) -> None:  # noqa: F811
     plan = Plan.load("mouse")
     with build_recording(mouse, plan) as opened:
         tracker = build_tracker(opened, plan)

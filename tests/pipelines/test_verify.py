@@ -66,7 +66,9 @@ def test_an_untouched_session_is_what_it_was(whole: Path) -> None:
 @pytest.mark.parametrize("name", ["frames.parquet", "summary.csv", "columns.json", "plan.toml"])
 def test_a_changed_file_is_found(copy: Path, name: str) -> None:
     content = (copy / name).read_bytes()
-    (copy / name).write_bytes(content.replace(b"a", b"b", 1) if name != "plan.toml" else content + b"\n")
+    (copy / name).write_bytes(
+        content.replace(b"a", b"b", 1) if name != "plan.toml" else content + b"\n"
+    )
     assert f"{name} was changed" in wrong(verify_session(copy, never))
     result = CliRunner().invoke(cli.app, ["verify", str(copy)])
     assert result.exit_code == 1
@@ -79,7 +81,12 @@ def test_a_missing_table_and_cut_logs_are_found(copy: Path) -> None:
         data = (copy / name).read_bytes()
         (copy / name).write_bytes(data[: len(data) // 2])
     said = " ".join(wrong(verify_session(copy, never)))
-    for what in ("summary.csv is missing", "session.rrd was changed", "session.mcap was changed", "not written whole"):
+    for what in (
+        "summary.csv is missing",
+        "session.rrd was changed",
+        "session.mcap was changed",
+        "not written whole",
+    ):
         assert what in said
 
 
@@ -97,12 +104,16 @@ def test_what_an_older_session_does_not_say_is_only_noted(copy: Path) -> None:
     assert "does not say machine, files" in findings[0].sentence
 
 
-def test_the_recording_is_measured_again_where_asked(whole: Path, recording: Path, tmp_path: Path) -> None:
+def test_the_recording_is_measured_again_where_asked(
+    whole: Path, recording: Path, tmp_path: Path
+) -> None:
     def run(path: str, plan: Plan, out: str, **_: Any) -> Path:
         assert plan.session.name == "circle"
         return write_like(Path(out) / "circle.liex", "")
 
-    assert "all 15 tables are the same" in verify_session(whole, run, str(recording))[-1].sentence.replace(
+    assert "all 15 tables are the same" in verify_session(whole, run, str(recording))[
+        -1
+    ].sentence.replace(
         f"{len([*whole.glob('*.parquet'), *whole.glob('*.csv')])} tables", "15 tables"
     )
 
@@ -110,7 +121,9 @@ def test_the_recording_is_measured_again_where_asked(whole: Path, recording: Pat
         return write_like(Path(out) / "circle.liex", "", speed=210.0)
 
     assert "other rows in" in wrong(verify_session(whole, run_otherwise, str(recording)))[0]
-    other = write_png_folder(tmp_path / "other", MOUSE.frame(1).depth.astype("u2")[None], MOUSE.camera)
+    other = write_png_folder(
+        tmp_path / "other", MOUSE.frame(1).depth.astype("u2")[None], MOUSE.camera
+    )
     assert "is not the recording" in wrong(verify_session(whole, never, str(other)))[0]
 
 

@@ -25,7 +25,10 @@ def plans(draw: st.DrawFn) -> Plan:
         "animal": {"name": draw(words), "spine_min_mm": low, "spine_max_mm": high},
         "camera": {"cx": draw(st.floats(-1e4, 1e4)), "source": draw(words)},
         "recording": {"accept_truncated": draw(st.booleans())},
-        "session": {"subject_id": draw(words), "session_start_time": draw(st.datetimes(timezones=st.timezones()))},
+        "session": {
+            "subject_id": draw(words),
+            "session_start_time": draw(st.datetimes(timezones=st.timezones())),
+        },
     }
     if draw(st.booleans()):
         table["animal"]["spine_mm"] = draw(lengths)
@@ -43,7 +46,9 @@ def test_a_plan_survives_its_own_file(plan: Plan) -> None:
 @pytest.mark.parametrize("name", known_plans())
 def test_a_bundled_plan_is_the_file_that_the_program_would_write(name: str) -> None:
     """So every setting stands in it, with its comment. After adding one: liex info --plan NAME > the file."""
-    assert (plans_folder() / f"{name}.toml").read_text(encoding="utf-8") == Plan.load(name).to_toml()
+    assert (plans_folder() / f"{name}.toml").read_text(encoding="utf-8") == Plan.load(
+        name
+    ).to_toml()
 
 
 def test_every_setting_says_what_it_means() -> None:
@@ -103,7 +108,9 @@ def test_a_wrong_setting_is_told_in_one_sentence(setting: str, says: str) -> Non
 def test_a_wrong_key_in_a_file_names_the_file(tmp_path: Path) -> None:
     path = tmp_path / "my.toml"
     path.write_text("[estimation]\nmodle = 'mouse'\n")
-    with pytest.raises(PlanError, match=r"my\.toml: estimation\.modle is not .* nearest one is estimation\.model"):
+    with pytest.raises(
+        PlanError, match=r"my\.toml: estimation\.modle is not .* nearest one is estimation\.model"
+    ):
         Plan.load(path)
 
 

@@ -20,12 +20,21 @@ _WORDS = st.sampled_from(
     [*_WHOLE, *(key for section in _WHOLE.values() if isinstance(section, dict) for key in section)]
 )
 _LEAVES = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=12), st.datetimes(), st.dates(),
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=12),
+    st.datetimes(),
+    st.dates(),
     st.sampled_from(["../x", "/etc/passwd", "mouse", "\0", "2026-08-21T10:00:00+02:00", "=1+1"]),
-)  # fmt: skip
+)
 _TABLES = st.recursive(
     _LEAVES,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_WORDS | st.text(max_size=6), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(_WORDS | st.text(max_size=6), inner, max_size=4)
+    ),
     max_leaves=15,
 )
 
@@ -52,8 +61,14 @@ def test_whatever_a_plans_text_is_it_is_read_or_refused_in_one_sentence(text: st
 
 
 @settings(max_examples=60, deadline=None)
-@given(key=_WORDS | st.text(max_size=10), section=_WORDS | st.text(max_size=10), value=st.text(max_size=20))
-def test_whatever_is_set_on_the_command_line_it_is_read_or_refused(key: str, section: str, value: str) -> None:
+@given(
+    key=_WORDS | st.text(max_size=10),
+    section=_WORDS | st.text(max_size=10),
+    value=st.text(max_size=20),
+)
+def test_whatever_is_set_on_the_command_line_it_is_read_or_refused(
+    key: str, section: str, value: str
+) -> None:
     check(lambda: Plan().with_settings([f"{section}.{key}={value}"]))
 
 

@@ -56,9 +56,16 @@ def test_sessions_get_their_animals_facts_and_settings(tmp_path: Path) -> None:
     first, second = study_of(TWO, tmp_path).sessions
     assert first.id == "sub-m01_ses-01_date-20260821"
     assert first.folder == tmp_path / "derivatives/liex-lab/sub-m01/ses-01_date-20260821/behav"
-    assert first.recording == str(tmp_path / "rawdata/sub-m01/ses-01_date-20260821/behav/depth.mcap")
+    assert first.recording == str(
+        tmp_path / "rawdata/sub-m01/ses-01_date-20260821/behav/depth.mcap"
+    )
     facts = first.plan.session
-    assert (facts.name, facts.subject_id, facts.group, facts.cage) == (first.id, "m01", "control", "c1")
+    assert (facts.name, facts.subject_id, facts.group, facts.cage) == (
+        first.id,
+        "m01",
+        "control",
+        "c1",
+    )
     assert (first.plan.animal.spine_mm, first.plan.behaviour.rear_height_mm) == (65, 45.0)
     assert (second.plan.animal.spine_mm, second.plan.behaviour.rear_height_mm) == (None, 50.0)
     assert (first.exclude, second.exclude) == ("", "fell asleep")
@@ -69,8 +76,12 @@ def test_sessions_get_their_animals_facts_and_settings(tmp_path: Path) -> None:
 def test_a_plan_and_files_in_the_studys_folder_are_found_from_everywhere(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text(Plan.load("mouse").with_settings(["seed=7"]).to_toml())
     (tmp_path / "zones.toml").write_text("")
-    study = study_of(TWO.replace('name = "two groups"', 'plan = "own.toml"\nset.arena.zones = "zones.toml"')
-                     .replace("[set]\nbehaviour.rear_height_mm = 45.0\n", ""), tmp_path)  # fmt: skip
+    study = study_of(
+        TWO.replace(
+            'name = "two groups"', 'plan = "own.toml"\nset.arena.zones = "zones.toml"'
+        ).replace("[set]\nbehaviour.rear_height_mm = 45.0\n", ""),
+        tmp_path,
+    )
     plan = study.sessions[0].plan
     assert plan.seed == 7
     assert plan.arena.zones == str(tmp_path / "zones.toml")
@@ -91,7 +102,11 @@ def test_a_plan_and_files_in_the_studys_folder_are_found_from_everywhere(tmp_pat
         ('id = "m02"', 'id = "=cmd"', "letters and digits"),
         ('id = "m02"', 'id = "M01"', "listed twice"),
         ('session = "01"', 'session = "a/b"', "letters and digits"),
-        ('animal = "m02"\nsession = "01"', 'animal = "m01"\nsession = "01_date-20260821"', "two sessions"),
+        (
+            'animal = "m02"\nsession = "01"',
+            'animal = "m01"\nsession = "01_date-20260821"',
+            "two sessions",
+        ),
         ('animal = "m02"', 'animal = "m03"', "not in"),
         ("exclude", "exlcude", "did you mean exclude"),
         ("group", "gruop", "did you mean group"),
@@ -117,17 +132,38 @@ def test_a_study_that_is_not_there_is_told(tmp_path: Path) -> None:
 
 def test_settings_are_put_into_one_another() -> None:
     assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 1}}) == {
-        "a": {"b": 5, "c": 2}, "d": {"e": 1},
-    }  # fmt: skip
+        "a": {"b": 5, "c": 2},
+        "d": {"e": 1},
+    }
 
 
-_WORDS = st.sampled_from([*tomllib.loads(TWO), "plan", "results", "set", "id", "animal", "session", "recording", "x"])
+_WORDS = st.sampled_from(
+    [*tomllib.loads(TWO), "plan", "results", "set", "id", "animal", "session", "recording", "x"]
+)
 _LEAVES = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=12),
-    st.sampled_from(["../x", "/etc/passwd", "mouse", "m01", "synthetic:walk", "\0", "a\\..\\b", "rawdata", "~/x"]),
-)  # fmt: skip
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=12),
+    st.sampled_from(
+        [
+            "../x",
+            "/etc/passwd",
+            "mouse",
+            "m01",
+            "synthetic:walk",
+            "\0",
+            "a\\..\\b",
+            "rawdata",
+            "~/x",
+        ]
+    ),
+)
 _TABLES = st.recursive(
-    _LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_WORDS, inner, max_size=4), max_leaves=20
+    _LEAVES,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_WORDS, inner, max_size=4),
+    max_leaves=20,
 )
 
 
@@ -138,7 +174,9 @@ def inside(path: Path, folder: Path) -> bool:
 
 @settings(max_examples=150, deadline=None)
 @given(table=st.dictionaries(_WORDS, _TABLES, max_size=5))
-def test_whatever_a_study_file_says_it_is_read_or_refused_in_one_sentence(table: dict[str, Any]) -> None:
+def test_whatever_a_study_file_says_it_is_read_or_refused_in_one_sentence(
+    table: dict[str, Any],
+) -> None:
     check_study(table)
 
 
@@ -150,6 +188,8 @@ def check_study(table: dict[str, Any]) -> None:
         assert inside(study.results, folder)
         for session in study.sessions:
             assert inside(session.folder, folder)
-            assert session.recording.startswith("synthetic:") or inside(Path(session.recording), folder)
+            assert session.recording.startswith("synthetic:") or inside(
+                Path(session.recording), folder
+            )
     except LiexError as error:
         assert "\n" not in str(error)  # noqa: PT017

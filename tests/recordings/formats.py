@@ -123,7 +123,9 @@ def _tiff_ends(path: Path) -> list[int]:
     with tifffile.TiffFile(path) as tif:
         for page in tif.pages:
             last = max(
-                last, page.offset + 400, *(o + c for o, c in zip(page.dataoffsets, page.databytecounts, strict=True))
+                last,
+                page.offset + 400,
+                *(o + c for o, c in zip(page.dataoffsets, page.databytecounts, strict=True)),
             )
             ends.append(last)
     return ends
@@ -139,7 +141,9 @@ def _archive_ends(path: Path) -> list[int]:
     for k in range(0, len(packed), 64):
         got.append(got[-1] + len(inflate.decompress(packed[k : k + 64])))
     frame = 2 * 64 * 48
-    return [64 * int(np.searchsorted(got, start + k * frame)) for k in range(1, n_bytes // frame + 1)]
+    return [
+        64 * int(np.searchsorted(got, start + k * frame)) for k in range(1, n_bytes // frame + 1)
+    ]
 
 
 def _avi_ends(path: Path) -> list[int]:
@@ -169,9 +173,14 @@ def _mcap_ends(path: Path) -> list[int]:
         reader = make_reader(file)
         summary = reader.get_summary()
         assert summary is not None
-        times = [message.log_time for _, _, message in reader.iter_messages(topics=["/camera/depth"])]
+        times = [
+            message.log_time for _, _, message in reader.iter_messages(topics=["/camera/depth"])
+        ]
     chunks = summary.chunk_indexes
-    return [next(c.chunk_start_offset + c.chunk_length for c in chunks if t <= c.message_end_time) for t in times]
+    return [
+        next(c.chunk_start_offset + c.chunk_length for c in chunks if t <= c.message_end_time)
+        for t in times
+    ]
 
 
 def _message_ends(file: MessageFile) -> list[int]:
@@ -233,66 +242,103 @@ def _archive(folder: Path, frames: Frames) -> Path:
     return write_archive(_moseq(folder / "session", frames), folder / "session.tar.gz", order)
 
 
-def _pictures(suffix: str, write: Callable[[Path, NDArray[Any]], object]) -> Callable[[Path, Frames], Path]:
+def _pictures(
+    suffix: str, write: Callable[[Path, NDArray[Any]], object]
+) -> Callable[[Path, Frames], Path]:
     return lambda folder, frames: write_folder(folder, frames, suffix, write)
 
 
 FORMATS = (
     Format("png", write_png_folder, others(".png"), streams=False),
     Format("tiff", _pictures(".tif", write_tiff), lambda path, at: None, streams=False),
-    Format("tiff-stack", lambda f, s: write_tiff_stack(f / "depth.tif", s).parent, before(_tiff_ends, ".tif")),
+    Format(
+        "tiff-stack",
+        lambda f, s: write_tiff_stack(f / "depth.tif", s).parent,
+        before(_tiff_ends, ".tif"),
+    ),
     Format("pgm", _pictures(".pgm", write_pgm), others(".pgm"), streams=False),
     Format("pclzf", _pictures(".pclzf", write_pclzf), others(".pclzf"), streams=False),
     Format("nyu", write_nyu, others(".png"), streams=False),
     Format("moseq-dat", _moseq, before(lambda p: range(6144, p.stat().st_size + 1, 6144), ".dat")),
     Format("moseq-archive", _archive, before(_archive_ends, ".gz")),
     Format("moseq-avi", write_video_session, before(_avi_ends, ".avi"), promise=_promise_avi),
-    Format("azure-mkv", lambda f, s: write_video_session(f, s, "depth.mkv"), before(_mkv_ends, ".mkv")),
+    Format(
+        "azure-mkv", lambda f, s: write_video_session(f, s, "depth.mkv"), before(_mkv_ends, ".mkv")
+    ),
     Format("oni-16zT", _oni("16zT"), before(_oni_ends, ".oni"), promise=_promise_oni),
     Format("oni-16zP", _oni("16zP"), before(_oni_ends, ".oni"), n_damaged=60),
     Format("oni-old", _old_oni, before(_oni_ends, ".oni"), n_damaged=60),
-    Format("mcap-foxglove", lambda f, s: write_mcap(f / "recording.mcap", s), before(_mcap_ends, ".mcap")),
     Format(
-        "mcap-unchunked", lambda f, s: write_mcap(f / "recording.mcap", s, use_chunks=False),
-        before(_mcap_message_ends, ".mcap"), n_damaged=60,
+        "mcap-foxglove",
+        lambda f, s: write_mcap(f / "recording.mcap", s),
+        before(_mcap_ends, ".mcap"),
     ),
     Format(
-        "mcap-png", lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png", chunk_size=4096),
-        before(_mcap_message_ends, ".mcap"), n_damaged=60,
+        "mcap-unchunked",
+        lambda f, s: write_mcap(f / "recording.mcap", s, use_chunks=False),
+        before(_mcap_message_ends, ".mcap"),
+        n_damaged=60,
     ),
     Format(
-        "mcap-ros1", lambda f, s: write_ros_mcap(f / "recording.mcap", s, 1, compression=CompressionType.NONE),
-        before(_mcap_message_ends, ".mcap"), n_damaged=60,
+        "mcap-png",
+        lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png", chunk_size=4096),
+        before(_mcap_message_ends, ".mcap"),
+        n_damaged=60,
+    ),
+    Format(
+        "mcap-ros1",
+        lambda f, s: write_ros_mcap(f / "recording.mcap", s, 1, compression=CompressionType.NONE),
+        before(_mcap_message_ends, ".mcap"),
+        n_damaged=60,
     ),
     Format(
         "mcap-ros2",
         lambda f, s: write_ros_mcap(
             f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4, chunk_size=4096
         ),
-        before(_mcap_message_ends, ".mcap"), n_damaged=60,
+        before(_mcap_message_ends, ".mcap"),
+        n_damaged=60,
     ),
     Format("bag-lz4", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
     Format(
-        "bag-bz2", lambda f, s: write_bag(f / "recording.bag", s, compression="bz2", kind="png", chunk_bytes=4096),
-        before(_bag_ends, ".bag"), n_damaged=60,
+        "bag-bz2",
+        lambda f, s: write_bag(
+            f / "recording.bag", s, compression="bz2", kind="png", chunk_bytes=4096
+        ),
+        before(_bag_ends, ".bag"),
+        n_damaged=60,
     ),
     Format(
-        "bag-plain", lambda f, s: write_bag(f / "recording.bag", s, compression=None, chunk_bytes=1 << 18, kind="rvl"),
-        before(_bag_ends, ".bag"), n_damaged=60,
+        "bag-plain",
+        lambda f, s: write_bag(
+            f / "recording.bag", s, compression=None, chunk_bytes=1 << 18, kind="rvl"
+        ),
+        before(_bag_ends, ".bag"),
+        n_damaged=60,
     ),
     # SQLite keeps its tables in pages of a tree, so that nothing is promised of what comes before
     Format("ros2-db3", lambda f, s: write_db3(f / "bag", s), lambda path, at: None),
     Format(
         "raytrix-float",
-        lambda f, s: write_raytrix(f, -s.astype(np.float32), "raytrix-f32-negative-mm", ".tif", write_tiff),
-        lambda path, at: None, streams=False,
+        lambda f, s: write_raytrix(
+            f, -s.astype(np.float32), "raytrix-f32-negative-mm", ".tif", write_tiff
+        ),
+        lambda path, at: None,
+        streams=False,
     ),
     Format(
-        "raytrix-xyz", lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".xyz", write_xyz), others(".xyz"),
-        atol_mm=1e-3, streams=False,
+        "raytrix-xyz",
+        lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".xyz", write_xyz),
+        others(".xyz"),
+        atol_mm=1e-3,
+        streams=False,
     ),
     Format(
-        "raytrix-ply", lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".ply", write_ply), others(".ply"),
-        atol_mm=1e-3, streams=False, promise=_promise_ply,
+        "raytrix-ply",
+        lambda f, s: write_raytrix(f, s, "raytrix-points-mm", ".ply", write_ply),
+        others(".ply"),
+        atol_mm=1e-3,
+        streams=False,
+        promise=_promise_ply,
     ),
-)  # fmt: skip
+)

@@ -41,12 +41,16 @@ class OniBuilder:
         self.content = struct.pack("<4sBBHIQI", b"NI10", *version, 2**64 - 1, 9)
         self.frames: dict[int, list[tuple[int, int]]] = {}  # node: time and position of each
 
-    def record(self, kind: int, node: int = 0, fields: bytes = b"", payload: bytes = b"", undoes: int = 0) -> int:
+    def record(
+        self, kind: int, node: int = 0, fields: bytes = b"", payload: bytes = b"", undoes: int = 0
+    ) -> int:
         """Append a record; where it begins."""
         at = len(self.content)
         head = "<IIIIII" if self.old else "<IIIIIQ"
         size = struct.calcsize(head) + len(fields)
-        self.content += struct.pack(head, 0x0052494E, kind, node, size, len(payload), undoes) + fields + payload
+        self.content += (
+            struct.pack(head, 0x0052494E, kind, node, size, len(payload), undoes) + fields + payload
+        )
         return at
 
     def node(
@@ -91,13 +95,21 @@ class OniBuilder:
     ) -> None:
         """What OpenNI2's player wants of a depth node."""
         shape = mode(width, height)
-        self.properties(node, xnMapOutputMode=shape, xnSupportedMapOutputModes=shape, xnCropping=crop)
+        self.properties(
+            node, xnMapOutputMode=shape, xnSupportedMapOutputModes=shape, xnCropping=crop
+        )
         if fov:
             self.properties(node, xnFOV=struct.pack("<dd", *fov))
         self.integers(
-            node, oniRequiredFrameSize=2 * width * height, xnIsGenerating=1, xnDeviceMaxDepth=10_000,
-            xnSupportedMapOutputModesCount=1, xnPixelFormat=4, oniPixelFormat=100, xnMirror=0,
-        )  # fmt: skip
+            node,
+            oniRequiredFrameSize=2 * width * height,
+            xnIsGenerating=1,
+            xnDeviceMaxDepth=10_000,
+            xnSupportedMapOutputModesCount=1,
+            xnPixelFormat=4,
+            oniPixelFormat=100,
+            xnMirror=0,
+        )
 
     def begin(self, node: int) -> None:
         """The properties of a node are complete, and its data begins."""
@@ -114,7 +126,10 @@ class OniBuilder:
     def seek_table(self, node: int) -> int:
         """Add the table of a node's frames; where it begins."""
         entry, known = "<QII" if self.old else "<QIQ", self.frames.get(node, [])
-        rows = [struct.pack(entry, 0, 0, 0), *(struct.pack(entry, time_us, 3, at) for time_us, at in known)]
+        rows = [
+            struct.pack(entry, 0, 0, 0),
+            *(struct.pack(entry, time_us, 3, at) for time_us, at in known),
+        ]
         return self.record(0x0E, node, payload=b"".join(rows))
 
     def write(self, path: Path, closed: bool = True) -> Path:
@@ -173,4 +188,8 @@ def plain_payload(frame: NDArray[np.uint16], codec: str) -> bytes:
     if codec == "16zP":
         return plain_16z(frame.ravel())
     table, numbers = np.unique(frame, return_inverse=True)
-    return struct.pack("<H", len(table)) + table.astype("<u2").tobytes() + plain_16z(numbers.ravel().astype(np.uint16))
+    return (
+        struct.pack("<H", len(table))
+        + table.astype("<u2").tobytes()
+        + plain_16z(numbers.ravel().astype(np.uint16))
+    )

@@ -58,10 +58,19 @@ def _run(folder: Path, *arguments: str) -> Witnessed:
 
 class _Frame(ctypes.Structure):
     _fields_ = (
-        ("size", ctypes.c_int), ("data", ctypes.c_void_p), ("sensor", ctypes.c_int), ("time_us", ctypes.c_uint64),
-        ("index", ctypes.c_int), ("width", ctypes.c_int), ("height", ctypes.c_int), ("mode", ctypes.c_int * 4),
-        ("cropped", ctypes.c_int), ("x", ctypes.c_int), ("y", ctypes.c_int), ("stride", ctypes.c_int),
-    )  # fmt: skip
+        ("size", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("sensor", ctypes.c_int),
+        ("time_us", ctypes.c_uint64),
+        ("index", ctypes.c_int),
+        ("width", ctypes.c_int),
+        ("height", ctypes.c_int),
+        ("mode", ctypes.c_int * 4),
+        ("cropped", ctypes.c_int),
+        ("x", ctypes.c_int),
+        ("y", ctypes.c_int),
+        ("stride", ctypes.c_int),
+    )
 
 
 class _Stream:
@@ -75,7 +84,13 @@ class _Stream:
         self.do("oniDeviceOpen", source.encode(), ctypes.byref(self._device))
         if source.endswith(".oni"):
             self.do("oniDeviceSetProperty", self._device, REPEAT, ctypes.byref(ctypes.c_int(0)), 4)
-            self.do("oniDeviceSetProperty", self._device, SPEED, ctypes.byref(ctypes.c_float(ONE_FRAME_A_READ)), 4)
+            self.do(
+                "oniDeviceSetProperty",
+                self._device,
+                SPEED,
+                ctypes.byref(ctypes.c_float(ONE_FRAME_A_READ)),
+                4,
+            )
         self.do("oniDeviceCreateStream", self._device, DEPTH, ctypes.byref(self.handle))
 
     def do(self, name: str, *arguments: object) -> None:
@@ -85,7 +100,9 @@ class _Stream:
 
     def number(self, name: int, kind: type[ctypes.c_int] | type[ctypes.c_float]) -> float:
         value, size = kind(), ctypes.c_int(4)
-        failed = self.library.oniStreamGetProperty(self.handle, name, ctypes.byref(value), ctypes.byref(size))
+        failed = self.library.oniStreamGetProperty(
+            self.handle, name, ctypes.byref(value), ctypes.byref(size)
+        )
         return float("nan") if failed else value.value
 
     def read(self) -> tuple[NDArray[np.uint16], int]:
@@ -105,7 +122,10 @@ def _main(out: str, what: str, source: str, target: str = "", n: str = "") -> No
         stream.do("oniRecorderStart", recorder)
         time.sleep(0.2)  # it starts in a thread, and frames before that are lost
     stream.do("oniStreamStart", stream.handle)
-    frames, times = zip(*(stream.read() for _ in range(int(n or stream.number(N_FRAMES, ctypes.c_int)))), strict=True)
+    frames, times = zip(
+        *(stream.read() for _ in range(int(n or stream.number(N_FRAMES, ctypes.c_int)))),
+        strict=True,
+    )
     if what == "record":
         stream.library.oniRecorderStop(recorder)
         stream.do("oniRecorderDestroy", ctypes.byref(recorder))

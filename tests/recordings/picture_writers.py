@@ -17,7 +17,11 @@ from tests.recordings.writers import SMALL, Frames, even_times, write_camera, wr
 
 
 def write_folder(
-    folder: Path, frames: NDArray[Any], suffix: str, write: Callable[[Path, NDArray[Any]], object], **camera: object
+    folder: Path,
+    frames: NDArray[Any],
+    suffix: str,
+    write: Callable[[Path, NDArray[Any]], object],
+    **camera: object,
 ) -> Path:
     """frame_0, frame_1, ... with `suffix`, each by `write`; `camera` are further keys of camera.toml."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -32,7 +36,9 @@ def write_tiff(path: Path, frame: NDArray[Any], compression: str | None = None) 
     tifffile.imwrite(path, frame, photometric="minisblack", compression=compression)
 
 
-def write_pgm(path: Path, frame: NDArray[Any], order: str = ">u2", head: str = "P5\n{w} {h}\n65535\n") -> None:
+def write_pgm(
+    path: Path, frame: NDArray[Any], order: str = ">u2", head: str = "P5\n{w} {h}\n65535\n"
+) -> None:
     height, width = frame.shape
     path.write_bytes(head.format(w=width, h=height).encode() + frame.astype(order).tobytes())
 
@@ -41,7 +47,9 @@ def write_pclzf(path: Path, frame: NDArray[Any], kind: bytes = b"depth16") -> No
     data = np.ascontiguousarray(frame).tobytes()
     packed = pack_lzf(data)
     height, width = frame.shape[:2]
-    head = struct.pack("<5sII16sII", b"PCLZF", width, height, kind.ljust(16), len(packed), len(data))
+    head = struct.pack(
+        "<5sII16sII", b"PCLZF", width, height, kind.ljust(16), len(packed), len(data)
+    )
     path.write_bytes(head + packed)
 
 
@@ -91,9 +99,14 @@ def write_nyu(folder: Path, frames: Frames) -> Path:
 
 
 def write_raytrix(
-    folder: Path, frames: NDArray[Any], profile: str, suffix: str, write: Callable[[Path, NDArray[Any]], object],
-    more: str = "", **camera: object,
-) -> Path:  # fmt: skip
+    folder: Path,
+    frames: NDArray[Any],
+    profile: str,
+    suffix: str,
+    write: Callable[[Path, NDArray[Any]], object],
+    more: str = "",
+    **camera: object,
+) -> Path:
     """A folder of exports with a raytrix.toml; `frames` are stored numbers, `more` further lines of raytrix.toml."""
     write_folder(folder, frames, suffix, write, **camera)
     (folder / "raytrix.toml").write_text(f'profile = "{profile}"\n{more}', encoding="utf-8")
@@ -117,14 +130,27 @@ def write_ply(path: Path, frame: NDArray[Any], form: str = "binary_little_endian
     points = points_of(frame)
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form, "")
     head = [
-        "ply", f"format {form} 1.0", "comment made for a test", f"element vertex {len(points)}", "property float x",
-        "property float y", "property uchar red", "property float z", "element face 1",
-        "property list uchar int vertex_indices", "end_header\n",
-    ]  # fmt: skip
+        "ply",
+        f"format {form} 1.0",
+        "comment made for a test",
+        f"element vertex {len(points)}",
+        "property float x",
+        "property float y",
+        "property uchar red",
+        "property float z",
+        "element face 1",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
     if order:
-        rows = np.zeros(len(points), [("x", f"{order}f4"), ("y", f"{order}f4"), ("red", "u1"), ("z", f"{order}f4")])
+        rows = np.zeros(
+            len(points),
+            [("x", f"{order}f4"), ("y", f"{order}f4"), ("red", "u1"), ("z", f"{order}f4")],
+        )
         rows["x"], rows["y"], rows["z"] = points.T
         body = rows.tobytes() + b"\x03" + np.arange(3, dtype=f"{order}i4").tobytes()
     else:
-        body = ("".join(f"{x:.4f} {y:.4f} 0 {z:.4f}\n" for x, y, z in points) + "3 0 1 2\n").encode()
+        body = (
+            "".join(f"{x:.4f} {y:.4f} 0 {z:.4f}\n" for x, y, z in points) + "3 0 1 2\n"
+        ).encode()
     path.write_bytes("\n".join(head).encode() + body)

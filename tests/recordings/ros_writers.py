@@ -69,7 +69,9 @@ def depth_message(ros: int, frame: NDArray[Any], time_ns: int, frame_id: str, ho
     if "cloud" in how.kind:
         return _cloud(ros, frame, header, how)
     if how.kind in ("16UC1", "mono16", "32FC1"):
-        ordered = np.ascontiguousarray(frame.astype(frame.dtype.newbyteorder(">" if how.big_endian else "<")))
+        ordered = np.ascontiguousarray(
+            frame.astype(frame.dtype.newbyteorder(">" if how.big_endian else "<"))
+        )
         rows = ordered.view(np.uint8).reshape(len(frame), -1)
         padded = np.pad(rows, ((0, 0), (0, how.padding)), constant_values=0xAB)
         height, width = frame.shape
@@ -109,18 +111,30 @@ def _cloud(ros: int, frame: NDArray[Any], header: Any, how: How) -> Any:
         points = points[:, np.random.default_rng(5).permutation(points.shape[1])]
     height, width, _ = points.shape
     order = ">" if how.big_endian else "<"
-    layout = np.dtype([("rgb", "u4"), ("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f4")])
+    layout = np.dtype(
+        [("rgb", "u4"), ("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f4")]
+    )
     packed = np.zeros((height, width), layout)
     for k, name in enumerate("xyz"):
         packed[name] = points[..., k]
     assert layout.fields is not None
     fields = [
-        types["sensor_msgs/msg/PointField"](name, int(layout.fields[name][1]), 6 if name == "rgb" else 7, 1)
+        types["sensor_msgs/msg/PointField"](
+            name, int(layout.fields[name][1]), 6 if name == "rgb" else 7, 1
+        )
         for name in ("x", "y", "z", "rgb")
-    ]  # fmt: skip
+    ]
     rows = np.pad(packed.view(np.uint8).reshape(height, -1), ((0, 0), (0, how.padding)))
     return types["sensor_msgs/msg/PointCloud2"](
-        header, height, width, fields, how.big_endian, layout.itemsize, rows.shape[1], rows.ravel(), False
+        header,
+        height,
+        width,
+        fields,
+        how.big_endian,
+        layout.itemsize,
+        rows.shape[1],
+        rows.ravel(),
+        False,
     )
 
 
@@ -136,9 +150,18 @@ def _camera_info(ros: int, frame_id: str, time_ns: int, how: How) -> Any:
     p = np.hstack([k, np.zeros((3, 1))])
     region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     return types["sensor_msgs/msg/CameraInfo"](
-        _header(ros, time_ns, frame_id), camera.height, camera.width, how.model, np.array(how.distortion, float),
-        k.ravel(), np.eye(3).ravel(), p.ravel(), 0, 0, region,
-    )  # fmt: skip
+        _header(ros, time_ns, frame_id),
+        camera.height,
+        camera.width,
+        how.model,
+        np.array(how.distortion, float),
+        k.ravel(),
+        np.eye(3).ravel(),
+        p.ravel(),
+        0,
+        0,
+        region,
+    )
 
 
 def write_ros_mcap(
@@ -154,7 +177,9 @@ def write_ros_mcap(
 ) -> Path:
     """ROS's messages in an MCAP file; `changes` are further facts of `How`."""
     with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=chunk_size, compression=compression, use_chunking=use_chunking)
+        writer = McapWriter(
+            file, chunk_size=chunk_size, compression=compression, use_chunking=use_chunking
+        )
         writer.start(f"ros{ros}")
         channels: dict[str, int] = {}
         for topic, log_ns, message in ros_messages(ros, frames, replace(how or How(), **changes)):
@@ -163,7 +188,9 @@ def write_ros_mcap(
                 definition, _ = store(ros).generate_msgdef(kind, ros_version=ros)
                 name = kind.replace("/msg/", "/") if ros == 1 else kind
                 schema = writer.register_schema(name, f"ros{ros}msg", definition.encode())
-                channels[topic] = writer.register_channel(topic, "ros1" if ros == 1 else "cdr", schema)
+                channels[topic] = writer.register_channel(
+                    topic, "ros1" if ros == 1 else "cdr", schema
+                )
             pack = store(ros).serialize_ros1 if ros == 1 else store(ros).serialize_cdr
             writer.add_message(channels[topic], log_ns, bytes(pack(message, kind)), log_ns)
         writer.finish()

@@ -69,7 +69,9 @@ def damage(rng: np.random.Generator, path: Path) -> Damage:
     file = files[int(rng.choice(len(files), p=sizes / sizes.sum() if rng.random() < 0.7 else None))]
     content = bytearray(file.read_bytes())
     kind = str(rng.choice(["cut", "bits", "zeros", "number", "insert", "remove", "twice"]))
-    near = len(content) if rng.random() < 0.6 else min(len(content), 256)  # headers are worth more than their share
+    near = (
+        len(content) if rng.random() < 0.6 else min(len(content), 256)
+    )  # headers are worth more than their share
     at = int(rng.integers(0, near))
     length = int(rng.integers(1, 600))
     if kind == "cut":
@@ -82,7 +84,9 @@ def damage(rng: np.random.Generator, path: Path) -> Damage:
         content[at : at + length] = bytes(len(content[at : at + length]))
     elif kind == "number":  # as a length, a count or a size: 2^32 - 1, 2^31 - 1, 2^31, 2^24, 0, 1
         number = bytes.fromhex(
-            str(rng.choice(["ffffffff", "ffffff7f", "00000080", "00000001", "00000000", "01000000"]))
+            str(
+                rng.choice(["ffffffff", "ffffff7f", "00000080", "00000001", "00000000", "01000000"])
+            )
         )
         content[at : at + 4] = number[: len(content[at : at + 4])]
     elif kind == "insert":
@@ -146,17 +150,25 @@ def test_damaged_variants_give_frames_or_a_sentence(form: Format, tmp_path: Path
             with little_time(), little_memory(4 * size + 300_000_000):
                 n_opened += check(form, whole, opened, done)
         except BaseException as error:
-            failed.append(f"seed {seed}, {done.kind} at {done.at} of {done.file.name}: {type(error).__name__}: {error}")
+            failed.append(
+                f"seed {seed}, {done.kind} at {done.at} of {done.file.name}: {type(error).__name__}: {error}"
+            )
             if isinstance(error, KeyboardInterrupt):
                 raise
         sound = tmp_path / "whole" / done.file.relative_to(tmp_path / "damaged")
         done.file.write_bytes(sound.read_bytes())
     assert not failed, "\n".join(failed)
-    assert 0.1 * form.n_damaged < n_opened < form.n_damaged  # the damage was neither too harsh nor none
+    assert (
+        0.1 * form.n_damaged < n_opened < form.n_damaged
+    )  # the damage was neither too harsh nor none
 
 
-@pytest.mark.parametrize("form", [form for form in FORMATS if form.promise], ids=lambda form: form.name)
-def test_a_header_that_promises_two_thousand_million_frames_is_refused(form: Format, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "form", [form for form in FORMATS if form.promise], ids=lambda form: form.name
+)
+def test_a_header_that_promises_two_thousand_million_frames_is_refused(
+    form: Format, tmp_path: Path
+) -> None:
     path = form.write(tmp_path, STORED)
     assert form.promise is not None
     form.promise(path)
@@ -167,7 +179,9 @@ def test_a_header_that_promises_two_thousand_million_frames_is_refused(form: For
 
 def test_the_limits_of_this_test_hold(tmp_path: Path) -> None:
     with little_memory(50_000_000), pytest.raises(MemoryError):
-        np.ones(4_000_000_000, np.uint8)  # more than a process that has run many tests may hold unused
+        np.ones(
+            4_000_000_000, np.uint8
+        )  # more than a process that has run many tests may hold unused
     with little_time():
         signal.setitimer(signal.ITIMER_REAL, 0.01)
         with pytest.raises(TimeoutError):

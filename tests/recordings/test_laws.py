@@ -51,7 +51,9 @@ def test_it_holds_what_was_written(recording: Recording, form: Format) -> None:
     assert (len(recording), recording.n_whole, recording.truncated) == (N, N, False)
     assert (recording.width, recording.height) == (64, 48)
     lens = recording.camera
-    np.testing.assert_allclose([lens.fx, lens.fy, lens.cx, lens.cy], [SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy])
+    np.testing.assert_allclose(
+        [lens.fx, lens.fy, lens.cx, lens.cy], [SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy]
+    )
     assert lens.source
     for index, frame in enumerate(recording):
         assert (frame.index, frame.time_ns) == (index, int(recording.times_ns[index]))
@@ -61,7 +63,9 @@ def test_it_holds_what_was_written(recording: Recording, form: Format) -> None:
 def test_times_increase_by_what_was_written(recording: Recording) -> None:
     assert recording.times_ns.dtype == np.int64
     assert np.all(np.diff(recording.times_ns) > 0)
-    np.testing.assert_allclose(np.diff(recording.times_ns), 1e9 / 30, atol=0.6e6)  # some count whole milliseconds
+    np.testing.assert_allclose(
+        np.diff(recording.times_ns), 1e9 / 30, atol=0.6e6
+    )  # some count whole milliseconds
     assert recording.duration_s == pytest.approx((N - 1) / 30, abs=0.001)
     assert (recording.gaps, recording.faults) == ([], [])
 
@@ -77,7 +81,9 @@ def test_it_reads_in_any_order_and_again(recording: Recording, form: Format) -> 
 
 
 @pytest.mark.parametrize("part", [slice(2, 5), slice(None, None, 2), slice(-3, None), slice(1, 2)])
-def test_a_slice_is_a_recording_of_its_frames(recording: Recording, form: Format, part: slice) -> None:
+def test_a_slice_is_a_recording_of_its_frames(
+    recording: Recording, form: Format, part: slice
+) -> None:
     cut, rows = recording[part], range(N)[part]
     assert len(cut) == len(rows)
     np.testing.assert_array_equal(cut.times_ns, recording.times_ns[part])
@@ -91,8 +97,13 @@ def test_pictures_may_be_written_on(recording: Recording, form: Format) -> None:
     assert_is(recording.frame(1).depth, 1, form)
 
 
-def test_equal_files_have_equal_digests_and_others_not(path: Path, form: Format, tmp_path: Path) -> None:
-    with open_recording(path) as recording, open_recording(form.write(tmp_path, STORED[:-1])) as shorter:
+def test_equal_files_have_equal_digests_and_others_not(
+    path: Path, form: Format, tmp_path: Path
+) -> None:
+    with (
+        open_recording(path) as recording,
+        open_recording(form.write(tmp_path, STORED[:-1])) as shorter,
+    ):
         assert recording.digest() == recording[1:3].digest() != shorter.digest()
 
 
@@ -146,7 +157,9 @@ class Bounded(io.BufferedReader):
         total = os.fstat(self.fileno()).st_size
         unbounded = size is None or size < 0
         if total > LARGE and (unbounded or size > max(1 << 20, 4 * BYTES)):
-            raise AssertionError(f"{self.name}, {total} bytes long, was asked for {'all' if unbounded else size}")
+            raise AssertionError(
+                f"{self.name}, {total} bytes long, was asked for {'all' if unbounded else size}"
+            )
 
 
 @pytest.fixture(scope="module")

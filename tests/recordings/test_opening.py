@@ -47,7 +47,9 @@ STORED = depth_frames(4)
         ("empty.mcap", "is empty"),
     ],
 )
-def test_a_file_that_cannot_be_read_is_told_in_a_sentence(tmp_path: Path, name: str, says: str) -> None:
+def test_a_file_that_cannot_be_read_is_told_in_a_sentence(
+    tmp_path: Path, name: str, says: str
+) -> None:
     (tmp_path / name).write_bytes(b"")
     sentence = refusal(tmp_path / name)
     assert says in sentence
@@ -164,5 +166,7 @@ def test_a_format_brings_only_its_own_libraries(tmp_path: Path) -> None:
 
 def test_the_camera_of_a_recording_is_for_its_pictures(tmp_path: Path) -> None:
     with open_recording(write_png_folder(tmp_path / "r", STORED)) as recording:
-        assert (recording.camera.width, recording.camera.height) == recording.frame(0).depth.shape[::-1]
+        assert (recording.camera.width, recording.camera.height) == recording.frame(0).depth.shape[
+            ::-1
+        ]
         assert recording.camera.fx == SMALL.fx

@@ -40,7 +40,9 @@ def copy_of(files: list[Path], folder: Path) -> list[Path]:
     return [Path(shutil.copy(path, folder)) for path in files]
 
 
-def test_pictures_hold_what_independent_readers_found(reference_data: Path, expected: dict[str, Any]) -> None:
+def test_pictures_hold_what_independent_readers_found(
+    reference_data: Path, expected: dict[str, Any]
+) -> None:
     files = sorted((reference_data / "depth_files" / "xtion_open3d").glob("*.png"))
     with open_recording(files[0].parent, camera=XTION, fps=30, strict=True) as recording:
         for frame, path in zip(recording, files, strict=True):
@@ -56,13 +58,22 @@ def test_pcl_recordings_hold_their_times_and_their_camera(
     assert "both TIFF and PCLZF" in refusal(folder)
     files = copy_of(sorted(folder.glob(f"*.{kind}")), tmp_path)
     copy_of(list(folder.glob("*.xml")), tmp_path)
-    with open_recording(tmp_path, camera=None if kind == "pclzf" else XTION, strict=True) as recording:
+    with open_recording(
+        tmp_path, camera=None if kind == "pclzf" else XTION, strict=True
+    ) as recording:
         for frame, path in zip(recording, files, strict=True):
             assert_as_expected(frame.depth, expected[f"primesense_pcl/{path.name}"])
         assert np.diff(recording.times_ns).tolist() == [254_471_000]
         if kind == "pclzf":
             lens = recording.camera
-            assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height) == (525, 525, 320, 240, 640, 480)
+            assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height) == (
+                525,
+                525,
+                320,
+                240,
+                640,
+                480,
+            )
             assert lens.source == "the XML files beside the pictures"
 
 
@@ -70,12 +81,18 @@ def test_the_encodings_of_data_sets_come_out_as_millimetres(
     reference_data: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
     depth = {}
-    for name, encoding in (("TUM_depth.png", "tum"), ("SUN_depth.png", "sun"), ("NYU_depth.pgm", "kinect1-disparity")):
+    for name, encoding in (
+        ("TUM_depth.png", "tum"),
+        ("SUN_depth.png", "sun"),
+        ("NYU_depth.pgm", "kinect1-disparity"),
+    ):
         folder = tmp_path / encoding
         (path,) = copy_of([reference_data / "depth_files" / "other_formats" / name], folder)
         with open_recording(path, camera=XTION, fps=30) as recording:
             assert_as_expected(recording.frame(0).depth, expected[f"other_formats/{name}"])
-            assert any("low byte first" in problem for problem in recording.problems) == name.endswith(".pgm")
+            assert any(
+                "low byte first" in problem for problem in recording.problems
+            ) == name.endswith(".pgm")
         write_camera(folder, XTION, encoding=encoding)
         with open_recording(path, fps=30, strict=True) as recording:
             depth[encoding] = recording.frame(0).depth.astype(float)
@@ -97,7 +114,12 @@ def test_a_real_nyu_frame_lies_before_its_joints(reference_data: Path) -> None:
     folder = reference_data / "hand_nyu"
     truth = np.load(folder / "nyu_test_14joints.npz")
     with open_recording(folder, strict=True) as recording:
-        assert (recording.format, len(recording), recording.width, recording.height) == ("nyu", 1, 640, 480)
+        assert (recording.format, len(recording), recording.width, recording.height) == (
+            "nyu",
+            1,
+            640,
+            480,
+        )
         depth = recording.frame(0).depth
         assert (depth.min(), depth.max()) == (731, 2001)
         lens = recording.camera
@@ -112,13 +134,17 @@ def test_a_real_nyu_frame_lies_before_its_joints(reference_data: Path) -> None:
 def test_a_kinect_hand_is_a_folder_of_pictures(reference_data: Path) -> None:
     lens = json.loads((reference_data / "hand_kinect2" / "intrinsics.json").read_text())
     camera = Camera(**{name: lens[name] for name in ("fx", "fy", "cx", "cy", "width", "height")})
-    with open_recording(reference_data / "hand_kinect2", camera=camera, fps=30, strict=True) as recording:
+    with open_recording(
+        reference_data / "hand_kinect2", camera=camera, fps=30, strict=True
+    ) as recording:
         assert (len(recording), recording.width, recording.height) == (30, 512, 424)
         depth = recording.frame(0).depth
         assert 400 < depth[depth > 0].min() < 700
 
 
-def test_the_vendors_calibration_holds_no_metric_scale(reference_data: Path, tmp_path: Path) -> None:
+def test_the_vendors_calibration_holds_no_metric_scale(
+    reference_data: Path, tmp_path: Path
+) -> None:
     path = reference_data / "depth_files" / "raytrix" / "tree_Calibration.xml"
     found = read_ray_calibration(path)
     assert found.diameter_px == pytest.approx(23.2136, abs=1e-4)
@@ -126,14 +152,20 @@ def test_the_vendors_calibration_holds_no_metric_scale(reference_data: Path, tmp
     assert np.round(found.depth_ranges, 3).tolist() == [[1.0, 3.2], [2.6, 4.2], [3.5, 100.0]]
     assert "raytrix.toml" in refusal(path.parent)
     copy_of([path], tmp_path)
-    write_raytrix(tmp_path, np.full((1, 48, 64), 2.5, np.float32), "raytrix-virtual", ".tif", write_tiff)
+    write_raytrix(
+        tmp_path, np.full((1, 48, 64), 2.5, np.float32), "raytrix-virtual", ".tif", write_tiff
+    )
     sentence = refusal(tmp_path)
     assert "tree_Calibration.xml" in sentence
     assert "tcp = 2.207 in virtual depth, but no focal length and no metric scale" in sentence
 
 
-def test_pictures_survive_a_way_through_mcap(reference_data: Path, expected: dict[str, Any], tmp_path: Path) -> None:
-    with open_recording(reference_data / "depth_files" / "xtion_open3d", camera=XTION, fps=30) as pictures:
+def test_pictures_survive_a_way_through_mcap(
+    reference_data: Path, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    with open_recording(
+        reference_data / "depth_files" / "xtion_open3d", camera=XTION, fps=30
+    ) as pictures:
         stored = np.stack([frame.depth for frame in pictures]).astype(np.uint16)
     with open_recording(write_mcap(tmp_path / "transcoded.mcap", stored, XTION)) as recording:
         for frame in recording:
@@ -151,26 +183,38 @@ def test_a_realsense_bag_holds_what_independent_readers_found(
 ) -> None:
     path = reference_data / "depth_files" / "realsense_bag" / "single_depth_color_640x480.bag"
     with open_recording(path, strict=True) as recording:
-        assert (len(recording), recording.width, recording.height, recording.problems) == (2, 640, 480, [])
+        assert (len(recording), recording.width, recording.height, recording.problems) == (
+            2,
+            640,
+            480,
+            [],
+        )
         camera = recording.camera
         np.testing.assert_allclose(
-            [camera.fx, camera.fy, camera.cx, camera.cy], [390.43, 390.43, 331.39, 242.19], atol=0.01
+            [camera.fx, camera.fy, camera.cx, camera.cy],
+            [390.43, 390.43, 331.39, 242.19],
+            atol=0.01,
         )
         assert recording.times_ns.tolist() == [360_815_089_000, 360_981_765_000]
         for frame in recording:
-            assert_as_expected(frame.depth, expected[f"realsense_bag/{path.name} message {frame.index}"])
+            assert_as_expected(
+                frame.depth, expected[f"realsense_bag/{path.name} message {frame.index}"]
+            )
         with open_recording(cut(path, 0.97, tmp_path / "cut.bag")) as part:
             assert part.truncated
             np.testing.assert_array_equal(part.frame(0).depth, recording.frame(0).depth)
 
 
 def test_a_real_kinect_session_is_read_as_it_was_recorded(reference_data: Path) -> None:
-    with open_recording(reference_data / "mouse_kinect2" / "session_20170125.tar.gz", strict=True) as recording:
+    with open_recording(
+        reference_data / "mouse_kinect2" / "session_20170125.tar.gz", strict=True
+    ) as recording:
         assert (len(recording), recording.width, recording.height) == (300, 512, 424)
         assert recording.metadata["session_start_time"] == "2017-01-25T10:42:07.173469-05:00"
         assert recording.duration_s == pytest.approx(10.30, abs=0.005)
         lengths_ms = [
-            int(recording.times_ns[g.stop_frame] - recording.times_ns[g.stop_frame - 1]) / 1e6 for g in recording.gaps
+            int(recording.times_ns[g.stop_frame] - recording.times_ns[g.stop_frame - 1]) / 1e6
+            for g in recording.gaps
         ]
         assert np.round(lengths_ms).tolist() == [200.0, 134.0, 100.0]
         assert [gap.n_frames_missing for gap in recording.gaps] == [5, 3, 2]
@@ -178,9 +222,14 @@ def test_a_real_kinect_session_is_read_as_it_was_recorded(reference_data: Path) 
         assert np.median(depth[depth > 0]) == pytest.approx(673.5, abs=10)
 
 
-def test_a_real_session_that_is_cut_gives_the_same_frames(reference_data: Path, tmp_path: Path) -> None:
+def test_a_real_session_that_is_cut_gives_the_same_frames(
+    reference_data: Path, tmp_path: Path
+) -> None:
     whole = reference_data / "mouse_kinect2" / "session_20170125.tar.gz"
-    with open_recording(whole) as recording, open_recording(cut(whole, 0.2, tmp_path / whole.name)) as part:
+    with (
+        open_recording(whole) as recording,
+        open_recording(cut(whole, 0.2, tmp_path / whole.name)) as part,
+    ):
         assert part.truncated
         assert 20 < len(part) < 100
         for index in (0, len(part) // 2, len(part) - 1):

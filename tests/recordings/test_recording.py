@@ -15,13 +15,22 @@ from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
 from liex_lab.recordings.frame import depth_mm
 from liex_lab.recordings.recording import file_digest
-from tests.recordings.writers import SMALL, depth_frames, even_times, write_camera, write_mcap, write_png_folder
+from tests.recordings.writers import (
+    SMALL,
+    depth_frames,
+    even_times,
+    write_camera,
+    write_mcap,
+    write_png_folder,
+)
 
 N = 7
 STORED = depth_frames(N)
 
 
-def in_memory(n: int = N, times_ns: list[int] | None = None, reads: list[int] | None = None) -> Recording:
+def in_memory(
+    n: int = N, times_ns: list[int] | None = None, reads: list[int] | None = None
+) -> Recording:
     def read(index: int) -> NDArray[np.float32]:
         if reads is not None:
             reads.append(index)
@@ -50,7 +59,10 @@ def test_chunks_hold_every_frame_once() -> None:
         next(in_memory(7).chunks(0))
 
 
-@given(st.slices(12).filter(lambda s: s.step is None or s.step > 0), st.slices(5).filter(lambda s: s.step in (None, 1)))
+@given(
+    st.slices(12).filter(lambda s: s.step is None or s.step > 0),
+    st.slices(5).filter(lambda s: s.step in (None, 1)),
+)
 def test_a_slice_of_a_slice_holds_the_frames_a_list_would(first: slice, second: slice) -> None:
     recording = in_memory(12)
     expected = list(range(12))[first]
@@ -139,7 +151,9 @@ def test_a_recording_without_a_file_is_known_by_its_content() -> None:
     st.sampled_from([1.0, 0.2, -1.0, 1000.0]),
     st.lists(st.sampled_from([0.0, 2047.0, 65535.0, float("nan")]), max_size=3),
 )
-def test_unread_is_told_by_the_stored_value(kind: str, values: list[float], unit: float, unread: list[float]) -> None:
+def test_unread_is_told_by_the_stored_value(
+    kind: str, values: list[float], unit: float, unread: list[float]
+) -> None:
     stored = np.array([values], kind)
     by_hand = [0.0 if v == 0 or v in unread or v * unit < 0 else v * unit for v in values]
     depth = depth_mm(stored, unit, unread)

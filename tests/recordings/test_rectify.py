@@ -10,7 +10,14 @@ import pytest
 from liex_lab.optics.camera import Camera, Distortion
 from liex_lab.optics.refraction import RANGINGS, Water
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.rectify import ideal_camera, lookup_table, rectified, rectifier, share_lost, straight_camera
+from liex_lab.recordings.rectify import (
+    ideal_camera,
+    lookup_table,
+    rectified,
+    rectifier,
+    share_lost,
+    straight_camera,
+)
 from tests.oracles.plate import Plate
 
 CAMERA = Camera(150.0, 152.0, 79.5, 61.0, 160, 120)
@@ -24,16 +31,26 @@ STORED[rng.random(STORED.shape) < 0.05] = 0
 
 def recording(camera: Camera = CAMERA) -> Recording:
     return Recording(
-        name="r", format="images", camera=camera, times_ns=np.cumsum([5, 30, 31, 90, 30, 30, 29, 30, 30]) * 1_000_000,
-        read=lambda k: STORED[k].copy(), problems=["odd"], truncated=True, n_whole=8, metadata={"subject_id": "m01"},
-    )  # fmt: skip
+        name="r",
+        format="images",
+        camera=camera,
+        times_ns=np.cumsum([5, 30, 31, 90, 30, 30, 29, 30, 30]) * 1_000_000,
+        read=lambda k: STORED[k].copy(),
+        problems=["odd"],
+        truncated=True,
+        n_whole=8,
+        metadata={"subject_id": "m01"},
+    )
 
 
 def carried_by_hand(depth: np.ndarray, camera: Camera, water: Water) -> np.ndarray:
     """The loop a reader would write, without the filling of holes: nearest point to a pixel, 0 for none."""
     ideal = ideal_camera(camera, water)
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    points = water.true_points(camera.unproject(np.stack([u, v], -1), 1.0)[..., :2], depth) + water.lift_mm
+    points = (
+        water.true_points(camera.unproject(np.stack([u, v], -1), 1.0)[..., :2], depth)
+        + water.lift_mm
+    )
     places = np.floor(ideal.project(points) + 0.5)
     out = np.zeros(depth.shape)
     for row, column in np.argwhere(depth > 0):
@@ -54,7 +71,16 @@ def test_a_recording_of_an_ideal_camera_in_air_is_handed_on_untouched() -> None:
 def test_everything_but_the_depth_stays(camera: Camera) -> None:
     original = recording(camera)
     seen = rectified(original, WATER)
-    for name in ("name", "format", "truncated", "n_whole", "metadata", "gaps", "rate_hz", "duration_s"):
+    for name in (
+        "name",
+        "format",
+        "truncated",
+        "n_whole",
+        "metadata",
+        "gaps",
+        "rate_hz",
+        "duration_s",
+    ):
         assert getattr(seen, name) == getattr(original, name), name
     np.testing.assert_array_equal(seen.times_ns, original.times_ns)
     assert seen.digest() == original.digest()
@@ -64,8 +90,9 @@ def test_everything_but_the_depth_stays(camera: Camera) -> None:
         assert (seen.width, seen.height) == (160, 120)
     assert seen.camera.distortion is None
     assert seen.optics == {
-        "distortion": camera.distortion and camera.distortion.to_dict(), "water": WATER.to_dict()
-    }  # fmt: skip
+        "distortion": camera.distortion and camera.distortion.to_dict(),
+        "water": WATER.to_dict(),
+    }
 
 
 def test_it_is_lazy_sliceable_and_the_same_again() -> None:
@@ -101,9 +128,13 @@ def test_the_water_is_undone_once() -> None:
 def test_closing_closes_the_recording_behind() -> None:
     closed = []
     original = Recording(
-        name="r", format="x", camera=BARREL, times_ns=np.arange(3), read=lambda k: STORED[k],
+        name="r",
+        format="x",
+        camera=BARREL,
+        times_ns=np.arange(3),
+        read=lambda k: STORED[k],
         close=lambda: closed.append(1),
-    )  # fmt: skip
+    )
     with rectified(original, WATER) as seen:
         assert seen.frame(1).depth.any()
     assert closed == [1]
@@ -132,18 +163,24 @@ def test_the_lookup_table_takes_the_nearest_pixel() -> None:
         assert table[v, u] == (row * 160 + column if inside else -1)
 
 
-@pytest.mark.parametrize("water", [WATER, Water(450.0, 1.34, 0.05, -0.08, "structured_light"), Water(900.0)])
+@pytest.mark.parametrize(
+    "water", [WATER, Water(450.0, 1.34, 0.05, -0.08, "structured_light"), Water(900.0)]
+)
 def test_fast_and_slow_agree(water: Water) -> None:
     depth = STORED[0]
     slow = carried_by_hand(depth, CAMERA, water)
     fast = rectifier(CAMERA, water)(depth)
     reached = slow > 0
-    assert (np.abs(fast - slow)[reached] > 0.05).mean() < 0.002, "but for points on the border of two pixels"
+    assert (np.abs(fast - slow)[reached] > 0.05).mean() < 0.002, (
+        "but for points on the border of two pixels"
+    )
 
 
 @pytest.mark.parametrize("ranging", RANGINGS[:3])
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.06, -0.04)])
-def test_the_floor_of_a_tank_is_flat_and_as_deep_as_it_is(ranging: str, tilt: tuple[float, float]) -> None:
+def test_the_floor_of_a_tank_is_flat_and_as_deep_as_it_is(
+    ranging: str, tilt: tuple[float, float]
+) -> None:
     water = Water(400.0, 1.333, *tilt, ranging)
     plate = Plate(600.0, 120.0)
     undone = rectifier(CAMERA, water)(plate.depth(CAMERA, water).astype(np.float32))
@@ -164,7 +201,8 @@ def test_unread_stays_unread_and_only_cracks_are_closed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("camera", "most"), [(BARREL, 0.07), (FISHEYE, 0.07), (replace(CAMERA, distortion=Distortion.of("", [0.1])), 0.0)]
+    ("camera", "most"),
+    [(BARREL, 0.07), (FISHEYE, 0.07), (replace(CAMERA, distortion=Distortion.of("", [0.1])), 0.0)],
 )
 def test_the_straight_picture_holds_what_the_bent_one_held(camera: Camera, most: float) -> None:
     straight = straight_camera(camera)
@@ -173,11 +211,15 @@ def test_the_straight_picture_holds_what_the_bent_one_held(camera: Camera, most:
     assert (straight.fx, straight.fy) == (camera.fx, camera.fy)
     assert share_lost(camera) <= most
     middle = np.array([[80.0, 60.0]])
-    off = straight.project(camera.unproject(middle, 1.0)) - straight.project(CAMERA.unproject(middle, 1.0))
+    off = straight.project(camera.unproject(middle, 1.0)) - straight.project(
+        CAMERA.unproject(middle, 1.0)
+    )
     assert np.abs(off).max() < 0.5, "and the middle keeps its detail"
 
 
 def test_much_that_leaves_the_picture_is_told() -> None:
     seen = rectified(recording(replace(CAMERA, distortion=Distortion.of("plumb_bob", [-0.5]))))
     assert any("leave the picture" in problem for problem in seen.problems)
-    assert not any("leave the picture" in problem for problem in rectified(recording(CAMERA), WATER).problems)
+    assert not any(
+        "leave the picture" in problem for problem in rectified(recording(CAMERA), WATER).problems
+    )

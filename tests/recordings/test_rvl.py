@@ -23,7 +23,9 @@ def test_packed_depth_is_what_a_slow_decoder_reads(share_unread, spread):
 
 
 def test_words_that_end_too_early_or_hold_too_much_are_no_picture():
-    words = pack_rvl(np.random.default_rng(3).integers(0, 900, (23, 31)).astype(np.uint16)).tobytes()
+    words = pack_rvl(
+        np.random.default_rng(3).integers(0, 900, (23, 31)).astype(np.uint16)
+    ).tobytes()
     assert unpack(words, 31, 23) is not None
     assert all(unpack(words[:n], 31, 23) is None for n in range(0, len(words) - 4, 4))
     assert unpack(words, 31, 20) is None

@@ -54,7 +54,9 @@ def test_no_other_choice_moves_fewer_stamps(times: list[int]) -> None:
         """Room for the stamps between: at least one nanosecond each."""
         return all(times[b] - times[a] >= b - a for a, b in pairwise(chosen))
 
-    assert kept == max(n for n in range(len(times) + 1) for c in combinations(range(len(times)), n) if can_stay(c))
+    assert kept == max(
+        n for n in range(len(times) + 1) for c in combinations(range(len(times)), n) if can_stay(c)
+    )
 
 
 def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
@@ -65,11 +67,21 @@ def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
 
 
 def test_stamps_that_are_moved_are_spread_evenly_between_those_that_stay() -> None:
-    np.testing.assert_array_equal(settle(np.array([0, 33, 33, 99, 132])).times_ns, [0, 33, 66, 99, 132])
-    np.testing.assert_array_equal(settle(np.array([0, 33, 33, 33, 132])).times_ns, [0, 33, 66, 99, 132])
-    np.testing.assert_array_equal(settle(np.array([0, 33, 33, 34])).times_ns, [0, 16, 33, 34])  # no room behind it
-    np.testing.assert_array_equal(settle(np.array([0, 30, 60, 90, 5, 6])).times_ns, [0, 30, 60, 90, 120, 150])
-    np.testing.assert_array_equal(settle(np.array([900, 901, 60, 90, 120])).times_ns, [0, 30, 60, 90, 120])
+    np.testing.assert_array_equal(
+        settle(np.array([0, 33, 33, 99, 132])).times_ns, [0, 33, 66, 99, 132]
+    )
+    np.testing.assert_array_equal(
+        settle(np.array([0, 33, 33, 33, 132])).times_ns, [0, 33, 66, 99, 132]
+    )
+    np.testing.assert_array_equal(
+        settle(np.array([0, 33, 33, 34])).times_ns, [0, 16, 33, 34]
+    )  # no room behind it
+    np.testing.assert_array_equal(
+        settle(np.array([0, 30, 60, 90, 5, 6])).times_ns, [0, 30, 60, 90, 120, 150]
+    )
+    np.testing.assert_array_equal(
+        settle(np.array([900, 901, 60, 90, 120])).times_ns, [0, 30, 60, 90, 120]
+    )
 
 
 def faults_of(times: list[int]) -> list[str]:
@@ -148,12 +160,37 @@ def test_a_recording_lists_what_its_clock_did(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "first", "steps", "moment"),
     [
-        (["f_20121214T142255.814212.tif", "f_20121214T142256.068683.tif"], 1355494975_814212000, [254_471_000], False),
-        (["2024-05-01_10-00-00.123.png", "2024-05-01_10-00-00.456.png"], 1714557600_123000000, [333_000_000], False),
-        (["1305031102.175304.png", "1305031102.211214.png"], 1305031102_175304000, [35_910_000], True),
+        (
+            ["f_20121214T142255.814212.tif", "f_20121214T142256.068683.tif"],
+            1355494975_814212000,
+            [254_471_000],
+            False,
+        ),
+        (
+            ["2024-05-01_10-00-00.123.png", "2024-05-01_10-00-00.456.png"],
+            1714557600_123000000,
+            [333_000_000],
+            False,
+        ),
+        (
+            ["1305031102.175304.png", "1305031102.211214.png"],
+            1305031102_175304000,
+            [35_910_000],
+            True,
+        ),
         (["d_1700000000123.png", "d_1700000000156.png"], 1700000000_123000000, [33_000_000], True),
-        (["1700000000123456_a.png", "1700000000156789_a.png"], 1700000000_123456000, [33_333_000], True),
-        (["1700000000123456789.png", "1700000000156789012.png"], 1700000000_123456789, [33_332_223], True),
+        (
+            ["1700000000123456_a.png", "1700000000156789_a.png"],
+            1700000000_123456000,
+            [33_333_000],
+            True,
+        ),
+        (
+            ["1700000000123456789.png", "1700000000156789012.png"],
+            1700000000_123456789,
+            [33_332_223],
+            True,
+        ),
     ],
 )
 def test_stamps_in_names_are_read_as_people_write_them(
@@ -167,11 +204,16 @@ def test_stamps_in_names_are_read_as_people_write_them(
 @pytest.mark.parametrize(
     "names",
     [
-        [], ["frame_0.png", "frame_1.png"], ["frame_0000000000001.png", "frame_0000000000002.png"],
-        ["1305031102.175304.png", "last.png"], ["20121399T142255.814212.png"], ["1305031102.175_1305031103.175.png"],
-        ["20240501.png"], ["20240501_101010.png"],
+        [],
+        ["frame_0.png", "frame_1.png"],
+        ["frame_0000000000001.png", "frame_0000000000002.png"],
+        ["1305031102.175304.png", "last.png"],
+        ["20121399T142255.814212.png"],
+        ["1305031102.175_1305031103.175.png"],
+        ["20240501.png"],
+        ["20240501_101010.png"],
     ],
-)  # fmt: skip
+)
 def test_names_that_only_count_hold_no_stamps(names: list[str]) -> None:
     assert name_times(names) is None
 
@@ -180,7 +222,10 @@ def test_gaps_are_steps_of_more_than_one_and_a_half_medians() -> None:
     times = np.cumsum([0, 10, 10, 10, 30, 10, 15, 10, 16, 10]).astype(np.int64)
     first, second = find_gaps(times, median_step(times))
     assert (first.start_frame, first.stop_frame, first.n_frames_missing) == (4, 4, 2)
-    assert (first.start_ns, first.stop_ns) == (40, 60)  # from when the next frame was due until the one that came
+    assert (first.start_ns, first.stop_ns) == (
+        40,
+        60,
+    )  # from when the next frame was due until the one that came
     assert (second.start_frame, second.n_frames_missing) == (8, 1)
     assert find_gaps(times[:1], 0) == []
 

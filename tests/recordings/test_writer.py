@@ -39,7 +39,9 @@ WRITERS: dict[str, Any] = {
     "raw": lambda folder: McapDepthWriter(folder / "r.mcap", SMALL),
     "png": lambda folder: McapDepthWriter(folder / "r.mcap", SMALL, packing="png"),
     "ros": lambda folder: McapDepthWriter(folder / "r.mcap", SMALL, messages="ros"),
-    "ros png": lambda folder: McapDepthWriter(folder / "r.mcap", SMALL, messages="ros", packing="png"),
+    "ros png": lambda folder: McapDepthWriter(
+        folder / "r.mcap", SMALL, messages="ros", packing="png"
+    ),
     "pictures": lambda folder: PictureFolderWriter(folder / "r", SMALL),
     "oni": lambda folder: OniRecordingWriter(folder / "r.oni", SMALL),
 }
@@ -55,10 +57,14 @@ def test_what_is_written_is_read_again(tmp_path: Path, kind: str, start_ns: int)
     with open_recording(writer.path, strict=True) as recording:
         assert recording.problems == []
         exact = [(t + 500) // 1000 * 1000 for t in even_times(len(STORED), start_ns)]
-        assert recording.times_ns.tolist() == (exact if kind == "oni" else even_times(len(STORED), start_ns))
+        assert recording.times_ns.tolist() == (
+            exact if kind == "oni" else even_times(len(STORED), start_ns)
+        )
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
         assert recording.camera.matrix.tolist() == SMALL.matrix.tolist()
-    assert notes == (["times were rounded to microseconds, which is what .oni holds"] if kind == "oni" else [])
+    assert notes == (
+        ["times were rounded to microseconds, which is what .oni holds"] if kind == "oni" else []
+    )
 
 
 BENT = [
@@ -70,7 +76,9 @@ BENT = [
 
 @pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize("distortion", BENT, ids=str)
-def test_a_bent_lens_stays_bent(tmp_path: Path, kind: str, distortion: Distortion, monkeypatch: Any) -> None:
+def test_a_bent_lens_stays_bent(
+    tmp_path: Path, kind: str, distortion: Distortion, monkeypatch: Any
+) -> None:
     monkeypatch.setattr("tests.recordings.test_writer.SMALL", replace(SMALL, distortion=distortion))
     writer = WRITERS[kind](tmp_path)
     notes = fill(writer, STORED[:2])
@@ -109,7 +117,9 @@ def test_the_reader_of_mcap_itself_reads_what_we_write(tmp_path: Path, packing: 
     assert (lens.width, lens.height, depth[0].decoded_message.frame_id) == (64, 48, lens.frame_id)
     if packing == "raw":
         for message, frame in zip(depth, STORED, strict=True):
-            np.testing.assert_array_equal(np.frombuffer(message.decoded_message.data, "<u2"), frame.ravel())
+            np.testing.assert_array_equal(
+                np.frombuffer(message.decoded_message.data, "<u2"), frame.ravel()
+            )
 
 
 @pytest.mark.parametrize("packing", ["raw", "png"])
@@ -127,9 +137,16 @@ def test_rosbags_opens_what_we_write(tmp_path: Path, packing: Any) -> None:
     (lens, _), depth = read["/camera/camera_info"], read["/camera/depth"]
     np.testing.assert_array_equal(lens.k, SMALL.matrix.ravel())
     np.testing.assert_array_equal(lens.p.reshape(3, 4)[:, :3], SMALL.matrix)
-    assert (lens.width, lens.height, lens.distortion_model, lens.d.tolist()) == (64, 48, "plumb_bob", [0.0] * 5)
+    assert (lens.width, lens.height, lens.distortion_model, lens.d.tolist()) == (
+        64,
+        48,
+        "plumb_bob",
+        [0.0] * 5,
+    )
     if packing == "raw":
-        assert {(m.width, m.height, m.step, m.encoding, m.is_bigendian) for m in depth} == {(64, 48, 128, "16UC1", 0)}
+        assert {(m.width, m.height, m.step, m.encoding, m.is_bigendian) for m in depth} == {
+            (64, 48, 128, "16UC1", 0)
+        }
         pictures = [m.data.view("<u2").reshape(48, 64) for m in depth]
     else:
         pictures = [cv2.imdecode(m.data, cv2.IMREAD_UNCHANGED) for m in depth]
@@ -172,7 +189,10 @@ def test_metres_are_the_nearest_there_are(values: list[float]) -> None:
     assert np.all(off <= np.spacing(np.maximum(depth, np.float32(1e-30))))
 
 
-@given(st.lists(st.integers(0, 65535), min_size=1, max_size=20), st.sampled_from([1.0, 0.5, 0.25, 0.1, 0.05, 0.01]))
+@given(
+    st.lists(st.integers(0, 65535), min_size=1, max_size=20),
+    st.sampled_from([1.0, 0.5, 0.25, 0.1, 0.05, 0.01]),
+)
 def test_whole_steps_are_read_back_exactly(values: list[int], step_mm: float) -> None:
     stored = np.array([values], np.uint16)
     depth = depth_mm(stored, step_mm)

@@ -13,12 +13,22 @@ import numpy as np
 
 from tests.recordings.writers import Frames, write_camera, write_moseq_folder
 
-FACTORY = (0.5122697949409485, 0.49451231956481934, 0.4921168386936188, 0.4921667277812958)  # cx cy fx fy of one camera
+FACTORY = (
+    0.5122697949409485,
+    0.49451231956481934,
+    0.4921168386936188,
+    0.4921667277812958,
+)  # cx cy fx fy of one camera
 UNKNOWN_SIZE = b"\x01" + b"\xff" * 7
 
 
 def write_avi(
-    path: Path, frames: Frames, fps: int = 30, gop: int = 12, pixels: str = "gray16le", level: int = 3
+    path: Path,
+    frames: Frames,
+    fps: int = 30,
+    gop: int = 12,
+    pixels: str = "gray16le",
+    level: int = 3,
 ) -> Path:
     """FFV1 in AVI, one key picture in `gop`; level 3 has check sums and level 1 none."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,7 +45,9 @@ def write_avi(
     return path
 
 
-def write_video_session(folder: Path, frames: Frames, video: str = "depth.avi", **how: object) -> Path:
+def write_video_session(
+    folder: Path, frames: Frames, video: str = "depth.avi", **how: object
+) -> Path:
     """A MoSeq session whose depth is a video: depth.avi (FFV1) or depth.mkv (raw), stamps, metadata, camera.toml."""
     write_moseq_folder(folder, frames)
     (folder / "depth.dat").unlink()
@@ -75,15 +87,24 @@ def write_mkv(
     info += [] if date_ns is None else [element(0x4461, date_ns.to_bytes(8, "big", signed=True))]
     attached = [
         element(
-            0x61A7, _text(0x466E, name) + _text(0x4660, "application/json") + _number(0x46AE, 7) + element(0x465C, data)
+            0x61A7,
+            _text(0x466E, name)
+            + _text(0x4660, "application/json")
+            + _number(0x46AE, 7)
+            + element(0x465C, data),
         )
         for name, data in (attachments or {}).items()
     ]
-    tagged = [element(0x7373, element(0x63C0, b"") + element(0x67C8, _text(0x45A3, k) + _text(0x4487, v)))
-              for k, v in (tags or {}).items()]  # fmt: skip
+    tagged = [
+        element(0x7373, element(0x63C0, b"") + element(0x67C8, _text(0x45A3, k) + _text(0x4487, v)))
+        for k, v in (tags or {}).items()
+    ]
     body = [
         element(0x1549A966, b"".join(info)),
-        element(0x1654AE6B, b"".join(_track(k + 1, title, width, height) for k, title in enumerate(titles))),
+        element(
+            0x1654AE6B,
+            b"".join(_track(k + 1, title, width, height) for k, title in enumerate(titles)),
+        ),
         element(0x1941A469, b"".join(attached)) if attached else b"",
         element(0x1254C367, b"".join(tagged)) if tagged else b"",
     ]
@@ -91,12 +112,15 @@ def write_mkv(
         blocks = [_number(0xE7, times[start])]
         for k in range(start, min(start + 4, len(frames))):
             blocks += [
-                _block(n + 1, title, frames[k], times[k] - times[start], groups) for n, title in enumerate(titles)
+                _block(n + 1, title, frames[k], times[k] - times[start], groups)
+                for n, title in enumerate(titles)
             ]
         body.append(element(0x1F43B675, b"".join(blocks), open_size=live))
     head = _text(0x4282, "matroska") + _number(0x4287, 4) + _number(0x4285, 2)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(element(0x1A45DFA3, head) + element(0x18538067, b"".join(body), open_size=live))
+    path.write_bytes(
+        element(0x1A45DFA3, head) + element(0x18538067, b"".join(body), open_size=live)
+    )
     return path
 
 
@@ -115,8 +139,12 @@ def _text(id: int, value: str) -> bytes:
 
 
 def _track(number: int, title: str, width: int, height: int) -> bytes:
-    bitmap = struct.pack("<IiiHH4s5I", 40, width, height, 1, 16, b"b16g", width * height * 2, 0, 0, 0, 0)
-    facts = _number(0xD7, number) + _number(0x73C5, number) + _number(0x83, 1) + _text(0x536E, title)
+    bitmap = struct.pack(
+        "<IiiHH4s5I", 40, width, height, 1, 16, b"b16g", width * height * 2, 0, 0, 0, 0
+    )
+    facts = (
+        _number(0xD7, number) + _number(0x73C5, number) + _number(0x83, 1) + _text(0x536E, title)
+    )
     video = element(0xE0, _number(0xB0, width) + _number(0xBA, height))
     return element(0xAE, facts + _text(0x86, "V_MS/VFW/FOURCC") + element(0x63A2, bitmap) + video)
 
@@ -132,11 +160,17 @@ def factory_calibration(distortion: Sequence[float] = (0.0,) * 8) -> bytes:
     k1, k2, p1, p2, k3, k4, k5, k6 = distortion
     depth = {
         "Intrinsics": {
-            "ModelParameterCount": 14, "ModelParameters": [*FACTORY, k1, k2, k3, k4, k5, k6, 0, 0, p2, p1],
+            "ModelParameterCount": 14,
+            "ModelParameters": [*FACTORY, k1, k2, k3, k4, k5, k6, 0, 0, p2, p1],
             "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
         },
-        "Location": "CALIBRATION_CameraLocationD0", "Purpose": "CALIBRATION_CameraPurposeDepth",
-        "SensorHeight": 1024, "SensorWidth": 1024,
-    }  # fmt: skip
-    colour = {"Location": "CALIBRATION_CameraLocationPV0", "Purpose": "CALIBRATION_CameraPurposePhotoVideo"}
+        "Location": "CALIBRATION_CameraLocationD0",
+        "Purpose": "CALIBRATION_CameraPurposeDepth",
+        "SensorHeight": 1024,
+        "SensorWidth": 1024,
+    }
+    colour = {
+        "Location": "CALIBRATION_CameraLocationPV0",
+        "Purpose": "CALIBRATION_CameraPurposePhotoVideo",
+    }
     return json.dumps({"CalibrationInformation": {"Cameras": [colour, depth]}}).encode() + b"\0"

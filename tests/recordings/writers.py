@@ -29,7 +29,9 @@ STEP_NS = 33_333_333
 START_NS = 1_760_000_000_123_456_789  # October 2025: stamps that a float64 of seconds cannot hold
 
 
-def depth_frames(n: int, width: int = 64, height: int = 48, seed: int = 0, floor_mm: int = 700) -> Frames:
+def depth_frames(
+    n: int, width: int = 64, height: int = 48, seed: int = 0, floor_mm: int = 700
+) -> Frames:
     """(n, H, W) mm: a flat floor, noise, unread pixels, and a lump 30 mm high that walks along the row."""
     rng = np.random.default_rng(seed)
     frames = floor_mm + rng.integers(-1, 2, (n, height, width))
@@ -47,7 +49,9 @@ def even_times(n: int, start_ns: int = START_NS, step_ns: int = STEP_NS) -> list
 
 def write_camera(folder: Path, camera: Camera = SMALL, **more: object) -> Path:
     """A camera.toml; `more` are further keys of [camera]."""
-    facts = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")} | more
+    facts = {
+        name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")
+    } | more
     lines = [f"{key} = {json.dumps(value)}" for key, value in facts.items()]
     path = folder / "camera.toml"
     path.write_text("\n".join(["[camera]", *lines, ""]), encoding="utf-8")
@@ -56,14 +60,22 @@ def write_camera(folder: Path, camera: Camera = SMALL, **more: object) -> Path:
 
 def write_times(folder: Path, times_ns: Sequence[int], seconds: bool = False) -> Path:
     """A timestamps.csv, in ns or in decimal seconds."""
-    rows = [f"{t // 10**9}.{t % 10**9:09d}" for t in times_ns] if seconds else [str(t) for t in times_ns]
+    rows = (
+        [f"{t // 10**9}.{t % 10**9:09d}" for t in times_ns]
+        if seconds
+        else [str(t) for t in times_ns]
+    )
     path = folder / "timestamps.csv"
     path.write_text("\n".join(["time_s" if seconds else "time_ns", *rows, ""]), encoding="utf-8")
     return path
 
 
 def write_png_folder(
-    folder: Path, frames: Frames, camera: Camera = SMALL, times_ns: Sequence[int] | None = None, **more: object
+    folder: Path,
+    frames: Frames,
+    camera: Camera = SMALL,
+    times_ns: Sequence[int] | None = None,
+    **more: object,
 ) -> Path:
     """frame_0.png, frame_1.png, ... (so that sorting by letters would be wrong), camera.toml and timestamps.csv."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +106,11 @@ def write_moseq_folder(
     """depth.dat, depth_ts.txt and metadata.json, as the Kinect v2 program writes them."""
     folder.mkdir(parents=True, exist_ok=True)
     frames.astype("<u2").tofile(folder / "depth.dat")
-    stamps = [f"{1000.0 + k * 33.3333:.4f}" for k in range(len(frames))] if times_ms is None else times_ms
+    stamps = (
+        [f"{1000.0 + k * 33.3333:.4f}" for k in range(len(frames))]
+        if times_ms is None
+        else times_ms
+    )
     (folder / "depth_ts.txt").write_text("".join(f"{t} 0\n" for t in stamps), encoding="utf-8")
     facts: dict[str, object] = {
         "DepthResolution": [int(frames.shape[2]), int(frames.shape[1])],
@@ -103,7 +119,9 @@ def write_moseq_folder(
         "StartTime": "2017-01-25T10:42:07.1734698-05:00",
         "SubjectName": "m01",
     }
-    (folder / "metadata.json").write_text(json.dumps(facts if metadata is None else metadata), encoding="utf-8")
+    (folder / "metadata.json").write_text(
+        json.dumps(facts if metadata is None else metadata), encoding="utf-8"
+    )
     return folder
 
 
@@ -138,24 +156,40 @@ def write_mcap(
 
     encoding "png" writes CompressedImage; `padding` bytes follow each row; log times lag the stamps by `log_delay_ns`.
     """
-    options = MCAPWriteOptions(compression=compression, chunk_size=chunk_size, use_chunks=use_chunks)
+    options = MCAPWriteOptions(
+        compression=compression, chunk_size=chunk_size, use_chunks=use_chunks
+    )
     context = foxglove.Context()
     writer = foxglove.open_mcap(path, context=context, allow_overwrite=True, writer_options=options)
     for topic in topics:
         if camera is not None:
-            lens = CameraCalibrationChannel(topic.rpartition("/")[0] + "/calibration", context=context)
+            lens = CameraCalibrationChannel(
+                topic.rpartition("/")[0] + "/calibration", context=context
+            )
             lens.log(
                 CameraCalibration(
-                    timestamp=Timestamp(sec=0, nsec=0), frame_id=topic, width=camera.width, height=camera.height,
-                    K=[float(k) for k in camera.matrix.ravel()], D=list(distortion),
+                    timestamp=Timestamp(sec=0, nsec=0),
+                    frame_id=topic,
+                    width=camera.width,
+                    height=camera.height,
+                    K=[float(k) for k in camera.matrix.ravel()],
+                    D=list(distortion),
                 ),
                 log_time=START_NS,
-            )  # fmt: skip
+            )
         make: Any = CompressedImageChannel if encoding == "png" else RawImageChannel
         channel = make(topic, context=context)
-        for time_ns, frame in zip(even_times(len(frames)) if times_ns is None else times_ns, frames, strict=True):
-            stamp = Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9) if stamped else Timestamp(sec=0, nsec=0)
-            channel.log(_image(frame, stamp, topic, encoding, padding), log_time=time_ns + log_delay_ns)
+        for time_ns, frame in zip(
+            even_times(len(frames)) if times_ns is None else times_ns, frames, strict=True
+        ):
+            stamp = (
+                Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
+                if stamped
+                else Timestamp(sec=0, nsec=0)
+            )
+            channel.log(
+                _image(frame, stamp, topic, encoding, padding), log_time=time_ns + log_delay_ns
+            )
     writer.close()
     return path
 
@@ -169,22 +203,36 @@ def _image(
     rows = np.ascontiguousarray(frame).view(np.uint8).reshape(len(frame), -1)
     padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=0xAB)
     return RawImage(
-        timestamp=stamp, frame_id=frame_id, encoding=encoding, width=frame.shape[1], height=frame.shape[0],
-        step=padded.shape[1], data=padded.tobytes(),
-    )  # fmt: skip
+        timestamp=stamp,
+        frame_id=frame_id,
+        encoding=encoding,
+        width=frame.shape[1],
+        height=frame.shape[0],
+        step=padded.shape[1],
+        data=padded.tobytes(),
+    )
 
 
-def in_memory(frames: NDArray[Any], camera: Camera = SMALL, times_ns: Sequence[int] | None = None) -> Recording:
+def in_memory(
+    frames: NDArray[Any], camera: Camera = SMALL, times_ns: Sequence[int] | None = None
+) -> Recording:
     """Depths (n, H, W) mm as a recording that is in no file."""
     times = even_times(len(frames)) if times_ns is None else times_ns
     return Recording(
-        name="in memory", format="memory", camera=camera, times_ns=np.array(times, np.int64),
+        name="in memory",
+        format="memory",
+        camera=camera,
+        times_ns=np.array(times, np.int64),
         read=lambda index: frames[index].astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def write_oni_file(
-    path: Path, frames: Frames, camera: Camera = SMALL, times_ns: Sequence[int] | None = None, codec: Codec = "16zT"
+    path: Path,
+    frames: Frames,
+    camera: Camera = SMALL,
+    times_ns: Sequence[int] | None = None,
+    codec: Codec = "16zT",
 ) -> Path:
     """An .oni file by the product's own writer, which keeps times to the microsecond."""
     return write_oni(in_memory(frames, camera, times_ns), path, codec=codec, overwrite=True)

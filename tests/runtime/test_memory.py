@@ -48,12 +48,16 @@ def test_a_track_on_disk_takes_no_memory_when_it_rests(tmp_path):
 
 def test_a_disk_without_room_is_told_before_any_of_it_is_taken(tmp_path, monkeypatch):
     free = shutil.disk_usage(tmp_path).free
-    monkeypatch.setattr("tempfile.TemporaryFile", lambda **how: pytest.fail("it was tried all the same"))
+    monkeypatch.setattr(
+        "tempfile.TemporaryFile", lambda **how: pytest.fail("it was tried all the same")
+    )
     with pytest.raises(OSError, match="No space left"):
         on_disk(tmp_path)((2 * free,), np.uint8)
 
 
-def test_where_files_cannot_be_mapped_arrays_are_in_memory_and_a_full_disk_is_told(tmp_path, monkeypatch):
+def test_where_files_cannot_be_mapped_arrays_are_in_memory_and_a_full_disk_is_told(
+    tmp_path, monkeypatch
+):
     def refuse(number):
         def memmap(*what, **how):
             raise OSError(number, os.strerror(number))

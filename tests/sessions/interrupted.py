@@ -13,8 +13,17 @@ from tests.sessions.walking_mouse import WalkingMouse, steady
 
 MOUSE = WalkingMouse(steady(8.0), rear_s=(1.0, 2.0), lost=(20, 21))
 CHUNK = 16
-_PRELOADED = ["pandas", "rerun", "foxglove", "cv2", "pyarrow.parquet", "tests.sessions.walking_mouse",
-              "liex_lab.sessions.rrd", "liex_lab.sessions.mcap", "liex_lab.behaviour"]  # fmt: skip
+_PRELOADED = [
+    "pandas",
+    "rerun",
+    "foxglove",
+    "cv2",
+    "pyarrow.parquet",
+    "tests.sessions.walking_mouse",
+    "liex_lab.sessions.rrd",
+    "liex_lab.sessions.mcap",
+    "liex_lab.behaviour",
+]
 
 
 def write_session(place: str, pause_s: float = 0.0, every_s: float = 0.0) -> None:

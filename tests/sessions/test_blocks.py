@@ -21,13 +21,19 @@ MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))
 
 
 @pytest.mark.parametrize("size", [1, 7, 50])
-def test_a_table_made_in_blocks_is_the_one_made_at_once(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_table_made_in_blocks_is_the_one_made_at_once(
+    size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rows = Rows(MOUSE.track(), 5 + np.arange(len(MOUSE.times_ns)), "s", "m")
 
     def made() -> dict[str, pd.DataFrame]:
-        return {name: pd.concat([tables.to_pandas(tables.TABLES[name], block) for block in blocks], ignore_index=True)
-                for name, blocks in (("poses", rows.poses()), ("rotations", rows.rotations()))
-                } | {"frames": rows.frames_table()}  # fmt: skip
+        return {
+            name: pd.concat(
+                [tables.to_pandas(tables.TABLES[name], block) for block in blocks],
+                ignore_index=True,
+            )
+            for name, blocks in (("poses", rows.poses()), ("rotations", rows.rotations()))
+        } | {"frames": rows.frames_table()}
 
     at_once = made()
     monkeypatch.setattr(rows_module, "ROWS_PER_GROUP", size)
@@ -39,7 +45,9 @@ def test_a_table_made_in_blocks_is_the_one_made_at_once(size: int, monkeypatch: 
     assert np.isnan(at_once["frames"]["dt_s"][0])
 
 
-def test_a_data_frame_is_written_in_blocks_as_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_data_frame_is_written_in_blocks_as_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     table = Rows(MOUSE.track(), np.arange(len(MOUSE.times_ns)), "s", "m").frames_table()
     monkeypatch.setattr(tables, "ROWS_PER_GROUP", 16)
     tables.write_table(tmp_path / "a.parquet", tables.FRAMES, tables.from_pandas(table), {})
@@ -54,17 +62,28 @@ def test_some_columns_or_rows_of_a_table_are_those_of_the_whole(tmp_path: Path) 
     poses = session.poses
     wanted = poses[poses["frame_index"].isin([3, 80])].reset_index(drop=True)
     pd.testing.assert_frame_equal(session.table("poses", frame_index=[3, 80]), wanted)
-    pd.testing.assert_frame_equal(session.table("poses", ["joint", "x_mm"], [3, 80]), wanted[["joint", "x_mm"]])
+    pd.testing.assert_frame_equal(
+        session.table("poses", ["joint", "x_mm"], [3, 80]), wanted[["joint", "x_mm"]]
+    )
 
 
-def test_evidence_is_written_in_blocks_as_numpy_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_is_written_in_blocks_as_numpy_writes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = Observations.empty(MOUSE.skeleton, MOUSE.times_ns)
     rng = np.random.default_rng(3)
-    seen.place[:], seen.n_px[:] = rng.normal(size=seen.place.shape), rng.integers(0, 99, seen.n_px.shape)
-    subject = Subject(MOUSE.skeleton, MOUSE.camera, MOUSE.T_arena_camera, 90.0, 5.0, 0.5, (1.0,) * 5)
+    seen.place[:], seen.n_px[:] = (
+        rng.normal(size=seen.place.shape),
+        rng.integers(0, 99, seen.n_px.shape),
+    )
+    subject = Subject(
+        MOUSE.skeleton, MOUSE.camera, MOUSE.T_arena_camera, 90.0, 5.0, 0.5, (1.0,) * 5
+    )
     monkeypatch.setattr(evidence, "_BLOCK", 16)
     write_evidence(tmp_path, seen, subject)
     with np.load(tmp_path / FILE) as kept:
         told = kept["subject"]
-    np.savez_compressed(tmp_path / "by_numpy.npz", subject=told, **{name: getattr(seen, name) for name in COLUMNS})
+    np.savez_compressed(
+        tmp_path / "by_numpy.npz", subject=told, **{name: getattr(seen, name) for name in COLUMNS}
+    )
     assert (tmp_path / FILE).read_bytes() == (tmp_path / "by_numpy.npz").read_bytes()

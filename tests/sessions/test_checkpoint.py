@@ -24,12 +24,17 @@ N_KILLS = 8  # tests/campaign does many more
 def tables_of(folder: Path) -> dict[str, bytes]:
     """Everything that has to be equal."""
     kinds = {".parquet", ".csv", ".toml"}
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in kinds}
+    return {
+        path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in kinds
+    }
 
 
 def depth_messages(folder: Path) -> list[tuple[int, bytes]]:
     with (folder / "session.mcap").open("rb") as file:
-        return [(m.log_time, m.data) for _, _, m in make_reader(file).iter_messages(topics=["/camera/depth"])]
+        return [
+            (m.log_time, m.data)
+            for _, _, m in make_reader(file).iter_messages(topics=["/camera/depth"])
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +82,9 @@ def test_a_killed_session_goes_on_where_it_was(disturbed: tuple[Path, list[int]]
     assert [entry.name for entry in place.parent.iterdir()] == ["circle.liex"]
 
 
-def test_its_files_are_those_of_an_undisturbed_one(disturbed: tuple[Path, list[int]], undisturbed: Path) -> None:
+def test_its_files_are_those_of_an_undisturbed_one(
+    disturbed: tuple[Path, list[int]], undisturbed: Path
+) -> None:
     place, _ = disturbed
     assert tables_of(place) == tables_of(undisturbed)
     assert {path.name for path in place.iterdir()} == {path.name for path in undisturbed.iterdir()}
@@ -85,7 +92,9 @@ def test_its_files_are_those_of_an_undisturbed_one(disturbed: tuple[Path, list[i
         assert (place / "thumbnails" / picture.name).read_bytes() == picture.read_bytes()
 
 
-def test_its_logs_are_whole_and_hold_every_frame_once(disturbed: tuple[Path, list[int]], undisturbed: Path) -> None:
+def test_its_logs_are_whole_and_hold_every_frame_once(
+    disturbed: tuple[Path, list[int]], undisturbed: Path
+) -> None:
     place, _ = disturbed
     assert depth_messages(place) == depth_messages(undisturbed)
     with (place / "session.mcap").open("rb") as file:
@@ -98,7 +107,9 @@ def test_its_logs_are_whole_and_hold_every_frame_once(disturbed: tuple[Path, lis
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # what was joined is read as a whole
-def test_its_replay_holds_the_rows_of_an_undisturbed_one(disturbed: tuple[Path, list[int]], undisturbed: Path) -> None:
+def test_its_replay_holds_the_rows_of_an_undisturbed_one(
+    disturbed: tuple[Path, list[int]], undisturbed: Path
+) -> None:
     for entity in (rrd.DEPTH, f"{rrd.SKELETON}/joints", rrd.ACTIONS):
         rows = [columns_of(Session.open(place), entity) for place in (disturbed[0], undisturbed)]
         assert rows[0]["frame"] == rows[1]["frame"], entity
@@ -146,15 +157,19 @@ def test_a_full_disk_is_told_and_after_making_room_the_work_goes_on(
     assert tables_of(place) == tables_of(undisturbed)
 
 
-def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_jumps_changes_nothing(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(3)
     monkeypatch.setattr(time, "time", lambda: float(rng.uniform(-1e9, 1e10)))
     write_session(str(tmp_path / "circle.liex"))
     assert tables_of(tmp_path / "circle.liex") == tables_of(undisturbed)
 
 
-@pytest.mark.parametrize("damage", ["other facts", "short log", "short column", "no state", "no JSON", "empty",
-                                    "no float"])  # fmt: skip
+@pytest.mark.parametrize(
+    "damage",
+    ["other facts", "short log", "short column", "no state", "no JSON", "empty", "no float"],
+)
 def test_what_cannot_be_gone_on_with_is_begun_anew(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
@@ -188,7 +203,8 @@ def test_an_accident_before_the_first_checkpoint_leaves_nothing(tmp_path: Path) 
 def test_columns_grow_and_are_cut_back(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     blocks = [
-        {"a": rng.normal(size=(n, 2, 3)), "b": rng.integers(0, 9, n), "c": np.array(["x"] * n)} for n in (3, 5, 1)
+        {"a": rng.normal(size=(n, 2, 3)), "b": rng.integers(0, 9, n), "c": np.array(["x"] * n)}
+        for n in (3, 5, 1)
     ]
     columns = Columns(tmp_path)
     for block in blocks:

@@ -26,15 +26,29 @@ from tests.damage import ANYTHING, check, damage
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 READS: list[Callable[[Session], Any]] = [
-    lambda s: s.name, lambda s: s.frames, lambda s: s.poses, lambda s: s.bouts, lambda s: s.summary,
-    lambda s: s.columns, lambda s: s.camera, lambda s: s.T_arena_camera, lambda s: s.arena, lambda s: s.zones,
-    lambda s: s.plan, read_evidence, read_flips,
-]  # fmt: skip
+    lambda s: s.name,
+    lambda s: s.frames,
+    lambda s: s.poses,
+    lambda s: s.bouts,
+    lambda s: s.summary,
+    lambda s: s.columns,
+    lambda s: s.camera,
+    lambda s: s.T_arena_camera,
+    lambda s: s.arena,
+    lambda s: s.zones,
+    lambda s: s.plan,
+    read_evidence,
+    read_flips,
+]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = write(tmp_path_factory.mktemp("whole") / "circle.liex", WalkingMouse(steady(1.0)), individual="=1+1").path
+    path = write(
+        tmp_path_factory.mktemp("whole") / "circle.liex",
+        WalkingMouse(steady(1.0)),
+        individual="=1+1",
+    ).path
     add_evidence(path)
     return path
 
@@ -52,7 +66,9 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def add_evidence(folder: Path) -> None:
     """Put observations.npz into a session."""
     mouse = WalkingMouse(steady(1.0))
-    subject = Subject(mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 5.0, 0.5, (1.0,) * 5)
+    subject = Subject(
+        mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 5.0, 0.5, (1.0,) * 5
+    )
     write_evidence(folder, Observations.empty(mouse.skeleton, mouse.times_ns), subject)
 
 
@@ -81,7 +97,9 @@ def read_all(folder: Path) -> None:
         check(partial(read, session))
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_any_value_anywhere_in_session_json(whole: Path, copy: Path, data: st.DataObject) -> None:
     document = json.loads((whole / "session.json").read_text())
@@ -90,11 +108,25 @@ def test_any_value_anywhere_in_session_json(whole: Path, copy: Path, data: st.Da
     read_all(copy)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(name=st.sampled_from(["frames.parquet", "bouts.parquet", "summary.csv", "columns.json", "plan.toml",
-                             "observations.npz"]),
-       data=st.data())  # fmt: skip
-def test_any_byte_anywhere_in_its_files(whole: Path, copy: Path, name: str, data: st.DataObject) -> None:
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    name=st.sampled_from(
+        [
+            "frames.parquet",
+            "bouts.parquet",
+            "summary.csv",
+            "columns.json",
+            "plan.toml",
+            "observations.npz",
+        ]
+    ),
+    data=st.data(),
+)
+def test_any_byte_anywhere_in_its_files(
+    whole: Path, copy: Path, name: str, data: st.DataObject
+) -> None:
     content = bytearray((whole / name).read_bytes())
     at = data.draw(st.integers(0, len(content) - 1))
     if data.draw(st.booleans()):
@@ -107,9 +139,13 @@ def test_any_byte_anywhere_in_its_files(whole: Path, copy: Path, name: str, data
     (copy / name).write_bytes((whole / name).read_bytes())
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(name=st.sampled_from(["checkpoint.json", "seen/columns.json"]), data=st.data())
-def test_any_value_anywhere_in_an_unfinished_session(part: Path, name: str, data: st.DataObject) -> None:
+def test_any_value_anywhere_in_an_unfinished_session(
+    part: Path, name: str, data: st.DataObject
+) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(shutil.copytree(part, Path(scratch) / "x.part"))
         document = json.loads((copy / name).read_text())
@@ -124,10 +160,14 @@ def test_any_value_anywhere_in_an_unfinished_session(part: Path, name: str, data
         held.leave(keep=False)
 
 
-def test_a_session_that_lacks_a_part_of_session_json_is_read_or_refused(whole: Path, copy: Path) -> None:
+def test_a_session_that_lacks_a_part_of_session_json_is_read_or_refused(
+    whole: Path, copy: Path
+) -> None:
     document = json.loads((whole / "session.json").read_text())
     for name in document:
-        (copy / "session.json").write_text(json.dumps({key: value for key, value in document.items() if key != name}))
+        (copy / "session.json").write_text(
+            json.dumps({key: value for key, value in document.items() if key != name})
+        )
         read_all(copy)
 
 
@@ -141,8 +181,12 @@ def test_any_json_instead_of_a_failure(document: Any) -> None:
         assert isinstance(found["reason"], str)
 
 
-@pytest.mark.parametrize("file", ["../../../etc/passwd", "/etc/passwd", "session.rrd", "thumbnails/../../x.png"])
-def test_a_picture_outside_of_the_session_is_refused(whole: Path, tmp_path: Path, file: str) -> None:
+@pytest.mark.parametrize(
+    "file", ["../../../etc/passwd", "/etc/passwd", "session.rrd", "thumbnails/../../x.png"]
+)
+def test_a_picture_outside_of_the_session_is_refused(
+    whole: Path, tmp_path: Path, file: str
+) -> None:
     folder = Path(shutil.copytree(whole, tmp_path / "x.liex"))
     document = json.loads((folder / "session.json").read_text())
     document["thumbnails"][0]["file"] = file

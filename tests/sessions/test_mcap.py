@@ -55,7 +55,10 @@ def test_the_calibration_is_repeated_about_once_a_second(messages):
     calibrations = messages["/camera/calibration"]
     assert len(calibrations) == 3
     assert list(calibrations[0][1].K) == MOUSE.camera.matrix.ravel().tolist()
-    assert (calibrations[0][1].width, calibrations[0][1].height) == (MOUSE.camera.width, MOUSE.camera.height)
+    assert (calibrations[0][1].width, calibrations[0][1].height) == (
+        MOUSE.camera.width,
+        MOUSE.camera.height,
+    )
 
 
 def test_transforms_place_the_camera_and_the_animal_in_the_arena_in_metres(messages):
@@ -68,7 +71,9 @@ def test_transforms_place_the_camera_and_the_animal_in_the_arena_in_metres(messa
     assert len(placed["root"]) == 74
     assert placed["camera"][0].translation.z == pytest.approx(0.7)
     track, q = MOUSE.track(), placed["root"][10].rotation
-    np.testing.assert_allclose(so3.quaternion(track.root_rotation[10]), [q.w, q.x, q.y, q.z], atol=1e-12)
+    np.testing.assert_allclose(
+        so3.quaternion(track.root_rotation[10]), [q.w, q.x, q.y, q.z], atol=1e-12
+    )
     t = placed["root"][10].translation
     np.testing.assert_allclose([t.x, t.y, t.z], track.root_mm[10] / 1000.0)
 
@@ -95,7 +100,9 @@ def test_actions_are_told_on_change_with_word_and_place(messages, session):
     first = int(MOUSE.times_ns[0])
     starts = [round(start * 1e9) + first for start in session.bouts["start_s"]]
     assert [time for time, state in states if state["action"]] == starts
-    assert [state["frame_index"] for _, state in states if state["action"]] == list(session.bouts["start_frame"])
+    assert [state["frame_index"] for _, state in states if state["action"]] == list(
+        session.bouts["start_frame"]
+    )
 
 
 def test_what_is_odd_about_the_recording_is_in_the_log(messages):

@@ -55,15 +55,25 @@ def columns_of(session, entity):
 @pytest.fixture(scope="module")
 def session(tmp_path_factory, strict):
     gaps = find_gaps(MOUSE.times_ns, median_step(MOUSE.times_ns))
-    return write(tmp_path_factory.mktemp("rrd") / "circle.liex", MOUSE, gaps=gaps, problems=["It was dark."])
+    return write(
+        tmp_path_factory.mktemp("rrd") / "circle.liex", MOUSE, gaps=gaps, problems=["It was dark."]
+    )
 
 
 def test_the_expected_entities_are_there_on_both_timelines(session):
     for entity in (
-        replay.DEPTH, f"{replay.SKELETON}/joints", f"{replay.SKELETON}/bones", f"{replay.OVERLAY}/joints", replay.ROOT,
-        f"{replay.OVERLAY}/bones", "kinematics/speed_mm_s", "kinematics/nose_height_mm", "error/predicted",
-        replay.ACTIONS, replay.TRACKING,
-    ):  # fmt: skip
+        replay.DEPTH,
+        f"{replay.SKELETON}/joints",
+        f"{replay.SKELETON}/bones",
+        f"{replay.OVERLAY}/joints",
+        replay.ROOT,
+        f"{replay.OVERLAY}/bones",
+        "kinematics/speed_mm_s",
+        "kinematics/nose_height_mm",
+        "error/predicted",
+        replay.ACTIONS,
+        replay.TRACKING,
+    ):
         columns = columns_of(session, entity)
         assert columns.get("frame"), entity
         assert len(columns["frame"]) == len(columns["time"]), entity
@@ -86,12 +96,18 @@ def test_walls_and_zones_are_drawn_on_the_floor_and_in_the_picture(tmp_path, str
     bowl = Arena("round", (10.0, 0.0), 150.0)
     session = write(tmp_path / "c.liex", WalkingMouse(steady(0.5)), arena=bowl, zones=(nest,))
     (ring,) = columns_of(session, f"{replay.FLOOR}/walls")["LineStrips3D:strips"][0]
-    np.testing.assert_allclose(np.hypot(np.array(ring)[:, 0] - 0.01, np.array(ring)[:, 1]), 0.15, atol=1e-6)
+    np.testing.assert_allclose(
+        np.hypot(np.array(ring)[:, 0] - 0.01, np.array(ring)[:, 1]), 0.15, atol=1e-6
+    )
     (zone,) = columns_of(session, replay.FLOOR + "/zones/nest\\ a\\/b")["LineStrips3D:strips"][0]
-    np.testing.assert_allclose(np.array(zone)[:, :2] * 1000, [[0, 0], [50, 0], [50, 50], [0, 0]], atol=1e-4)
+    np.testing.assert_allclose(
+        np.array(zone)[:, :2] * 1000, [[0, 0], [50, 0], [50, 50], [0, 0]], atol=1e-4
+    )
     (seen,) = columns_of(session, replay.OVERLAY + "/zones/nest\\ a\\/b")["LineStrips2D:strips"][0]
     camera = session.camera
-    np.testing.assert_allclose(seen[0], [camera.cx + 0.5, camera.cy + 0.5], atol=1e-3)  # the foot of the camera
+    np.testing.assert_allclose(
+        seen[0], [camera.cx + 0.5, camera.cy + 0.5], atol=1e-3
+    )  # the foot of the camera
 
 
 def test_the_worst_frames_can_be_jumped_to(session):
@@ -106,7 +122,9 @@ def unpacked(blob, kind):
     if kind == "image/png":
         return cv2.imdecode(blob, cv2.IMREAD_UNCHANGED)
     width, height = struct.unpack("<II", blob.tobytes()[12:20])
-    return unpack_rvl(np.frombuffer(blob.tobytes()[20:], "<u4"), width * height).reshape(height, width)
+    return unpack_rvl(np.frombuffer(blob.tobytes()[20:], "<u4"), width * height).reshape(
+        height, width
+    )
 
 
 def test_depth_is_held_as_it_is(session):
@@ -125,7 +143,9 @@ def test_a_noisy_frame_takes_less_than_180_kilobytes_and_without_depth_next_to_n
     rng = np.random.default_rng(5)
 
     def noisy(frame):
-        noise = rng.normal(0.0, 1.0, frame.depth.shape) * (frame.depth > 0)  # on top of 1 mm that is there already
+        noise = rng.normal(0.0, 1.0, frame.depth.shape) * (
+            frame.depth > 0
+        )  # on top of 1 mm that is there already
         return replace(frame, depth=np.maximum(frame.depth + noise, 0).astype(np.float32))
 
     sizes = {}
@@ -137,14 +157,21 @@ def test_a_noisy_frame_takes_less_than_180_kilobytes_and_without_depth_next_to_n
             writer.close()
         sizes[depth] = (place / "session.rrd").stat().st_size / 24
     assert sizes[True] < 180_000
-    assert sizes[False] < 12_000  # of so short a session most is the scene and the body, which are there once
+    assert (
+        sizes[False] < 12_000
+    )  # of so short a session most is the scene and the body, which are there once
 
 
 def test_whatever_the_noise_the_picture_comes_out_as_it_went_in():
     rng = np.random.default_rng(8)
     kinds = set()
-    for sd_mm, step_mm in ((0.5, 1), (6.0, 5)):  # a camera that tells steps of 5 mm apart has large ones all over
-        depth = (step_mm * np.rint((700.0 + rng.normal(0.0, sd_mm, (120, 160))) / step_mm)).astype(np.uint16)
+    for sd_mm, step_mm in (
+        (0.5, 1),
+        (6.0, 5),
+    ):  # a camera that tells steps of 5 mm apart has large ones all over
+        depth = (step_mm * np.rint((700.0 + rng.normal(0.0, sd_mm, (120, 160))) / step_mm)).astype(
+            np.uint16
+        )
         blob, kind = replay.packed(depth)
         kinds.add(kind)
         np.testing.assert_array_equal(unpacked(blob, kind), depth)
@@ -161,8 +188,12 @@ def test_the_body_moves_with_the_joints_that_carry_it(session):
         for part in parts:
             columns = columns_of(session, f"{BODY}/{MOUSE.skeleton.names[part.joint]}")
             x, y, z, w = columns["Transform3D:quaternion"][row][0]
-            rotation = so3.exp(2.0 * np.arctan2(np.linalg.norm([x, y, z]), w) * np.array([x, y, z])
-                               / max(np.linalg.norm([x, y, z]), 1e-12))  # fmt: skip
+            rotation = so3.exp(
+                2.0
+                * np.arctan2(np.linalg.norm([x, y, z]), w)
+                * np.array([x, y, z])
+                / max(np.linalg.norm([x, y, z]), 1e-12)
+            )
             local = part.vertices / 1000.0 * columns["Transform3D:scale"][row][0]
             placed = local @ rotation.T + columns["Transform3D:translation"][row][0]
             off = np.linalg.norm(placed[:, None] - trunk[None], axis=-1).min(axis=1)
@@ -176,9 +207,14 @@ def test_every_candidate_is_there_when_it_is_asked_for(tmp_path, strict):
     seen = Observations.empty(mouse.skeleton, mouse.times_ns)
     track = mouse.track()
     for h in (0, 2):
-        seen.put_pose(h, Pose(SE3(track.root_rotation, track.root_mm + 10.0 * h), track.angles_rad, track.scale))
+        seen.put_pose(
+            h,
+            Pose(SE3(track.root_rotation, track.root_mm + 10.0 * h), track.angles_rad, track.scale),
+        )
         seen.score[:, h] = 1.0
-    subject = Subject(mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 9.0, 0.5, (1.0,) * 5)
+    subject = Subject(
+        mouse.skeleton, mouse.camera, mouse.T_arena_camera, 90.0, 9.0, 0.5, (1.0,) * 5
+    )
     with SessionWriter(tmp_path / "c.liex", mouse.provenance(replay_candidates=True)) as writer:
         for frames, _ in mouse.chunks(15):
             writer.add(frames)
@@ -207,7 +243,16 @@ def test_the_overlay_counts_from_the_corner_of_the_picture(session):
 def test_the_action_lane_changes_where_the_bouts_do_and_ends_empty(session):
     columns = columns_of(session, replay.ACTIONS)
     words = [row[0] for row in columns["StateChange:state"] if row]
-    assert words == ["walk", "", "walk", "", "walk", "rear", "walk", ""]  # "" in the gaps, and at the end
+    assert words == [
+        "walk",
+        "",
+        "walk",
+        "",
+        "walk",
+        "rear",
+        "walk",
+        "",
+    ]  # "" in the gaps, and at the end
     assert columns["frame"][0] == 0
     assert columns["frame"][-1] == len(MOUSE.times_s)
     bouts = session.bouts
@@ -232,8 +277,12 @@ def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict
     from mcap.reader import make_reader
     from rerun.chunk import RrdReader
 
-    session = write(tmp_path / "laid_out.liex", WalkingMouse(steady(0.5)), blueprint=replay_blueprint,
-                    problems=["It was dark."])  # fmt: skip
+    session = write(
+        tmp_path / "laid_out.liex",
+        WalkingMouse(steady(0.5)),
+        blueprint=replay_blueprint,
+        problems=["It was dark."],
+    )
     assert len(RrdReader(session.path / "session.rrd").blueprints()) == 1
     write_views(session.path)
     assert len(RrdReader(session.path / "replay.rbl").blueprints()) == 1
@@ -250,4 +299,8 @@ def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict
 
 def panels_of(node):
     """The panels of a layout's tree, in order."""
-    return [node] if isinstance(node, str) else sorted(panels_of(node["first"]) + panels_of(node["second"]))
+    return (
+        [node]
+        if isinstance(node, str)
+        else sorted(panels_of(node["first"]) + panels_of(node["second"]))
+    )

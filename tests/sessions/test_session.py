@@ -28,7 +28,12 @@ START = "2026-08-21T10:00:00+02:00"
 @pytest.fixture(scope="module")
 def session(tmp_path_factory) -> Session:
     subject = {"subject_id": "m01", "group": "control"}
-    return write(tmp_path_factory.mktemp("session") / "circle.liex", MOUSE, subject=subject, problems=["It was dark."])
+    return write(
+        tmp_path_factory.mktemp("session") / "circle.liex",
+        MOUSE,
+        subject=subject,
+        problems=["It was dark."],
+    )
 
 
 def test_a_session_says_where_it_comes_from(session):
@@ -50,10 +55,17 @@ def test_a_session_says_where_it_comes_from(session):
 
 def test_a_recording_and_a_plan_tell_where_a_session_comes_from():
     recording = Recording(
-        name="day1", format="synthetic", camera=MOUSE.camera, times_ns=np.delete(MOUSE.times_ns, [5, 6]),
+        name="day1",
+        format="synthetic",
+        camera=MOUSE.camera,
+        times_ns=np.delete(MOUSE.times_ns, [5, 6]),
         read=lambda row: MOUSE.frame(row).depth,
-        metadata={"subject_id": "m07", "session_start_time": START, "profile": {"name": "raytrix-u16-10um"}},
-    )  # fmt: skip
+        metadata={
+            "subject_id": "m07",
+            "session_start_time": START,
+            "profile": {"name": "raytrix-u16-10um"},
+        },
+    )
     plan = Plan().with_settings(["session.group=control"])
     floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 700.0, MOUSE.camera)
     origin = Provenance.of(recording, floor, MOUSE.skeleton, plan, model={"name": "mouse"})
@@ -63,7 +75,9 @@ def test_a_recording_and_a_plan_tell_where_a_session_comes_from():
     assert len(origin.input_sha256) == 64
     assert origin.document()["input"]["profile"] == {"name": "raytrix-u16-10um"}
     assert origin.document()["plan"]["session"]["group"] == "control"
-    np.testing.assert_allclose(origin.T_arena_camera.matrix, MOUSE.T_arena_camera.matrix, atol=1e-12)
+    np.testing.assert_allclose(
+        origin.T_arena_camera.matrix, MOUSE.T_arena_camera.matrix, atol=1e-12
+    )
 
 
 def test_camera_and_arena_come_back_exactly(session):
@@ -78,7 +92,11 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
     mouse = WalkingMouse(steady(2 * np.pi * 150 / 200), lost=(7,))
     optics = {"distortion": None, "water": {"height_mm": 300.0}}
     session = write(
-        tmp_path / "c.liex", mouse, arena=bowl, zones=(half, Zone("middle", (0.0, 0.0, 20.0))), optics=optics
+        tmp_path / "c.liex",
+        mouse,
+        arena=bowl,
+        zones=(half, Zone("middle", (0.0, 0.0, 20.0))),
+        optics=optics,
     )
     assert session.arena == bowl
     assert session.zones == [half, Zone("middle", (0.0, 0.0, 20.0))]
@@ -96,7 +114,9 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
     assert row["zone_upper_share"] == pytest.approx(0.5, abs=0.03)
     assert row["zone_upper_s"] == pytest.approx(row["zone_upper_share"] * row["observed_s"])
     assert row["zone_middle_s"] == 0.0
-    assert {"zone_upper_s", "zone_middle_share"} <= set(session.columns.query("table == 'summary'")["name"])
+    assert {"zone_upper_s", "zone_middle_share"} <= set(
+        session.columns.query("table == 'summary'")["name"]
+    )
 
 
 def test_a_session_without_walls_and_zones_says_so(session):
@@ -112,7 +132,9 @@ def test_poses_come_back_and_project_onto_their_pixels(session):
     xyz = session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(30, 5, 3)
     np.testing.assert_array_equal(xyz, track.joints_mm)
     uv = session.camera.project(session.T_arena_camera.inverse() @ xyz)
-    np.testing.assert_allclose(session.poses[["u_px", "v_px"]].to_numpy().reshape(30, 5, 2), uv, atol=1e-9)
+    np.testing.assert_allclose(
+        session.poses[["u_px", "v_px"]].to_numpy().reshape(30, 5, 2), uv, atol=1e-9
+    )
     assert list(session.poses["joint"].unique()) == list(MOUSE.skeleton.names)
     assert session.poses["score"].between(0, 1).all()
 
@@ -228,7 +250,10 @@ def test_a_track_may_come_at_the_end_as_a_whole(tmp_path):
 def test_a_recording_in_which_nothing_is_found_is_a_session_all_the_same(tmp_path):
     with SessionWriter(tmp_path / "empty.liex", MOUSE.provenance()) as writer:
         for frames, _ in MOUSE.chunks(10):
-            writer.add(frames, Track.empty(MOUSE.skeleton, np.array([f.time_ns for f in frames]), "no_depth"))
+            writer.add(
+                frames,
+                Track.empty(MOUSE.skeleton, np.array([f.time_ns for f in frames]), "no_depth"),
+            )
         session = writer.close()
     assert session.metadata["frames"]["n_observed"] == 0
     assert list(session.gaps["reason"]) == ["no_depth"]
@@ -236,14 +261,21 @@ def test_a_recording_in_which_nothing_is_found_is_a_session_all_the_same(tmp_pat
 
 
 def test_a_newer_session_asks_for_an_upgrade(session, tmp_path):
-    (tmp_path / "session.json").write_text(json.dumps({**session.metadata, "schema_version": SCHEMA_VERSION + 1}))
+    (tmp_path / "session.json").write_text(
+        json.dumps({**session.metadata, "schema_version": SCHEMA_VERSION + 1})
+    )
     with pytest.raises(SessionError, match="upgrade"):
         Session.open(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [(None, "holds no session.json"), ("{", "damaged"), ("[]", "damaged"), ('{"schema_version": 1}', "lacks plan")],
+    [
+        (None, "holds no session.json"),
+        ("{", "damaged"),
+        ("[]", "damaged"),
+        ('{"schema_version": 1}', "lacks plan"),
+    ],
 )
 def test_what_is_not_a_session_is_refused_with_a_sentence(tmp_path, content, says):
     if content is not None:
@@ -268,7 +300,9 @@ def test_thumbnails_hold_the_depth_around_the_animal(session):
         x0, y0 = max(entry["left_px"], 0), max(entry["top_px"], 0)
         inside = picture[y0 - entry["top_px"] :, x0 - entry["left_px"] :]
         inside = inside[: depth.shape[0] - y0, : depth.shape[1] - x0]
-        np.testing.assert_array_equal(inside, depth[y0 : y0 + inside.shape[0], x0 : x0 + inside.shape[1]])
+        np.testing.assert_array_equal(
+            inside, depth[y0 : y0 + inside.shape[0], x0 : x0 + inside.shape[1]]
+        )
 
 
 _WRITE_MANY = """
@@ -291,14 +325,22 @@ print(session.metadata["peak_memory_mb"])
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells a process its own peak memory")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="only Linux tells a process its own peak memory"
+)
 def test_memory_does_not_grow_with_the_recording(tmp_path):
     short, long = (
-        float(subprocess.run(
-            [sys.executable, "-c", _WRITE_MANY, str(tmp_path / f"{n}.liex"), str(n)], cwd=Path(__file__).parents[2],
-            capture_output=True, text=True, check=True, timeout=120,
-        ).stdout)
+        float(
+            subprocess.run(
+                [sys.executable, "-c", _WRITE_MANY, str(tmp_path / f"{n}.liex"), str(n)],
+                cwd=Path(__file__).parents[2],
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=120,
+            ).stdout
+        )
         for n in (90, 420)
-    )  # fmt: skip
+    )
     assert long - short < 90.0  # 330 frames more are 405 MB of float32 depth
     assert long < 1500.0

@@ -20,7 +20,9 @@ from liex_lab.tracking.track import Track
 FLOOR_MM = 700.0
 SPINE_MM = 90.0
 SMALL = Camera(95.8, 95.8, 53.0, 39.5, 107, 80, source="typical PrimeSense, a sixth of its size")
-SD_ROOT = np.array([0.02, 0.02, 0.05, 1.5, 1.5, 2.0])  # rad and mm; of two of them a fifth is common
+SD_ROOT = np.array(
+    [0.02, 0.02, 0.05, 1.5, 1.5, 2.0]
+)  # rad and mm; of two of them a fifth is common
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ class WalkingMouse:
         if self.rear_s:
             start, stop = self.rear_s
             ramp = 0.15
-            pitch = np.radians(55.0) * np.clip(np.minimum(self.times_s - start, stop - self.times_s) / ramp, 0, 1)
+            pitch = np.radians(55.0) * np.clip(
+                np.minimum(self.times_s - start, stop - self.times_s) / ramp, 0, 1
+            )
         rotation = so3.exp(np.stack([0 * heading, 0 * heading, heading], -1)) @ so3.exp(
             np.stack([0 * pitch, -pitch, 0 * pitch], -1)
         )
@@ -65,20 +69,34 @@ class WalkingMouse:
         pose = Pose(SE3(rotation, np.zeros((n, 3))), angles, scale)
         # the centre of rump to neck goes exactly round the circle, whatever the posture
         centre = pose.joints(skeleton)[:, :-1].mean(axis=1)
-        wanted = np.stack([self.radius_mm * np.cos(turned), self.radius_mm * np.sin(turned), np.full(n, 18.0)], -1)
+        wanted = np.stack(
+            [self.radius_mm * np.cos(turned), self.radius_mm * np.sin(turned), np.full(n, 18.0)], -1
+        )
         wanted[:, 2] += centre[:, 2]
         pose = replace(pose, root=SE3(rotation, wanted - centre))
         joints = pose.joints(skeleton)
         uv = self.camera.project(self.T_arena_camera.inverse() @ joints)
         track = Track(
-            skeleton=skeleton, times_ns=self.times_ns, joints_mm=joints, uv_px=uv,
-            sd_mm=np.full(joints.shape[:2], self.sd_mm), root_rotation=rotation, root_mm=pose.root.translation,
-            cov_root=np.tile(np.outer(SD_ROOT, SD_ROOT) * (0.8 * np.eye(6) + 0.2), (n, 1, 1)), angles_rad=angles,
-            sd_angles_rad=np.full(angles.shape, 0.05), scale=scale,
-            predicted_error_mm=2.0 + 0.5 * np.sin(self.times_s), residual_mm=np.full(n, 1.5),
-            n_foreground_px=np.full(n, 900, np.int64), centroid_mm=joints.mean(axis=1), centroid_px=uv.mean(axis=1),
-            p_flip=np.zeros(n), bridged=np.zeros(n, bool), flag=np.full(n, "", "<U12"),
-        )  # fmt: skip
+            skeleton=skeleton,
+            times_ns=self.times_ns,
+            joints_mm=joints,
+            uv_px=uv,
+            sd_mm=np.full(joints.shape[:2], self.sd_mm),
+            root_rotation=rotation,
+            root_mm=pose.root.translation,
+            cov_root=np.tile(np.outer(SD_ROOT, SD_ROOT) * (0.8 * np.eye(6) + 0.2), (n, 1, 1)),
+            angles_rad=angles,
+            sd_angles_rad=np.full(angles.shape, 0.05),
+            scale=scale,
+            predicted_error_mm=2.0 + 0.5 * np.sin(self.times_s),
+            residual_mm=np.full(n, 1.5),
+            n_foreground_px=np.full(n, 900, np.int64),
+            centroid_mm=joints.mean(axis=1),
+            centroid_px=uv.mean(axis=1),
+            p_flip=np.zeros(n),
+            bridged=np.zeros(n, bool),
+            flag=np.full(n, "", "<U12"),
+        )
         return forget(track, self.lost)
 
     def frame(self, row: int) -> DepthFrame:
@@ -92,7 +110,9 @@ class WalkingMouse:
         c, s = along[:2] / np.hypot(*along[:2])
         p, q = (x - middle[0]) * c + (y - middle[1]) * s, -(x - middle[0]) * s + (y - middle[1]) * c
         inside = 1.0 - (p / (0.65 * length)) ** 2 - (q / 17.0) ** 2
-        height = np.where(inside > 0, np.maximum(middle[2], 5.0) + 16.0 * np.sqrt(np.maximum(inside, 0)), 0.0)
+        height = np.where(
+            inside > 0, np.maximum(middle[2], 5.0) + 16.0 * np.sqrt(np.maximum(inside, 0)), 0.0
+        )
         rng = np.random.default_rng(row)
         depth = FLOOR_MM - height + rng.normal(0.0, 1.0, height.shape)
         depth[rng.random(height.shape) < 0.01] = 0.0
@@ -108,11 +128,18 @@ class WalkingMouse:
     def provenance(self, **more: Any) -> Provenance:
         """What a session has to be told."""
         known: dict[str, Any] = {
-            "name": "circle", "skeleton": self.skeleton, "camera": self.camera, "T_arena_camera": self.T_arena_camera,
-            "floor_distance_mm": FLOOR_MM, "input_sha256": "0" * 64, "plan_toml": 'animal = "mouse"\nseed = 7\n',
-            "format": "synthetic", "n_frames": len(self.times_s), "individual": "mouse_1",
+            "name": "circle",
+            "skeleton": self.skeleton,
+            "camera": self.camera,
+            "T_arena_camera": self.T_arena_camera,
+            "floor_distance_mm": FLOOR_MM,
+            "input_sha256": "0" * 64,
+            "plan_toml": 'animal = "mouse"\nseed = 7\n',
+            "format": "synthetic",
+            "n_frames": len(self.times_s),
+            "individual": "mouse_1",
             "animal_size": {"spine_mm": SPINE_MM, "origin": "known from the simulation"},
-        }  # fmt: skip
+        }
         return Provenance(**{**known, **more})
 
     @property

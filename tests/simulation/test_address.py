@@ -20,7 +20,11 @@ ADDRESS = "synthetic:walk?seed=3&frames=6&sensor=primesense-qvga&spine_mm=70"
 def test_an_address_says_seed_length_sensor_and_size() -> None:
     with open_recording(ADDRESS) as recording:
         assert isinstance(recording, SyntheticSession)
-        assert (recording.name, recording.format, len(recording)) == ("synthetic-walk-3", "synthetic", 6)
+        assert (recording.name, recording.format, len(recording)) == (
+            "synthetic-walk-3",
+            "synthetic",
+            6,
+        )
         assert recording.camera == PRIMESENSE_QVGA
         assert recording.spine_mm == 70.0
         again = open_recording(Path(ADDRESS))  # as the command line hands it over
@@ -71,7 +75,9 @@ def test_a_fish_swims_before_a_light_field_camera_at_50_frames_a_second() -> Non
     assert (fish.name, fish.camera) == ("synthetic-swim-2", RAYTRIX_R5)
     assert fish.rate_hz == pytest.approx(50.0)
     assert (fish.spine_mm, fish.skeleton.name) == (28.0, "fish")
-    np.testing.assert_array_equal(fish.frame(1).depth, swimming_session(2, 3, spine_mm=28.0).frame(1).depth)
+    np.testing.assert_array_equal(
+        fish.frame(1).depth, swimming_session(2, 3, spine_mm=28.0).frame(1).depth
+    )
 
 
 def test_any_animal_moves_that_a_toml_describes() -> None:

@@ -22,7 +22,10 @@ def fish() -> fish_acts.FishActor:
 def mouse() -> mouse_acts.MouseActor:
     rng, habits = np.random.default_rng(3), MouseHabits()
     return mouse_acts.MouseActor.of(
-        Individual.draw(rng, (1.1, 1.1)), habits.skeleton, habits.shapes(rng, "train", 1), np.array([300.0, 260.0])
+        Individual.draw(rng, (1.1, 1.1)),
+        habits.skeleton,
+        habits.shapes(rng, "train", 1),
+        np.array([300.0, 260.0]),
     )
 
 
@@ -54,9 +57,13 @@ def test_the_nine_actions_of_a_fish_follow_their_definitions(fish: fish_acts.Fis
     assert found["thrash"]["speed"].max() < 1.0
 
 
-def test_an_uncut_recording_stays_in_the_water_holds_every_action_and_nameless_stretches(fish) -> None:
+def test_an_uncut_recording_stays_in_the_water_holds_every_action_and_nameless_stretches(
+    fish,
+) -> None:
     motion = fish.uncut(np.random.default_rng(1), 240.0)
-    assert fish.fits(motion.position[::7], motion.heading[::7]) or (np.ptp(motion.position[:, 2]) < 112.0)
+    assert fish.fits(motion.position[::7], motion.heading[::7]) or (
+        np.ptp(motion.position[:, 2]) < 112.0
+    )
     words, counts = np.unique(motion.word, return_counts=True)
     assert set(words) == {"", *fish_acts.ACTIONS}
     assert 0.15 < counts[list(words).index("")] / len(motion.word) < 0.6
@@ -75,10 +82,14 @@ def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse
         assert word != "turn_left" or turn > 0
         assert word != "turn_right" or turn < 0
     near = (mouse.half - np.abs(motion.position[:, :2])).min(axis=1)
-    supported, free = (np.median(near[motion.word == f"rear_{kind}"]) for kind in ("supported", "unsupported"))
+    supported, free = (
+        np.median(near[motion.word == f"rear_{kind}"]) for kind in ("supported", "unsupported")
+    )
     assert supported < 65.0 < free
     speed = motion.channels[:, SPEED] / mouse.mouse.size
-    assert np.median(speed[motion.word == "run"]) > 250 > np.median(speed[motion.word == "walk"]) > 50
+    assert (
+        np.median(speed[motion.word == "run"]) > 250 > np.median(speed[motion.word == "walk"]) > 50
+    )
     assert np.median(speed[motion.word == "freeze"]) < 5
 
 

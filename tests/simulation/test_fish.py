@@ -44,16 +44,24 @@ def test_every_real_posture_is_near_one_that_is_drawn(reference_data):
     drawn = draw_bends(rng, FISH, rng.integers(len(KINDS), size=20_000))[:, 1:20]
     for real in real_bends(reference_data):
         off = np.sqrt(np.mean((drawn - real) ** 2, axis=1)).min()
-        assert np.degrees(off) < 1.6  # a joint; annotations hold two arcs, whole bodies of drawn ones wave a little
+        assert (
+            np.degrees(off) < 1.6
+        )  # a joint; annotations hold two arcs, whole bodies of drawn ones wave a little
 
 
 def test_fish_bend_as_far_as_swimming_larvae_do(reference_data):
-    points = np.load(reference_data / "zebrafish_larva_3d" / "free_swim_1000.npz")["xyz_mm"][:, :10].astype(float)
+    points = np.load(reference_data / "zebrafish_larva_3d" / "free_swim_1000.npz")["xyz_mm"][
+        :, :10
+    ].astype(float)
     bones = np.diff(points, axis=1)
     bones /= np.linalg.norm(bones, axis=-1, keepdims=True)
-    head_to_tail = np.degrees(np.arccos(np.clip(np.sum(bones[:, 0] * bones[:, -1], axis=-1), -1, 1)))
+    head_to_tail = np.degrees(
+        np.arccos(np.clip(np.sum(bones[:, 0] * bones[:, -1], axis=-1), -1, 1))
+    )
     rng = np.random.default_rng(1)
-    total = np.abs(np.degrees(draw_bends(rng, FISH, rng.integers(len(KINDS), size=4000)).sum(axis=1)))
+    total = np.abs(
+        np.degrees(draw_bends(rng, FISH, rng.integers(len(KINDS), size=4000)).sum(axis=1))
+    )
     assert np.quantile(total, 0.95) > np.quantile(head_to_tail, 0.95)
     assert np.quantile(total, 0.4) < np.quantile(head_to_tail, 0.75)  # and most are not turning
     assert total.max() < 230.0
@@ -70,10 +78,14 @@ def test_bends_stay_within_the_joints_limits_and_the_hind_half_does_most_of_them
 
 
 def test_the_joints_lie_within_the_fish_of_the_picture(pictures):
-    uv = pictures.joints_mm[..., :2] / pictures.joints_mm[..., 2:] * pictures.intrinsics[:, None, :2]
+    uv = (
+        pictures.joints_mm[..., :2] / pictures.joints_mm[..., 2:] * pictures.intrinsics[:, None, :2]
+    )
     uv = np.rint(uv + pictures.intrinsics[:, None, 2:] - pictures.origin[:, None]).astype(int)
     for i in range(len(pictures)):
-        depth, still = (picture[i] * pictures.unit_mm for picture in (pictures.depth, pictures.background))
+        depth, still = (
+            picture[i] * pictures.unit_mm for picture in (pictures.depth, pictures.background)
+        )
         inner = uv[i, 1:14]
         here, behind = depth[inner[:, 1], inner[:, 0]], still[inner[:, 1], inner[:, 0]]
         read = (here > 0) & (behind > 0)
@@ -107,7 +119,9 @@ def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
     assert speed.max() < 8.0  # lengths a second
     assert np.median(speed) > 0.1
     ahead = fish.joints_arena[:-1, 0] - fish.joints_arena[:-1, 10]
-    cosine = np.sum(step * ahead, axis=1) / np.linalg.norm(step, axis=1) / np.linalg.norm(ahead, axis=1)
+    cosine = (
+        np.sum(step * ahead, axis=1) / np.linalg.norm(step, axis=1) / np.linalg.norm(ahead, axis=1)
+    )
     assert np.median(cosine[speed > 0.5]) > 0.9
 
 
@@ -125,14 +139,31 @@ def test_the_same_seed_gives_the_same_fish():
 def sensed(distance_mm: float, **changes: float) -> np.ndarray:
     """A flat animal at a distance, as one unit of the camera sees it, mm (0 unread)."""
     p = RAYTRIX_R5_SENSOR.draw(np.random.default_rng(0), 1, np.zeros(1))[0]
-    columns = {"noise": k.NOISE, "dark": k.DARK, "filled": k.FLYING, "outliers": k.OUTLIERS, "smooth": k.SMOOTH}
+    columns = {
+        "noise": k.NOISE,
+        "dark": k.DARK,
+        "filled": k.FLYING,
+        "outliers": k.OUTLIERS,
+        "smooth": k.SMOOTH,
+    }
     p[[k.LUMPS, k.OUTLIERS, k.DARK]] = 0.0, 99.0, -99.0
     for name, value in changes.items():
         p[columns[name]] = value
     shape = (240, 240)
     depth, what = np.full(shape, distance_mm, np.float32), np.full(shape, k.ANIMAL, np.uint8)
     out = np.zeros(shape, np.uint16)
-    k.sense(depth, what, p, 2363.0, 0.0, 0.0, np.array([99], np.uint64), k.NORMAL, np.empty(shape, np.float32), out)
+    k.sense(
+        depth,
+        what,
+        p,
+        2363.0,
+        0.0,
+        0.0,
+        np.array([99], np.uint64),
+        k.NORMAL,
+        np.empty(shape, np.float32),
+        out,
+    )
     return out * p[k.UNIT]
 
 

@@ -9,7 +9,13 @@ import pytest
 
 from liex_lab.body import Skeleton
 from liex_lab.simulation.hand import pose_prior as hand_postures
-from liex_lab.simulation.hand.pose_prior import STATISTICS, HandPostures, distil, draw_seen, draw_wide
+from liex_lab.simulation.hand.pose_prior import (
+    STATISTICS,
+    HandPostures,
+    distil,
+    draw_seen,
+    draw_wide,
+)
 
 HAND = Skeleton.load("hand")
 
@@ -20,7 +26,9 @@ def test_drawn_hands_are_hands(draw) -> None:
     low, high = HAND.limits[..., 0], HAND.limits[..., 1]
     assert ((angles >= low - 1e-9) & (angles <= high + 1e-9))[:, 1:].all()
     assert (angles[:, ~HAND.axes] == 0).all()
-    np.testing.assert_allclose(turns @ np.swapaxes(turns, 1, 2), np.tile(np.eye(3), (400, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        turns @ np.swapaxes(turns, 1, 2), np.tile(np.eye(3), (400, 1, 1)), atol=1e-9
+    )
     assert np.linalg.det(turns).min() > 0.99
     again, _ = draw(np.random.default_rng(0), HAND, 400)
     np.testing.assert_array_equal(angles, again)
@@ -28,19 +36,26 @@ def test_drawn_hands_are_hands(draw) -> None:
 
 def test_people_show_their_palm_more_often_than_its_back() -> None:
     _, turns = draw_seen(np.random.default_rng(1), HAND, 1000)
-    assert (turns[:, 2, 2] < 0).mean() > 0.6  # the palm's z axis leaves through the back of the hand
+    assert (
+        turns[:, 2, 2] < 0
+    ).mean() > 0.6  # the palm's z axis leaves through the back of the hand
 
 
 def test_wide_postures_reach_further_than_those_seen() -> None:
     seen, wide = (draw(np.random.default_rng(2), HAND, 3000) for draw in (draw_seen, draw_wide))
     middle = [j for j, name in enumerate(HAND.names) if name.endswith("_middle")]
-    low, high = ([np.quantile(angles[:, middle, 1], q, axis=0) for angles in (seen[0], wide[0])] for q in (0.02, 0.98))
+    low, high = (
+        [np.quantile(angles[:, middle, 1], q, axis=0) for angles in (seen[0], wide[0])]
+        for q in (0.02, 0.98)
+    )
     assert (high[1] - low[1] > 1.05 * (high[0] - low[0])).all()  # from stretched to a fist
     spin = [np.arctan2(turns[:, 1, 0], turns[:, 0, 0]) for _, turns in (seen, wide)]
     assert np.abs(np.exp(1j * spin[1]).mean()) < np.abs(np.exp(1j * spin[0]).mean())
 
 
-def test_statistics_of_what_was_drawn_are_those_it_was_drawn_from(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+def test_statistics_of_what_was_drawn_are_those_it_was_drawn_from(
+    monkeypatch: pytest.MonkeyPatch, tmp_path
+) -> None:
     angles, turns = draw_seen(np.random.default_rng(3), HAND, 1500)
     text = distil(HAND, angles, turns)
     (tmp_path / "again.toml").write_text(text)

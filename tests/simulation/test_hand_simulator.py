@@ -83,7 +83,9 @@ def test_splits_are_fixed_and_their_people_differ() -> None:
     np.testing.assert_array_equal(clean[0].depths(3, 5), again[0].depths(3, 5))
     assert clean[0].spine_mm != clean[1].spine_mm
     assert world.test_split("hard", n_sessions=1)[0].cast.shown.any()
-    assert world.test_split("clean", spine_mm=150.0, n_sessions=1)[0].spine_mm == pytest.approx(150.0)
+    assert world.test_split("clean", spine_mm=150.0, n_sessions=1)[0].spine_mm == pytest.approx(
+        150.0
+    )
     with pytest.raises(LiexError, match="known are clean, hard, other-body"):
         world.test_split("soft")
 
@@ -95,7 +97,10 @@ def test_with_the_reference_test_postures_are_the_second_persons(reference_data:
     session = world.test_split("clean", n_sessions=1)[0]
     truth = NyuReference.load(reference_data / "hand_nyu").truth[N_FIRST_PERSON:]
     mine = session.joints_camera - session.joints_camera[:, :1]
-    tips = [HAND.names.index(f"{finger}_tip") for finger in ("little", "ring", "middle", "index", "thumb")]
+    tips = [
+        HAND.names.index(f"{finger}_tip")
+        for finger in ("little", "ring", "middle", "index", "thumb")
+    ]
     theirs = (truth - truth[:, 13:])[:, [0, 2, 4, 6, 8]]
     shape = np.linalg.norm(mine[:, tips][:, :, None] - mine[:, tips][:, None], axis=-1)
     known = np.linalg.norm(theirs[:, :, None] - theirs[:, None], axis=-1)
@@ -104,7 +109,9 @@ def test_with_the_reference_test_postures_are_the_second_persons(reference_data:
     assert np.median(off) < 6.0  # each has its model among the labelled frames
 
 
-def test_the_reference_is_looked_for_beside_the_repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reference_is_looked_for_beside_the_repository(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "shared" / "data" / "hand_nyu"
     folder.mkdir(parents=True)
     (folder / "nyu_test_14joints.npz").touch()
@@ -117,6 +124,8 @@ def test_gestures_flow() -> None:
     session = gesture_session(HAND, 3, 60)
     step = np.linalg.norm(np.diff(session.joints_camera, axis=0), axis=-1)
     assert step.max() < 60.0  # mm a frame at 30 frames/s: quick, but no jump
-    assert np.linalg.norm(session.joints_camera[0] - session.joints_camera[-1], axis=-1).max() > 30.0
+    assert (
+        np.linalg.norm(session.joints_camera[0] - session.joints_camera[-1], axis=-1).max() > 30.0
+    )
     assert np.ptp(session.cast.spine_mm) == 0.0
     np.testing.assert_array_equal(session.frame(7).depth, session.depths(7, 8)[0])

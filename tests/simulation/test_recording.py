@@ -16,7 +16,13 @@ from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.pose_prior import KINDS, sample_postures
 from liex_lab.simulation.recording import SyntheticSession, test_split
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, SENSORS
-from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingWindows, training_blocks, training_windows
+from liex_lab.simulation.training_patches import (
+    BLOCK,
+    PER_SESSION,
+    TrainingWindows,
+    training_blocks,
+    training_windows,
+)
 
 MOUSE = Skeleton.load("mouse")
 
@@ -60,13 +66,18 @@ def test_a_rearing_mouse_lifts_its_nose_and_keeps_its_rump_down() -> None:
 def test_headings_have_no_favourite() -> None:
     pose, _ = sample_postures(np.random.default_rng(4), MOUSE, 4000)
     forward = pose.root.rotation[:, :2, 0]
-    assert np.linalg.norm((forward / np.linalg.norm(forward, axis=1, keepdims=True)).mean(axis=0)) < 0.05
+    assert (
+        np.linalg.norm((forward / np.linalg.norm(forward, axis=1, keepdims=True)).mean(axis=0))
+        < 0.05
+    )
 
 
 # training windows
 
 
-def test_windows_hold_the_animal_and_their_truth_projects_into_them(windows: TrainingWindows) -> None:
+def test_windows_hold_the_animal_and_their_truth_projects_into_them(
+    windows: TrainingWindows,
+) -> None:
     uv = windows.joints_mm[..., :2] / windows.joints_mm[..., 2:] * windows.intrinsics[:, None, :2]
     uv = uv + windows.intrinsics[:, None, 2:] - windows.origin[:, None]
     assert (uv > 15).all()
@@ -84,7 +95,9 @@ def test_windows_hold_the_animal_and_their_truth_projects_into_them(windows: Tra
 def test_the_pose_of_a_window_has_its_joints(windows: TrainingWindows) -> None:
     joints = Pose(windows.root, windows.angles, windows.scale).joints(MOUSE)
     np.testing.assert_allclose(joints, windows.joints_mm, atol=1e-9)
-    heights = (windows.T_arena_camera @ windows.joints_mm.transpose(1, 0, 2)).transpose(1, 0, 2)[..., 2]
+    heights = (windows.T_arena_camera @ windows.joints_mm.transpose(1, 0, 2)).transpose(1, 0, 2)[
+        ..., 2
+    ]
     assert (heights > 0).all()
     assert heights.max() < 130.0
 
@@ -94,7 +107,9 @@ def test_the_true_floor_plane_is_the_floor(windows: TrainingWindows) -> None:
     shares = []
     for i in range(0, len(windows), 16):
         a, b, c = windows.floor_true[i]
-        plane = 1.0 / (a * (windows.origin[i, 0] + side)[None] + b * (windows.origin[i, 1] + side)[:, None] + c)
+        plane = 1.0 / (
+            a * (windows.origin[i, 0] + side)[None] + b * (windows.origin[i, 1] + side)[:, None] + c
+        )
         shown = windows.background[i] > 0
         off = (windows.background[i] - plane)[shown]
         shares.append(np.mean(np.abs(off) < 6.0))
@@ -112,8 +127,12 @@ def test_frames_of_a_mini_session_share_animal_camera_and_floor(windows: Trainin
     assert 1.05 < stretch.max() < 1.08
 
 
-def test_windows_depend_on_the_seed_alone_not_on_threads_or_on_where_one_starts(windows: TrainingWindows) -> None:
-    np.testing.assert_array_equal(training_windows(11, 40, parallel=False).depth, windows.depth[:40])
+def test_windows_depend_on_the_seed_alone_not_on_threads_or_on_where_one_starts(
+    windows: TrainingWindows,
+) -> None:
+    np.testing.assert_array_equal(
+        training_windows(11, 40, parallel=False).depth, windows.depth[:40]
+    )
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     again = training_windows(11, BLOCK)
@@ -146,15 +165,26 @@ def flat(sensor_kind: int, depth_mm: float, noise: float = 1.0) -> np.ndarray:
     p[k.KIND], p[k.SIDE] = sensor_kind, 1.0
     shape = (160, 160)
     depth, out = np.full(shape, depth_mm, np.float32), np.empty(shape, np.uint16)
-    k.sense(depth, np.full(shape, k.STILL, np.uint8), p, sensor.camera.fx, 80.0, 80.0, np.array([99], np.uint64),
-            k.NORMAL, np.empty(shape, np.float32), out)  # fmt: skip
+    k.sense(
+        depth,
+        np.full(shape, k.STILL, np.uint8),
+        p,
+        sensor.camera.fx,
+        80.0,
+        80.0,
+        np.array([99], np.uint64),
+        k.NORMAL,
+        np.empty(shape, np.float32),
+        out,
+    )
     return out
 
 
 @pytest.mark.parametrize("kind", [0, 1])
 def test_noise_grows_with_distance_and_with_the_noise_factor(kind: int) -> None:
     spreads = [
-        np.std(out[out > 0].astype(float)) for out in (flat(kind, 500.0), flat(kind, 1500.0), flat(kind, 1500.0, 2.0))
+        np.std(out[out > 0].astype(float))
+        for out in (flat(kind, 500.0), flat(kind, 1500.0), flat(kind, 1500.0, 2.0))
     ]
     assert 0.2 < spreads[0] < 2.0
     assert spreads[1] > 1.5 * spreads[0]
@@ -193,8 +223,18 @@ def test_a_kinect_mixes_depths_at_an_outline_and_a_primesense_does_not() -> None
         depth, what = np.full((120, 120), 900.0, np.float32), np.full((120, 120), k.STILL, np.uint8)
         depth[40:80, 40:80], what[40:80, 40:80] = 800.0, k.ANIMAL
         out = np.empty((120, 120), np.uint16)
-        k.sense(depth, what, p, sensor.camera.fx, 60.0, 60.0, np.array([7], np.uint64), k.NORMAL,
-                np.empty((120, 120), np.float32), out)  # fmt: skip
+        k.sense(
+            depth,
+            what,
+            p,
+            sensor.camera.fx,
+            60.0,
+            60.0,
+            np.array([7], np.uint64),
+            k.NORMAL,
+            np.empty((120, 120), np.float32),
+            out,
+        )
         between.append(((out > 820) & (out < 880)).sum())
     assert between[1] > 20 > between[0]
 
@@ -207,8 +247,18 @@ def test_erosion_strips_a_pixel_off_the_animal() -> None:
         depth, what = np.full((60, 60), 900.0, np.float32), np.full((60, 60), k.STILL, np.uint8)
         depth[20:40, 20:40], what[20:40, 20:40] = 800.0, k.ANIMAL
         out = np.empty((60, 60), np.uint16)
-        k.sense(depth, what, p, 365.0, 30.0, 30.0, np.array([7], np.uint64), k.NORMAL,
-                np.empty((60, 60), np.float32), out)  # fmt: skip
+        k.sense(
+            depth,
+            what,
+            p,
+            365.0,
+            30.0,
+            30.0,
+            np.array([7], np.uint64),
+            k.NORMAL,
+            np.empty((60, 60), np.float32),
+            out,
+        )
         areas.append(int(((out > 0) & (out < 850)).sum()))
     assert areas == [400, 324]
 
@@ -216,9 +266,13 @@ def test_erosion_strips_a_pixel_off_the_animal() -> None:
 # sessions
 
 
-def test_a_session_is_a_recording_that_reads_the_same_in_any_order(session: SyntheticSession) -> None:
+def test_a_session_is_a_recording_that_reads_the_same_in_any_order(
+    session: SyntheticSession,
+) -> None:
     late = session.frame(9).depth
-    again = SyntheticSession.draw([5, 0 if session.width == 640 else 1], 12, sensor=SENSORS[session.width == 512])
+    again = SyntheticSession.draw(
+        [5, 0 if session.width == 640 else 1], 12, sensor=SENSORS[session.width == 512]
+    )
     np.testing.assert_array_equal(late, again.frame(9).depth)
     chunks = [frame for chunk in session.chunks(5) for frame in chunk]
     assert [frame.index for frame in chunks] == list(range(12))
@@ -232,8 +286,11 @@ def test_a_session_is_a_recording_that_reads_the_same_in_any_order(session: Synt
 
 
 def test_the_animal_is_where_the_truth_says(session: SyntheticSession) -> None:
-    np.testing.assert_allclose(session.T_arena_camera @ session.joints_camera.reshape(-1, 3),
-                               session.joints_arena.reshape(-1, 3), atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(
+        session.T_arena_camera @ session.joints_camera.reshape(-1, 3),
+        session.joints_arena.reshape(-1, 3),
+        atol=1e-6,
+    )
     uv = session.camera.project(session.joints_camera)
     assert (uv > 0).all()
     assert (uv < [session.width - 1, session.height - 1]).all()
@@ -248,9 +305,13 @@ def test_the_animal_is_where_the_truth_says(session: SyntheticSession) -> None:
 
 def test_the_floor_of_a_session_is_where_its_plane_is(session: SyntheticSession) -> None:
     plane = session.floor.depth(session.width, session.height)
-    np.testing.assert_allclose(session.floor.T_arena_camera.rotation, session.T_arena_camera.rotation, atol=1e-9)
+    np.testing.assert_allclose(
+        session.floor.T_arena_camera.rotation, session.T_arena_camera.rotation, atol=1e-9
+    )
     depth = session.frame(0).depth
-    c, r = np.round(session.camera.project(session.T_arena_camera.inverse() @ [*session.stage.centre, 0.0])).astype(int)
+    c, r = np.round(
+        session.camera.project(session.T_arena_camera.inverse() @ [*session.stage.centre, 0.0])
+    ).astype(int)
     patch = (slice(r - 15, r + 15), slice(c - 15, c + 15))
     assert np.median(np.abs(depth[patch] - plane[patch])) < 6.0
 

@@ -26,16 +26,26 @@ STAR = Skeleton.from_table(
             joint
             for k in range(4)
             for joint in (
-                {"name": f"knee_{k}", "parent": "middle", "rest_deg": [0, 0, 90 * k], "axes": ["pitch", "yaw"]},
-                {"name": f"shin_{k}", "parent": f"knee_{k}", "offset_mm": [40, 0, 0], "axes": ["pitch"],
-                 "limits_deg": {"pitch": [0, 80]}},
+                {
+                    "name": f"knee_{k}",
+                    "parent": "middle",
+                    "rest_deg": [0, 0, 90 * k],
+                    "axes": ["pitch", "yaw"],
+                },
+                {
+                    "name": f"shin_{k}",
+                    "parent": f"knee_{k}",
+                    "offset_mm": [40, 0, 0],
+                    "axes": ["pitch"],
+                    "limits_deg": {"pitch": [0, 80]},
+                },
                 {"name": f"foot_{k}", "parent": f"shin_{k}", "offset_mm": [40, 0, 0]},
             )
         ],
         "surface": {"radii_mm": [9.0] + [6.0, 5.0, 4.0] * 4},
     },
     "star.toml",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("animal", ["mouse", "fish", "snake"])
@@ -137,7 +147,9 @@ def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it
     middle = scene.camera.project(recording.joints_camera.mean(axis=1))
     half = 48 * crops.step[:, None]
     assert (np.abs(crops.origin + half - middle)[crops.found] < 0.5 * half[crops.found]).all()
-    whole = scene.extract(recording.depths(0, 4), recording.spine_mm / skeleton.length, camera_view=habits.floats)
+    whole = scene.extract(
+        recording.depths(0, 4), recording.spine_mm / skeleton.length, camera_view=habits.floats
+    )
     np.testing.assert_array_equal(whole.heights, crops.heights[:4])
     np.testing.assert_array_equal(whole.origin, crops.origin[:4])
 

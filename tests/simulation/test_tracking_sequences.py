@@ -66,7 +66,9 @@ def test_time_goes_on_while_frames_are_dropped_and_the_truth_moves_with_it(hard)
 
 def test_holes_are_unread_and_an_occluder_is_nearer_than_the_animal(hard):
     (span, *_) = spans(hard, "holes")
-    share = [np.mean(beside(hard, i, 0.6 * hard.spine_mm) == 0) for i in range(span.start, span.stop)]
+    share = [
+        np.mean(beside(hard, i, 0.6 * hard.spine_mm) == 0) for i in range(span.start, span.stop)
+    ]
     calm = [np.mean(beside(hard, i, 0.6 * hard.spine_mm) == 0) for i in range(10)]
     assert np.median(share) > 2 * np.median(calm)
     (hidden, *_) = spans(hard, "hidden")
@@ -112,7 +114,9 @@ def test_a_hand_goes_from_gesture_to_gesture_behind_a_bar_that_passes():
     assert {event.kind for event in hand.events} >= {"occluder", "hidden"}
     steps = np.diff(hand.times_ns) * 1e-9
     speed = np.linalg.norm(np.diff(hand.joints_camera, axis=0), axis=-1) / steps[:, None]
-    assert 100.0 < np.quantile(speed, 0.9) < 1500.0  # mm/s, three times as fast as people gesture at the most
+    assert (
+        100.0 < np.quantile(speed, 0.9) < 1500.0
+    )  # mm/s, three times as fast as people gesture at the most
     (hidden, *_) = spans(hand, "hidden")
     middle = (hidden.start + hidden.stop) // 2
     seen = beside(hand, middle, 0.2 * hand.spine_mm)

@@ -17,7 +17,9 @@ from tests.sessions.walking_mouse import SD_ROOT, WalkingMouse, steady
 
 def rows_of(mouse: WalkingMouse) -> Rows:
     times = mouse.times_ns
-    return Rows(mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times)))
+    return Rows(
+        mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times))
+    )
 
 
 def test_a_dropped_and_a_lost_stretch_become_two_half_open_gaps():
@@ -87,10 +89,16 @@ def test_the_score_is_the_share_of_gaussian_points_within_the_radius():
 
 def test_stretches_are_the_runs_a_reader_would_count():
     labels = np.array(["a", "a", "", "b", "b", "b"])
-    assert [(a, b, str(w)) for a, b, w in stretches(labels)] == [(0, 2, "a"), (2, 3, ""), (3, 6, "b")]
+    assert [(a, b, str(w)) for a, b, w in stretches(labels)] == [
+        (0, 2, "a"),
+        (2, 3, ""),
+        (3, 6, "b"),
+    ]
     assert stretches(np.array([])) == []
 
 
 def test_a_frame_stands_for_the_time_to_the_next_one_but_not_for_a_gap():
-    np.testing.assert_allclose(stop_times(np.array([0.0, 0.1, 0.2, 0.9, 1.0])), [0.1, 0.2, 0.3, 1.0, 1.1])
+    np.testing.assert_allclose(
+        stop_times(np.array([0.0, 0.1, 0.2, 0.9, 1.0])), [0.1, 0.2, 0.3, 1.0, 1.1]
+    )
     np.testing.assert_allclose(stop_times(np.array([0.0])), [0.0])

@@ -12,26 +12,41 @@ import pytest
 from liex_lab.behaviour.listing import all_columns
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
-from liex_lab.tables.schema import BOUTS, TABLES, Column, columns, dictionary, empty_table, to_pandas, write_table
+from liex_lab.tables.schema import (
+    BOUTS,
+    TABLES,
+    Column,
+    columns,
+    dictionary,
+    empty_table,
+    to_pandas,
+    write_table,
+)
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory) -> Session:
-    return write(tmp_path_factory.mktemp("tables") / "circle.liex", WalkingMouse(steady(2.0), lost=(10, 11)))
+    return write(
+        tmp_path_factory.mktemp("tables") / "circle.liex", WalkingMouse(steady(2.0), lost=(10, 11))
+    )
 
 
 def test_every_written_column_has_an_entry_in_columns_json(session):
     described = {(row.table, row.name): row for row in session.columns.itertuples(index=False)}
     written = {
-        (path.stem, field.name): str(field.type) for path in session.path.glob("*.parquet")
+        (path.stem, field.name): str(field.type)
+        for path in session.path.glob("*.parquet")
         for field in pq.read_schema(path)
-    }  # fmt: skip
+    }
     written |= {("summary", name): "" for name in pd.read_csv(session.path / "summary.csv").columns}
     assert set(written) == set(described)
     for key, kind in written.items():
         assert described[key].meaning, key
-        assert kind in ("", {"float64": "double"}.get(described[key].dtype, described[key].dtype)), key
+        assert kind in (
+            "",
+            {"float64": "double"}.get(described[key].dtype, described[key].dtype),
+        ), key
 
 
 def test_a_unit_in_a_name_is_the_unit_of_the_entry():
@@ -88,8 +103,13 @@ def test_per_frame_tables_have_one_row_per_frame_and_joint(session):
 
 def test_equal_input_gives_equal_tables_whatever_the_chunks(tmp_path):
     mouse = WalkingMouse(steady(2.0), rear_s=(0.5, 1.2), lost=(3,))
-    first, second = write(tmp_path / "a.liex", mouse, chunk=7), write(tmp_path / "b.liex", mouse, chunk=60)
-    names = sorted(path.name for path in first.path.iterdir() if path.suffix in (".parquet", ".csv", ".toml"))
+    first, second = (
+        write(tmp_path / "a.liex", mouse, chunk=7),
+        write(tmp_path / "b.liex", mouse, chunk=60),
+    )
+    names = sorted(
+        path.name for path in first.path.iterdir() if path.suffix in (".parquet", ".csv", ".toml")
+    )
     assert len(names) == 13
     for name in [*names, "columns.json", "session.mcap"]:
         assert (first.path / name).read_bytes() == (second.path / name).read_bytes(), name
@@ -99,7 +119,9 @@ def test_parquet_files_are_zstd_and_describe_themselves(session):
     for path in session.path.glob("*.parquet"):
         file = pq.ParquetFile(path)
         about = json.loads(file.schema_arrow.metadata[b"liex_lab"])
-        assert {"version", "calibration_hash", "model_hash", "axes", "columns"} <= set(about), path.name
+        assert {"version", "calibration_hash", "model_hash", "axes", "columns"} <= set(about), (
+            path.name
+        )
         assert set(about["columns"]) == set(file.schema_arrow.names)
         if file.metadata.num_row_groups:
             assert file.metadata.row_group(0).column(0).compression == "ZSTD"
@@ -126,7 +148,9 @@ def test_tables_without_rows_keep_their_columns(session):
 
 
 def test_a_block_becomes_the_frame_that_reading_it_back_gives(session, tmp_path):
-    schema = columns("t", ("who", "string", "", "a"), ("n", "int64", "", "b"), ("yes", "bool", "", "c"))
+    schema = columns(
+        "t", ("who", "string", "", "a"), ("n", "int64", "", "b"), ("yes", "bool", "", "c")
+    )
     block = {"who": "m", "n": np.array([1, 2]), "yes": [True, False]}
     write_table(tmp_path / "t.parquet", schema, [block], {})
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "t.parquet"), to_pandas(schema, block))

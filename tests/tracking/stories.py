@@ -14,7 +14,13 @@ from liex_lab.tracking.offline import Subject
 MOUSE = Skeleton.load("mouse")
 ERROR_MM = 2.0
 SUBJECT = Subject(
-    MOUSE, KINECT_V2, SE3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 700.0])), MOUSE.length, 6.0, 0.5, (1.0,) * 5
+    MOUSE,
+    KINECT_V2,
+    SE3(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 700.0])),
+    MOUSE.length,
+    6.0,
+    0.5,
+    (1.0,) * 5,
 )
 
 

@@ -23,5 +23,9 @@ def test_an_animal_without_its_own_is_taken_for_a_mouse_and_a_fish_is_none():
 def test_the_kernels_get_every_number_of_it():
     motion = Tuning.of("fish").motion
     packed = motion.packed
-    np.testing.assert_allclose(packed.turn[2], [motion.turn[2].error, motion.turn[2].drive, motion.turn[2].fade])
-    np.testing.assert_allclose(packed.place_drive, [motion.place_drive[0]] * 2 + [motion.place_drive[1]])
+    np.testing.assert_allclose(
+        packed.turn[2], [motion.turn[2].error, motion.turn[2].drive, motion.turn[2].fade]
+    )
+    np.testing.assert_allclose(
+        packed.place_drive, [motion.place_drive[0]] * 2 + [motion.place_drive[1]]
+    )

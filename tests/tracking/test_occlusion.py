@@ -32,16 +32,28 @@ def drawn(turn: float, u: float = 0.0) -> tuple[Pose, np.ndarray]:
     surface = Surface.of(FISH)
     still = SE3(np.eye(3)[None], np.zeros((1, 3)))
     intrinsics = np.array([[CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]])
-    picture = render_meshes(surface.vertices(pose, girth=np.ones(1)), surface.faces, still, intrinsics,
-                            np.zeros((1, 2)), (CAMERA.width, CAMERA.height))[0]  # fmt: skip
-    return pose, np.where(picture > 0, picture, FLOOR.depth(CAMERA.width, CAMERA.height)).astype(np.float32)
+    picture = render_meshes(
+        surface.vertices(pose, girth=np.ones(1)),
+        surface.faces,
+        still,
+        intrinsics,
+        np.zeros((1, 2)),
+        (CAMERA.width, CAMERA.height),
+    )[0]
+    return pose, np.where(picture > 0, picture, FLOOR.depth(CAMERA.width, CAMERA.height)).astype(
+        np.float32
+    )
 
 
 WHOLE, PICTURE = drawn(0.4)
 BARE = Scene.from_floor(CAMERA, FLOOR, 3.0)
 KNOWN = Scene(CAMERA, FLOOR, BARE.background, BARE.limit, BARE.on_floor, view=FISH.view)
-SCENE = replace(KNOWN, area_mm2=float(KNOWN.extract(PICTURE[None], 1.0, camera_view=True).moments[0, 1]))
-ENDS = FreeEnds.fit(FISH, SCENE, WHOLE, SCENE.extract(PICTURE[None], 1.0, camera_view=True), PICTURE[None])
+SCENE = replace(
+    KNOWN, area_mm2=float(KNOWN.extract(PICTURE[None], 1.0, camera_view=True).moments[0, 1])
+)
+ENDS = FreeEnds.fit(
+    FISH, SCENE, WHOLE, SCENE.extract(PICTURE[None], 1.0, camera_view=True), PICTURE[None]
+)
 
 
 def found_in(pose: Pose, shift: float) -> Pose:
@@ -57,7 +69,9 @@ def off(pose: Pose, picture: np.ndarray, true: Pose = WHOLE) -> float:
     assert crops.n_px[0] > 0
     slid = ENDS.slid(pose, crops, picture[None])
     np.testing.assert_array_equal(slid.root.rotation, pose.root.rotation)
-    return float(np.linalg.norm(slid.joints(FISH) - true.joints(FISH), axis=-1).mean() / FISH.length)
+    return float(
+        np.linalg.norm(slid.joints(FISH) - true.joints(FISH), axis=-1).mean() / FISH.length
+    )
 
 
 def under_a_beam(side: int, share: float) -> np.ndarray:
@@ -76,18 +90,25 @@ def test_a_fish_half_under_a_beam_is_put_where_its_free_end_is(side, share):
     guess = found_in(WHOLE, -0.4 * side * hidden)  # toward what is seen of it
     assert 0.2 < hidden < 0.8
     assert off(guess, picture) < 0.4 * (0.4 * hidden)
-    assert off(reversed_pose(FISH, guess), picture, reversed_pose(FISH, WHOLE)) < 0.4 * (0.4 * hidden)
+    assert off(reversed_pose(FISH, guess), picture, reversed_pose(FISH, WHOLE)) < 0.4 * (
+        0.4 * hidden
+    )
 
 
 def test_a_fish_that_leaves_the_picture_is_put_where_its_free_end_is():
     true, picture = drawn(0.0, 140.0)
-    side = np.sign(CAMERA.project(true.joints(FISH)[0])[FISH.tip, 0] - CAMERA.project(true.joints(FISH)[0])[0, 0])
+    side = np.sign(
+        CAMERA.project(true.joints(FISH)[0])[FISH.tip, 0]
+        - CAMERA.project(true.joints(FISH)[0])[0, 0]
+    )
     assert off(found_in(true, -0.1 * side), picture, true) < 0.04
 
 
 def test_what_is_seen_whole_stays_where_it_is_and_what_is_not_found_is_nowhere():
     crops = SCENE.extract(PICTURE[None], 1.0, camera_view=True)
-    assert ENDS.slid(WHOLE, crops, PICTURE[None]).root.translation == pytest.approx(WHOLE.root.translation)
+    assert ENDS.slid(WHOLE, crops, PICTURE[None]).root.translation == pytest.approx(
+        WHOLE.root.translation
+    )
     gone = crops[np.array([0])]
     gone.n_px[:], gone.heights[:] = 0, 0
     nowhere = ENDS.slid(replace(WHOLE, scale=np.full(1, np.nan)), gone, PICTURE[None])

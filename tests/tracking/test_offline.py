@@ -12,7 +12,13 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import on_disk
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
-from liex_lab.tracking.offline import covariance_of_root, short_gaps, single_frames, spans, track_whole
+from liex_lab.tracking.offline import (
+    covariance_of_root,
+    short_gaps,
+    single_frames,
+    spans,
+    track_whole,
+)
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.smoother import Curve
 from liex_lab.tracking.track import Flip, Track
@@ -47,17 +53,26 @@ def test_the_roots_covariance_is_that_of_a_middle_that_is_off_and_a_turn_about_i
     rng, n = np.random.default_rng(8), 40_000
     pose = measured[:1]
     joints = joints_of(MOUSE, pose)
-    middle, sd_turn = np.array([[4.0, 1.0, 0.5], [1.0, 2.0, -0.3], [0.5, -0.3, 1.0]]), np.array([[0.04, 0.02, 0.06]])
+    middle, sd_turn = (
+        np.array([[4.0, 1.0, 0.5], [1.0, 2.0, -0.3], [0.5, -0.3, 1.0]]),
+        np.array([[0.04, 0.02, 0.06]]),
+    )
     one = np.ones(1)
     said = covariance_of_root(Curve(pose, joints, one, middle[None], sd_turn, sd_turn, one > 0))[0]
     centre, turns = joints[0].mean(axis=0), sd_turn * rng.normal(size=(n, 3))
     turned = pose.root.rotation[0] @ so3.exp(turns)
     lever = pose.root.rotation[0].T @ (pose.root.translation[0] - centre)
     place = centre + rng.multivariate_normal(np.zeros(3), middle, n) + turned @ lever
-    drawn = np.concatenate([turns, (place - pose.root.translation[0]) @ pose.root.rotation[0]], axis=1)
+    drawn = np.concatenate(
+        [turns, (place - pose.root.translation[0]) @ pose.root.rotation[0]], axis=1
+    )
     scale = np.sqrt(np.diagonal(said))
-    np.testing.assert_allclose(np.cov(drawn.T) / np.outer(scale, scale), said / np.outer(scale, scale), atol=0.03)
-    assert np.abs(said[:3, 3:] / np.outer(scale[:3], scale[3:])).max() > 0.3, "a turn and a shift go together"
+    np.testing.assert_allclose(
+        np.cov(drawn.T) / np.outer(scale, scale), said / np.outer(scale, scale), atol=0.03
+    )
+    assert np.abs(said[:3, 3:] / np.outer(scale[:3], scale[3:])).max() > 0.3, (
+        "a turn and a shift go together"
+    )
 
 
 def test_a_rows_covariance_of_the_root_is_one(measured):
@@ -78,7 +93,9 @@ def test_head_and_tail_are_told_apart_over_the_whole_recording(truth, measured):
     tracked = track_whole(SUBJECT, told(SECONDS, measured, flipped))
     assert joint_error(tracked.track.joints_mm, truth).max() < 5.0
     assert [(flip.start, flip.stop) for flip in tracked.flips] == [(20, 21), (70, 78), (120, 121)]
-    assert all(flip.applied and flip.source == "model" and flip.p_flip > 0.9 for flip in tracked.flips)
+    assert all(
+        flip.applied and flip.source == "model" and flip.p_flip > 0.9 for flip in tracked.flips
+    )
     assert tracked.track.p_flip.max() < 0.2
 
 
@@ -101,7 +118,9 @@ def test_outliers_do_not_pull_the_curve_and_are_not_measurements(truth, measured
     assert (track.n_foreground_px[track.bridged] == 0).all()
 
 
-def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_only_at_its_ends(truth, measured):
+def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_only_at_its_ends(
+    truth, measured
+):
     seen = told(SECONDS, measured)
     lose(seen, slice(50, 58))
     lose(seen, slice(100, 130))
@@ -109,7 +128,11 @@ def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_only_at_its_e
     seen.has_depth[100] = False
     track = track_whole(SUBJECT, seen).track
     # half of bridge_s is seven and a half frames
-    assert np.flatnonzero(track.bridged).tolist() == [*range(50, 58), *range(100, 107), *range(123, 130)]
+    assert np.flatnonzero(track.bridged).tolist() == [
+        *range(50, 58),
+        *range(100, 107),
+        *range(123, 130),
+    ]
     assert joint_error(track.joints_mm, truth)[50:58].max() < 8.0
     assert track.sd_mm[53].mean() > 1.2 * track.sd_mm[30].mean()
     assert np.isnan(track.joints_mm[107:123]).all()
@@ -126,7 +149,10 @@ def test_a_short_gap_is_bridged_and_grows_uncertain_and_a_long_one_only_at_its_e
 def test_what_looks_unlike_the_animal_is_measured_where_it_lies_on_the_curve_and_is_whole(measured):
     seen = told(SECONDS, measured)
     rows = slice(70, 74)
-    seen.score[rows], seen.error_mm[rows] = 1e4, 3.0 * seen.error_mm[rows]  # the metric has never seen such fur
+    seen.score[rows], seen.error_mm[rows] = (
+        1e4,
+        3.0 * seen.error_mm[rows],
+    )  # the metric has never seen such fur
     track = track_whole(SUBJECT, seen).track
     assert not track.bridged.any()
     assert track.observed.all()
@@ -171,10 +197,14 @@ def test_a_human_turns_a_span_round_and_may_take_that_back(truth, measured):
     tracked = track_whole(SUBJECT, seen, [span])
     assert joint_error(tracked.track.joints_mm, truth).max() < 5.0
     assert span in tracked.flips
-    seen.score[:, 1] = np.nan  # no candidate points the other way: the body is turned round as it lies
+    seen.score[:, 1] = (
+        np.nan
+    )  # no candidate points the other way: the body is turned round as it lies
     assert joint_error(track_whole(SUBJECT, seen, [span]).track.joints_mm, truth).max() < 6.0
     undone = track_whole(SUBJECT, seen, [replace(span, undone_at="2026-01-05T10:00:00+00:00")])
-    np.testing.assert_array_equal(undone.track.joints_mm, track_whole(SUBJECT, seen).track.joints_mm)
+    np.testing.assert_array_equal(
+        undone.track.joints_mm, track_whole(SUBJECT, seen).track.joints_mm
+    )
 
 
 def test_a_recording_without_any_animal_is_empty_rows():
@@ -199,11 +229,17 @@ def test_a_track_on_disk_is_the_one_in_memory(measured, tmp_path, monkeypatch):
     monkeypatch.setattr("liex_lab.tracking.offline._BLOCK", 40)
     monkeypatch.setattr("liex_lab.tracking.association._BLOCK", 30)
     flip = Flip(20, 30, 1.0, True, "human")
-    here, there = track_whole(SUBJECT, seen, [flip]), track_whole(SUBJECT, seen, [flip], room=on_disk(tmp_path))
+    here, there = (
+        track_whole(SUBJECT, seen, [flip]),
+        track_whole(SUBJECT, seen, [flip], room=on_disk(tmp_path)),
+    )
     assert here.flips == there.flips
     for column in fields(Track):
         if column.name != "skeleton":
-            assert getattr(here.track, column.name).tobytes() == getattr(there.track, column.name).tobytes()
+            assert (
+                getattr(here.track, column.name).tobytes()
+                == getattr(there.track, column.name).tobytes()
+            )
 
 
 def test_online_every_frame_gets_one_row_and_a_lag_makes_it_better(truth, measured):

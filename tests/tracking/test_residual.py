@@ -16,7 +16,9 @@ from liex_lab.optics.camera import Camera
 from liex_lab.tracking.residual import BodyResidual, render_crops
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice
 
-LARGE = Camera(1150.0, 1150.0, 319.5, 239.5, 640, 480)  # so near that every second pixel fills a height map
+LARGE = Camera(
+    1150.0, 1150.0, 319.5, 239.5, 640, 480
+)  # so near that every second pixel fills a height map
 LARGE_FLOOR = Floor.from_plane(np.array([-0.05, 0.03, 1.0]), 600.0, LARGE)
 
 
@@ -66,7 +68,9 @@ def test_the_body_is_drawn_on_the_pixels_of_the_height_map(clean, surface):
 
 @pytest.mark.parametrize("lifted", [4.0, -4.0, 9.0])
 def test_a_body_that_is_held_too_high_is_off_by_about_as_much(clean, surface, lifted):
-    off = BodyResidual(surface).of(moved(clean.pose, z=lifted), SCENE.extract(clean.depths, 1.0), SCENE)
+    off = BodyResidual(surface).of(
+        moved(clean.pose, z=lifted), SCENE.extract(clean.depths, 1.0), SCENE
+    )
     assert np.median(off) == pytest.approx(abs(lifted), abs=0.8)
 
 
@@ -78,13 +82,17 @@ def test_a_wrong_pose_explains_the_picture_worse_than_the_true_one(clean, surfac
 
 
 def test_a_body_that_does_not_touch_the_animal_has_no_residual(clean, surface):
-    off = BodyResidual(surface).of(moved(clean.pose, x=150.0), SCENE.extract(clean.depths, 1.0), SCENE)
+    off = BodyResidual(surface).of(
+        moved(clean.pose, x=150.0), SCENE.extract(clean.depths, 1.0), SCENE
+    )
     assert np.isnan(off).all()
 
 
 def test_of_no_frames_there_is_no_residual(clean, surface):
     none = np.zeros(40, np.bool_)
-    assert BodyResidual(surface).of(clean.pose[none], SCENE.extract(clean.depths, 1.0)[none], SCENE).shape == (0,)
+    assert BodyResidual(surface).of(
+        clean.pose[none], SCENE.extract(clean.depths, 1.0)[none], SCENE
+    ).shape == (0,)
 
 
 @pytest.mark.parametrize("girth", [0.8, 1.0, 1.25])
@@ -99,4 +107,6 @@ def test_frames_that_cannot_be_compared_do_not_disturb_the_girth(clean, surface)
     place = clean.pose.root.translation.copy()
     place[:5, 0] += 150.0
     pose = replace(clean.pose, root=SE3(clean.pose.root.rotation, place))
-    assert BodyResidual.fit(surface, pose, SCENE.extract(depths, 1.0), SCENE).girth == pytest.approx(1.2, abs=0.051)
+    assert BodyResidual.fit(
+        surface, pose, SCENE.extract(depths, 1.0), SCENE
+    ).girth == pytest.approx(1.2, abs=0.051)

@@ -77,7 +77,10 @@ def test_smoothing_agrees_with_all_states_solved_at_once():
 
 def test_places_that_are_measured_better_in_one_direction_agree_with_all_states_solved_at_once():
     rng = np.random.default_rng(4)
-    y, root = np.cumsum(rng.normal(0.0, 1.0, (len(TIMES), 3)), axis=0), rng.normal(0.0, 0.6, (len(TIMES), 3, 3))
+    y, root = (
+        np.cumsum(rng.normal(0.0, 1.0, (len(TIMES), 3)), axis=0),
+        rng.normal(0.0, 0.6, (len(TIMES), 3, 3)),
+    )
     r, q = root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(3), np.array([40.0, 40.0, 5.0])
     known = np.ones(len(TIMES), bool)
     known[[3, 6]] = False
@@ -85,16 +88,23 @@ def test_places_that_are_measured_better_in_one_direction_agree_with_all_states_
     kernels.run_place(TIMES, y, r, known, 0, q, FADE, out, spread)
     r[~known] = np.inf
     value, _, covariance = by_least_squares(TIMES, y, r, q)
-    np.testing.assert_allclose(out, value, atol=5e-3)  # the filter starts from a wide guess, not from none
+    np.testing.assert_allclose(
+        out, value, atol=5e-3
+    )  # the filter starts from a wide guess, not from none
     np.testing.assert_allclose(spread, covariance[:, :3, :3], atol=5e-3)
 
 
 def test_a_long_curve_of_places_stays_sound():
     rng = np.random.default_rng(5)
     n = 3000
-    y, r = np.cumsum(rng.normal(0.0, 1.0, (n, 3)), axis=0), np.tile(np.diag([0.2, 0.01, 0.1]), (n, 1, 1))
+    y, r = (
+        np.cumsum(rng.normal(0.0, 1.0, (n, 3)), axis=0),
+        np.tile(np.diag([0.2, 0.01, 0.1]), (n, 1, 1)),
+    )
     out, spread = np.zeros(y.shape), np.zeros(r.shape)
-    kernels.run_place(0.02 * np.arange(n), y, r, np.ones(n, bool), 0, np.full(3, 1e5), 0.3, out, spread)
+    kernels.run_place(
+        0.02 * np.arange(n), y, r, np.ones(n, bool), 0, np.full(3, 1e5), 0.3, out, spread
+    )
     assert np.abs(out - y).max() < 3.0
     assert np.linalg.eigvalsh(spread).min() > 0.0
 

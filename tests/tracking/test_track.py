@@ -55,6 +55,8 @@ def test_a_track_knows_which_frames_were_measured_its_root_and_its_spine():
     track = mouse.track()
     assert np.flatnonzero(~track.observed).tolist() == [2, 9]
     np.testing.assert_allclose(track.spine_mm[track.observed], SPINE_MM)
-    np.testing.assert_allclose((track.root @ np.zeros(3))[track.observed], track.joints_mm[track.observed, 0])
+    np.testing.assert_allclose(
+        (track.root @ np.zeros(3))[track.observed], track.joints_mm[track.observed, 0]
+    )
     length = np.linalg.norm(np.diff(track.joints_mm, axis=1), axis=-1).sum(axis=1)
     np.testing.assert_allclose(length, track.spine_mm)

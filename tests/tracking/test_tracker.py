@@ -35,7 +35,9 @@ def frames(toy: Toy) -> list[DepthFrame]:
 @pytest.fixture(scope="module")
 def scene(toy: Toy) -> Scene:
     moments = SCENE.extract(toy.depths, 1.0).moments
-    return replace(SCENE, area_mm2=float(np.median(moments[:, 1])), volume_mm3=float(np.median(moments[:, 2])))
+    return replace(
+        SCENE, area_mm2=float(np.median(moments[:, 1])), volume_mm3=float(np.median(moments[:, 2]))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -105,15 +107,23 @@ def test_the_true_body_is_not_far_from_the_observed_surface(track, tracker):
 
 def test_rows_do_not_depend_on_how_the_frames_are_dealt_out(tracker, frames, track):
     for size in (1, 7):
-        joined = Track.join([tracker.follow(frames[start : start + size]) for start in range(0, len(frames), size)])
+        joined = Track.join(
+            [tracker.follow(frames[start : start + size]) for start in range(0, len(frames), size)]
+        )
         for field in fields(Track):
             if field.name != "skeleton":
-                np.testing.assert_array_equal(getattr(joined, field.name), getattr(track, field.name))
+                np.testing.assert_array_equal(
+                    getattr(joined, field.name), getattr(track, field.name)
+                )
 
 
-def test_the_first_hypothesis_is_the_frames_own_answer_and_the_second_points_the_other_way(tracker, frames):
+def test_the_first_hypothesis_is_the_frames_own_answer_and_the_second_points_the_other_way(
+    tracker, frames
+):
     seen = tracker.observe(frames)
-    alone = tracker.estimator.estimate(np.stack([f.depth for f in frames]), tracker.scene, tracker.size)
+    alone = tracker.estimator.estimate(
+        np.stack([f.depth for f in frames]), tracker.scene, tracker.size
+    )
     np.testing.assert_array_equal(seen.known[:, 0], alone.found)
     np.testing.assert_array_equal(seen.error_mm[:, 0], alone.chosen.error_mm.astype(np.float32))
     pose = alone.chosen.pose.moved(tracker.scene.floor.T_arena_camera)
@@ -140,7 +150,9 @@ def test_a_frame_is_doubtful_where_more_error_is_expected_than_allowed(toy, scen
     limit = float(np.nanmedian(track.predicted_error_mm))
     strict = FrameTracker.prepare(estimator, scene, toy.depths, doubtful_mm=limit).follow(frames)
     seen = strict.observed
-    np.testing.assert_array_equal(strict.flag[seen] == "doubtful", strict.predicted_error_mm[seen] > limit)
+    np.testing.assert_array_equal(
+        strict.flag[seen] == "doubtful", strict.predicted_error_mm[seen] > limit
+    )
     assert 5 < (strict.flag == "doubtful").sum() < 20
     assert strict.flag[[NOTHING, BARE]].tolist() == ["no_depth", "not_found"]
 
@@ -157,5 +169,7 @@ def test_the_models_own_limit_of_doubt_grows_with_the_animal(toy, scene):
 def test_a_sample_without_an_animal_is_refused_in_one_sentence(toy, scene, spine_mm):
     bare = np.stack([FLOOR.depth(CAMERA.width, CAMERA.height)] * 5)
     with pytest.raises(EstimationError, match="no animal was found in the sampled frames") as error:
-        FrameTracker.prepare(PoseEstimator(trained("default").model), scene, bare, spine_mm=spine_mm)
+        FrameTracker.prepare(
+            PoseEstimator(trained("default").model), scene, bare, spine_mm=spine_mm
+        )
     assert "\n" not in str(error.value)

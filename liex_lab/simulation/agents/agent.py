@@ -20,7 +20,12 @@ STEP_S = 0.005  # of the clock on which an animal moves, whatever the camera's r
 UNLABELLED = ""
 SPEED, TURN, CLIMB = 0, 1, 2  # channels that every animal has: mm/s, rad/s, rad
 _TRIES = 16
-_TRAITS = {"vigour": 0.16, "tempo": 0.12, "bend": 0.12, "patience": 0.2}  # spread of the logarithm at the range's end
+_TRAITS = {
+    "vigour": 0.16,
+    "tempo": 0.12,
+    "bend": 0.12,
+    "patience": 0.2,
+}  # spread of the logarithm at the range's end
 
 
 @dataclass(frozen=True)
@@ -38,11 +43,15 @@ class Individual:
     side: float
 
     @staticmethod
-    def draw(rng: np.random.Generator, sizes: tuple[float, float], novel: bool = False) -> Individual:
+    def draw(
+        rng: np.random.Generator, sizes: tuple[float, float], novel: bool = False
+    ) -> Individual:
         """An animal; a novel one has traits at and beyond the ends of the range that all others come from."""
         low, high = (0.7, 1.5) if novel else (0.0, 1.0)
         reach = rng.uniform(low, high, len(_TRAITS)) * rng.choice([-1.0, 1.0], len(_TRAITS))
-        factors = {name: float(np.exp(_TRAITS[name] * z)) for name, z in zip(_TRAITS, reach, strict=True)}
+        factors = {
+            name: float(np.exp(_TRAITS[name] * z)) for name, z in zip(_TRAITS, reach, strict=True)
+        }
         size, restless, side = rng.uniform(*sizes), rng.random(), rng.uniform(-0.5, 0.5)
         return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
 
@@ -65,7 +74,13 @@ class Motion:
 
     def __getitem__(self, rows: NDArray[np.int64]) -> Motion:
         """Some steps of it."""
-        return Motion(self.channels[rows], self.heading[rows], self.position[rows], self.word[rows], self.act[rows])
+        return Motion(
+            self.channels[rows],
+            self.heading[rows],
+            self.position[rows],
+            self.word[rows],
+            self.act[rows],
+        )
 
     def at(self, rate_hz: float) -> NDArray[np.int64]:
         """The steps that a camera of this rate sees."""
@@ -76,10 +91,18 @@ class Story:
     """Acts, one after the other. fits: whether an animal can be at positions (m, 3) mm with headings (m,) rad."""
 
     def __init__(
-        self, rest: Array, blend_s: float, position: Array, heading: float, fits: Callable[[Array, Array], bool]
+        self,
+        rest: Array,
+        blend_s: float,
+        position: Array,
+        heading: float,
+        fits: Callable[[Array, Array], bool],
     ) -> None:
         gain = 1.0 - np.exp(-STEP_S / blend_s)
-        self._taps = np.array([gain * gain]), np.array([1.0, -2.0 * (1.0 - gain), (1.0 - gain) ** 2])
+        self._taps = (
+            np.array([gain * gain]),
+            np.array([1.0, -2.0 * (1.0 - gain), (1.0 - gain) ** 2]),
+        )
         self._state = lfilter_zi(*self._taps)[:, None] * rest
         self._lag = round(2.0 * blend_s / STEP_S)
         self.position, self.heading, self._fits = np.array(position, float), heading, fits
@@ -92,7 +115,10 @@ class Story:
             channels, state = lfilter(*self._taps, wanted := draw(), axis=0, zi=self._state)
             heading = self.heading + np.cumsum(channels[:, TURN]) * STEP_S
             run, climb = channels[:, SPEED] * STEP_S, channels[:, CLIMB]
-            steps = np.stack([np.cos(climb) * np.cos(heading), np.cos(climb) * np.sin(heading), np.sin(climb)], axis=1)
+            steps = np.stack(
+                [np.cos(climb) * np.cos(heading), np.cos(climb) * np.sin(heading), np.sin(climb)],
+                axis=1,
+            )
             position = self.position + np.cumsum(run[:, None] * steps, axis=0)
             if self._fits(position, heading):
                 self._state, self.position, self.heading = state, position[-1], float(heading[-1])
@@ -112,7 +138,9 @@ class Story:
         act = np.repeat(np.arange(len(lengths)), lengths)
         lag = min(self._lag, lengths[0] if lengths else 0)
         late = np.maximum(np.arange(len(word)) - lag, 0)
-        channels, heading, position = (np.concatenate([part[k] for part in self._told]) for k in range(3))
+        channels, heading, position = (
+            np.concatenate([part[k] for part in self._told]) for k in range(3)
+        )
         return Motion(channels, heading, position, word[late], act[late])
 
 

@@ -38,8 +38,17 @@ _ROLL, _FRONT, _HIND, _WAVE, _BEAT = range(3, 8)
 _CHANNELS = 8
 _BLEND_S = 0.008
 # how often each follows in an uncut recording; what lies between has no name
-_SHARES = {"scoot": 5.0, "j_turn": 2.5, "c_turn": 2.0, "r_turn": 3.0, "surface": 1.6, "dive": 1.6, "zigzag": 1.4,
-           "thrash": 1.4, "freeze": 1.4}  # fmt: skip
+_SHARES = {
+    "scoot": 5.0,
+    "j_turn": 2.5,
+    "c_turn": 2.0,
+    "r_turn": 3.0,
+    "surface": 1.6,
+    "dive": 1.6,
+    "zigzag": 1.4,
+    "thrash": 1.4,
+    "freeze": 1.4,
+}
 _NEAREST_MM = 185.0  # to the camera
 _VIEW = 0.32  # half the picture's side over the distance
 _BETWEEN = 0.75  # of the acts are followed by something without a name
@@ -69,10 +78,14 @@ class FishActor:
     def begin(self, rng: np.random.Generator, word: str = UNLABELLED) -> Story:
         """A story that begins somewhere in the middle, for a dive near the top."""
         low, high = self.water
-        level = {"surface": rng.uniform(0.0, 0.4), "dive": rng.uniform(0.6, 1.0)}.get(word, rng.uniform(0.1, 0.9))
+        level = {"surface": rng.uniform(0.0, 0.4), "dive": rng.uniform(0.6, 1.0)}.get(
+            word, rng.uniform(0.1, 0.9)
+        )
         z = low + level * (high - low)
         place = [*(rng.uniform(-0.6, 0.6, 2) * self._half(z)), z]
-        return Story(np.zeros(_CHANNELS), _BLEND_S, np.array(place), rng.uniform(-np.pi, np.pi), self.fits)
+        return Story(
+            np.zeros(_CHANNELS), _BLEND_S, np.array(place), rng.uniform(-np.pi, np.pi), self.fits
+        )
 
     def cut(self, rng: np.random.Generator, word: str) -> Motion:
         """One action with a little before and after it; the word marks it."""
@@ -87,10 +100,15 @@ class FishActor:
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
         """A recording: actions in random order, most of them with something unnamed between."""
         story, names = self.begin(rng), list(_SHARES)
-        share = np.array([_SHARES[name] for name in names]) * np.exp(rng.normal(0.0, 0.25, len(names)))
+        share = np.array([_SHARES[name] for name in names]) * np.exp(
+            rng.normal(0.0, 0.25, len(names))
+        )
         while story.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share / share.sum()))
-            if story.play(word, lambda word=word: self.act(rng, word), 6) and rng.random() > _BETWEEN:  # type: ignore[misc]
+            if (
+                story.play(word, lambda word=word: self.act(rng, word), 6)
+                and rng.random() > _BETWEEN
+            ):  # type: ignore[misc]
                 continue
             if not story.play(UNLABELLED, lambda: self._between(rng, None)):
                 self._go_home(rng, story)
@@ -126,17 +144,29 @@ class FishActor:
     def act(self, rng: np.random.Generator, word: str) -> Array:
         """Channels of one action."""
         table: dict[str, Callable[[np.random.Generator], Array]] = {
-            "scoot": self._scoot, "j_turn": self._j_turn, "c_turn": self._c_turn, "r_turn": self._r_turn,
-            "surface": lambda r: self._climb(r, 1.0), "dive": lambda r: self._climb(r, -1.0), "zigzag": self._zigzag,
-            "thrash": self._thrash, "freeze": self._freeze,
-        }  # fmt: skip
+            "scoot": self._scoot,
+            "j_turn": self._j_turn,
+            "c_turn": self._c_turn,
+            "r_turn": self._r_turn,
+            "surface": lambda r: self._climb(r, 1.0),
+            "dive": lambda r: self._climb(r, -1.0),
+            "zigzag": self._zigzag,
+            "thrash": self._thrash,
+            "freeze": self._freeze,
+        }
         channels = table[word](rng)
         channels[:, SPEED] *= self.length_mm
         return channels
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
         """How long an act lasts: most are nearer to the shortest."""
-        return float(np.clip(shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.fish.patience, 0.15, longest))
+        return float(
+            np.clip(
+                shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.fish.patience,
+                0.15,
+                longest,
+            )
+        )
 
     def _swim(self, rng: np.random.Generator, t: Array, c: Array, pace: float) -> None:
         """Waves down the body that fit a speed."""
@@ -151,7 +181,10 @@ class FishActor:
         c[:, SPEED] = pace * np.where(beating, 1.0, np.exp(-(t - t[beating][-1]) / 0.35))
         c[~beating, _WAVE] *= 0.15
         bend = rng.normal(0.0, 0.5)
-        c[:, TURN] = np.radians(rng.normal(0.0, 14.0)) + np.radians(10.0) * slow_noise(rng, len(t), 0.4)[:, 0]
+        c[:, TURN] = (
+            np.radians(rng.normal(0.0, 14.0))
+            + np.radians(10.0) * slow_noise(rng, len(t), 0.4)[:, 0]
+        )
         c[:, _FRONT], c[:, _HIND] = bend, 1.5 * bend
         c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
         return c
@@ -169,7 +202,15 @@ class FishActor:
         c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
         return c
 
-    def _bent(self, rng: np.random.Generator, t: Array, c: Array, shape: Array, total_deg: float, lag_s: float) -> None:
+    def _bent(
+        self,
+        rng: np.random.Generator,
+        t: Array,
+        c: Array,
+        shape: Array,
+        total_deg: float,
+        lag_s: float,
+    ) -> None:
         """Bends that add up to total_deg from head to tail at the shape's peak; the tail follows."""
         hind, lag = rng.uniform(0.52, 0.64), max(1, round(lag_s / STEP_S))
         late = np.concatenate([np.zeros(lag), shape])[: len(shape)]
@@ -178,11 +219,16 @@ class FishActor:
 
     def _r_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.25, 0.95))
-        way, total = self.fish.way(rng), float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0))
+        way, total = (
+            self.fish.way(rng),
+            float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0)),
+        )
         length = t[-1] * rng.uniform(0.75, 1.0)
         shape = bump(t, length, rng.uniform(0.3, 0.5))
         self._bent(rng, t, c, way * shape, total, 0.02)
-        c[:, TURN] = way * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
+        c[:, TURN] = (
+            way * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
+        )
         pace = self.fish.vigour * rng.uniform(0.3, 2.8)
         c[:, SPEED] = pace * (0.5 + 0.5 * t / t[-1])
         self._swim(rng, t, c, 0.4 * pace)
@@ -191,13 +237,18 @@ class FishActor:
 
     def _c_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.16, 0.7))
-        way, total = self.fish.way(rng), float(np.clip(self.fish.bend * rng.normal(132.0, 22.0), 88.0, 178.0))
+        way, total = (
+            self.fish.way(rng),
+            float(np.clip(self.fish.bend * rng.normal(132.0, 22.0), 88.0, 178.0)),
+        )
         first, back = rng.uniform(0.05, 0.10), rng.uniform(0.06, 0.11)
         bend = bump(t, first + back, first / (first + back))
         counter = bump(t - first - 0.6 * back, 1.6 * back) * (t > first + 0.6 * back)
         self._bent(rng, t, c, way * (bend - rng.uniform(0.15, 0.45) * counter), total, 0.012)
         shape = bump(t, 1.4 * first + 0.5 * back)
-        c[:, TURN] = way * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
+        c[:, TURN] = (
+            way * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
+        )
         pace = self.fish.vigour * rng.uniform(2.5, 9.0)
         glide = np.exp(-np.maximum(t - first - 0.1, 0.0) / rng.uniform(0.2, 0.5))
         c[:, SPEED] = pace * np.where(t < first, 0.15, glide)
@@ -212,7 +263,9 @@ class FishActor:
         c[:, CLIMB] = way * np.radians(rng.uniform(15.0, 45.0)) * np.minimum(1.0, (t + 0.1) / 0.3)
         c[:, SPEED] = pace
         self._swim(rng, t, c, pace)
-        c[:, TURN] = np.radians(rng.normal(0.0, 12.0)) + np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        c[:, TURN] = (
+            np.radians(rng.normal(0.0, 12.0)) + np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        )
         c[:, _FRONT] = rng.normal(0.0, 0.4)
         return c
 
@@ -236,8 +289,12 @@ class FishActor:
         t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4))
         beat = self.fish.tempo * rng.uniform(3.5, 7.5)
         c[:, _WAVE], c[:, _BEAT] = self.fish.bend * rng.uniform(3.4, 7.5), beat
-        c[:, TURN] = rng.uniform(1.0, 5.0) * np.sin(2 * np.pi * beat * t + rng.uniform(0, 6)) + rng.normal(0.0, 0.4)
-        c[:, SPEED] = self.fish.vigour * np.abs(rng.uniform(0.0, 0.6) + 0.25 * slow_noise(rng, len(t), 0.3)[:, 0])
+        c[:, TURN] = rng.uniform(1.0, 5.0) * np.sin(
+            2 * np.pi * beat * t + rng.uniform(0, 6)
+        ) + rng.normal(0.0, 0.4)
+        c[:, SPEED] = self.fish.vigour * np.abs(
+            rng.uniform(0.0, 0.6) + 0.25 * slow_noise(rng, len(t), 0.3)[:, 0]
+        )
         c[:, CLIMB] = np.radians(rng.normal(0.0, 10.0))
         c[:, _ROLL] *= 2.0
         return c
@@ -253,8 +310,13 @@ class FishActor:
     def _between(self, rng: np.random.Generator, seconds: float | None) -> Array:
         """What has no name: gliding, hovering, slow turns and climbs below every threshold, backing."""
         kind = rng.choice(5, p=[0.34, 0.28, 0.2, 0.1, 0.08])
-        t, c = self._blank(rng, seconds or self._seconds(rng, *[(0.2, 1.0), (0.3, 2.0), (0.35, 0.9), (0.5, 1.2),
-                                                              (0.3, 0.8)][kind]))  # fmt: skip
+        t, c = self._blank(
+            rng,
+            seconds
+            or self._seconds(
+                rng, *[(0.2, 1.0), (0.3, 2.0), (0.35, 0.9), (0.5, 1.2), (0.3, 0.8)][kind]
+            ),
+        )
         vigour = self.fish.vigour
         c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
         c[:, TURN] = np.radians(12.0) * slow_noise(rng, len(t), 0.5)[:, 0]
@@ -263,12 +325,17 @@ class FishActor:
             c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.0, 0.4), 3.0
         elif kind == 1:
             c[:, SPEED] = vigour * (0.3 + 0.15 * slow_noise(rng, len(t), 0.4)[:, 0])
-            c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.2, 0.9), self.fish.tempo * rng.uniform(1.5, 3.5)
+            c[:, _WAVE], c[:, _BEAT] = (
+                rng.uniform(0.2, 0.9),
+                self.fish.tempo * rng.uniform(1.5, 3.5),
+            )
             c[:, _HIND] = 0.6 * slow_noise(rng, len(t), 0.4)[:, 0]
         elif kind == 2:
             way, total, shape = self.fish.way(rng), rng.uniform(10.0, 40.0), bump(t, t[-1])
             self._bent(rng, t, c, way * shape, total, 0.03)
-            c[:, TURN] += way * np.radians(total * rng.uniform(0.6, 1.0)) * shape / (shape.sum() * STEP_S)
+            c[:, TURN] += (
+                way * np.radians(total * rng.uniform(0.6, 1.0)) * shape / (shape.sum() * STEP_S)
+            )
             c[:, SPEED] = vigour * rng.uniform(0.2, 1.2)
             c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.1, 0.5), 3.0
         elif kind == 3:
@@ -283,22 +350,36 @@ class FishActor:
 
 
 def fish_poses(
-    rng: np.random.Generator, habits: FishHabits, motion: Motion, rows: NDArray[np.int64], size: float
+    rng: np.random.Generator,
+    habits: FishHabits,
+    motion: Motion,
+    rows: NDArray[np.int64],
+    size: float,
 ) -> Pose:
     """Poses (n) in the arena frame, at steps `rows` (n,), of a fish of this size over home that moves so."""
     m, n = len(motion.heading), len(rows)
     phase = 2 * np.pi * np.cumsum(motion.channels[:, _BEAT]) * STEP_S
     own, length = 0.5 * slow_noise(rng, m, 0.25, 4)[rows], rng.uniform(0.9, 1.1)
     c = motion.channels[rows]
-    yaw = bend_profile(habits.skeleton, c[:, _FRONT], c[:, _HIND], c[:, _WAVE], phase[rows], np.full(n, length),
-                       np.full(n, 0.47), own * (0.2 + np.minimum(c[:, _WAVE], 1.0))[:, None])  # fmt: skip
+    yaw = bend_profile(
+        habits.skeleton,
+        c[:, _FRONT],
+        c[:, _HIND],
+        c[:, _WAVE],
+        phase[rows],
+        np.full(n, length),
+        np.full(n, 0.47),
+        own * (0.2 + np.minimum(c[:, _WAVE], 1.0))[:, None],
+    )
     rotation = root_rotation(motion.heading[rows], c[:, CLIMB], c[:, _ROLL])
     pose = hung(habits.skeleton, yaw, rotation, np.full(n, size))
     pose.root.translation[:] += motion.position[rows]
     return pose
 
 
-def depth_of_water(habits: FishHabits, shape: BodyShape, size: float, camera_mm: float) -> tuple[float, float]:
+def depth_of_water(
+    habits: FishHabits, shape: BodyShape, size: float, camera_mm: float
+) -> tuple[float, float]:
     """The lowest and the highest middle of a fish, mm above the floor, so that all of it stays in the water."""
     reach = size * (float(np.max(shape.half_height)) + 0.36 * habits.skeleton.length)
     return reach, camera_mm - _NEAREST_MM - reach

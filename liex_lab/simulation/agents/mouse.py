@@ -34,17 +34,37 @@ from liex_lab.simulation.species import MouseHabits
 Array = NDArray[np.float64]
 
 ACTIONS = (
-    "walk", "run", "turn_left", "turn_right", "rear_supported", "rear_unsupported", "groom", "pause", "freeze", "sniff",
-    "dart", "stretch_attend",
-)  # fmt: skip
+    "walk",
+    "run",
+    "turn_left",
+    "turn_right",
+    "rear_supported",
+    "rear_unsupported",
+    "groom",
+    "pause",
+    "freeze",
+    "sniff",
+    "dart",
+    "stretch_attend",
+)
 _RISE, _BEND = slice(3, 7), slice(7, 10)  # elevations of the bones, turns at the inner joints, rad
 _STRETCH, _ROLL = 10, 11
 _CHANNELS = 12
 _BLEND_S = 0.035
 _SHARES = {
-    "walk": 5.0, "run": 2.5, "turn_left": 1.2, "turn_right": 1.2, "rear_supported": 2.0, "rear_unsupported": 2.0,
-    "groom": 1.2, "pause": 4.0, "freeze": 1.5, "sniff": 2.2, "dart": 2.5, "stretch_attend": 1.5,
-}  # fmt: skip
+    "walk": 5.0,
+    "run": 2.5,
+    "turn_left": 1.2,
+    "turn_right": 1.2,
+    "rear_supported": 2.0,
+    "rear_unsupported": 2.0,
+    "groom": 1.2,
+    "pause": 4.0,
+    "freeze": 1.5,
+    "sniff": 2.2,
+    "dart": 2.5,
+    "stretch_attend": 1.5,
+}
 _BETWEEN = 0.3  # of the acts are followed by something without a name
 _STRIDE_HZ_PER_SPINE = 1.6
 _WALL_MM = 50.0  # a nose nearer to a wall can lean on it
@@ -66,7 +86,9 @@ class MouseActor:
         """An actor with this body."""
         height = resting_heights(skeleton, shape)[0] + np.array([0.5, 1.5, 2.5, 3.0, 3.5])
         height[-1] = 9.0
-        rest = np.arcsin(np.clip(np.diff(height) / np.linalg.norm(skeleton.offsets[1:], axis=1), -0.9, 0.9))
+        rest = np.arcsin(
+            np.clip(np.diff(height) / np.linalg.norm(skeleton.offsets[1:], axis=1), -0.9, 0.9)
+        )
         return MouseActor(mouse, mouse.size * skeleton.length, half, rest)
 
     def fits(self, position: Array, heading: Array) -> bool:
@@ -81,17 +103,26 @@ class MouseActor:
         rest = np.zeros(_CHANNELS)
         rest[_RISE], rest[_STRETCH] = self.rest, 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
-        story, names = Story(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits), list(_SHARES)
-        share = np.array([_SHARES[name] for name in names]) * np.exp(rng.normal(0.0, 0.25, len(names)))
+        story, names = (
+            Story(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits),
+            list(_SHARES),
+        )
+        share = np.array([_SHARES[name] for name in names]) * np.exp(
+            rng.normal(0.0, 0.25, len(names))
+        )
         while story.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share / share.sum()))
             if word == "rear_supported":
                 self._to_wall(rng, story)
-            done = self._possible(story, word) and story.play(word, lambda word=word: self.act(rng, word), 6)  # type: ignore[misc]
+            done = self._possible(story, word) and story.play(
+                word, lambda word=word: self.act(rng, word), 6
+            )  # type: ignore[misc]
             if not done and word in ("walk", "run", "dart"):  # no room ahead
                 self._turn_home(rng, story)
                 story.play(word, lambda word=word: self.act(rng, word), 8)  # type: ignore[misc]
-            elif rng.random() < _BETWEEN and not story.play(UNLABELLED, lambda: self._between(rng), 4):
+            elif rng.random() < _BETWEEN and not story.play(
+                UNLABELLED, lambda: self._between(rng), 4
+            ):
                 self._turn_home(rng, story)
         return story.told()
 
@@ -99,14 +130,20 @@ class MouseActor:
         """Whether a rear here is of that kind: one on a wall has it before the nose, any other is away from walls."""
         if word == "rear_supported":
             return self._room(story) < _WALL_MM
-        nose = story.position[:2] + 0.5 * self.spine_mm * np.array([np.cos(story.heading), np.sin(story.heading)])
+        nose = story.position[:2] + 0.5 * self.spine_mm * np.array(
+            [np.cos(story.heading), np.sin(story.heading)]
+        )
         return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
 
     def _room(self, story: Story) -> float:
         """From the nose to the wall ahead, mm."""
         way = np.array([np.cos(story.heading), np.sin(story.heading)])
         nose = story.position[:2] + 0.5 * self.spine_mm * way
-        ahead = np.where(np.abs(way) > 0.3, (self.half - np.sign(way) * nose) / np.maximum(np.abs(way), 1e-9), np.inf)
+        ahead = np.where(
+            np.abs(way) > 0.3,
+            (self.half - np.sign(way) * nose) / np.maximum(np.abs(way), 1e-9),
+            np.inf,
+        )
         return float(ahead.min())
 
     def _to_wall(self, rng: np.random.Generator, story: Story) -> None:
@@ -121,11 +158,15 @@ class MouseActor:
                 return
             speed = self.mouse.vigour * self.mouse.size * rng.uniform(90.0, 240.0)
             seconds = max(0.3, (room - 0.3 * _WALL_MM) / speed)
-            story.play("walk", lambda seconds=seconds, speed=speed: self._stride(rng, seconds, speed), 2)  # type: ignore[misc]
+            story.play(
+                "walk", lambda seconds=seconds, speed=speed: self._stride(rng, seconds, speed), 2
+            )  # type: ignore[misc]
 
     def _turn_home(self, rng: np.random.Generator, story: Story) -> None:
         """Turn to the middle of the box, on the spot where there is no room."""
-        self._turn_by(rng, story, np.arctan2(-story.position[1], -story.position[0]) + rng.normal(0.0, 0.3))
+        self._turn_by(
+            rng, story, np.arctan2(-story.position[1], -story.position[0]) + rng.normal(0.0, 0.3)
+        )
 
     def _turn_by(self, rng: np.random.Generator, story: Story, heading: float) -> None:
         away = (heading - story.heading + np.pi) % (2 * np.pi) - np.pi
@@ -141,21 +182,41 @@ class MouseActor:
         """Channels of one action."""
         vigour, size = self.mouse.vigour, self.mouse.size
         table: dict[str, Callable[[], Array]] = {
-            "walk": lambda: self._stride(rng, self._seconds(rng, 0.4, 2.8), vigour * size * rng.uniform(60.0, 290.0)),
-            "run": lambda: self._stride(rng, self._seconds(rng, 0.5, 1.3), vigour * size * rng.uniform(300.0, 540.0)),
+            "walk": lambda: self._stride(
+                rng, self._seconds(rng, 0.4, 2.8), vigour * size * rng.uniform(60.0, 290.0)
+            ),
+            "run": lambda: self._stride(
+                rng, self._seconds(rng, 0.5, 1.3), vigour * size * rng.uniform(300.0, 540.0)
+            ),
             "dart": lambda: self._dart(rng),
-            "turn_left": lambda: self._turning(rng, np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)),
-            "turn_right": lambda: self._turning(rng, -np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)),
-            "rear_supported": lambda: self._rear(rng, True), "rear_unsupported": lambda: self._rear(rng, False),
-            "groom": lambda: self._groom(rng), "pause": lambda: self._pause(rng), "freeze": lambda: self._freeze(rng),
-            "sniff": lambda: self._sniff(rng), "stretch_attend": lambda: self._stretch(rng),
-        }  # fmt: skip
+            "turn_left": lambda: self._turning(
+                rng, np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)
+            ),
+            "turn_right": lambda: self._turning(
+                rng, -np.radians(rng.uniform(34.0, 150.0)), rng.uniform(0.0, 130.0)
+            ),
+            "rear_supported": lambda: self._rear(rng, True),
+            "rear_unsupported": lambda: self._rear(rng, False),
+            "groom": lambda: self._groom(rng),
+            "pause": lambda: self._pause(rng),
+            "freeze": lambda: self._freeze(rng),
+            "sniff": lambda: self._sniff(rng),
+            "stretch_attend": lambda: self._stretch(rng),
+        }
         return table[word]()
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
-        return float(np.clip(shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.mouse.patience, 0.25, longest))
+        return float(
+            np.clip(
+                shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.mouse.patience,
+                0.25,
+                longest,
+            )
+        )
 
-    def _blank(self, rng: np.random.Generator, seconds: float, unrest: float = 1.0) -> tuple[Array, Array]:
+    def _blank(
+        self, rng: np.random.Generator, seconds: float, unrest: float = 1.0
+    ) -> tuple[Array, Array]:
         """The clock and the channels of a standing mouse, a little restless."""
         t = clock(seconds)
         c = np.zeros((len(t), _CHANNELS))
@@ -171,14 +232,22 @@ class MouseActor:
     def _gait(self, c: Array) -> None:
         """The trunk sways with the stride."""
         spines = np.abs(c[:, SPEED]) / self.spine_mm
-        phase = 2 * np.pi * np.cumsum(np.sqrt(spines) * _STRIDE_HZ_PER_SPINE * self.mouse.tempo) * STEP_S
+        phase = (
+            2
+            * np.pi
+            * np.cumsum(np.sqrt(spines) * _STRIDE_HZ_PER_SPINE * self.mouse.tempo)
+            * STEP_S
+        )
         sway = 0.06 * np.minimum(spines, 1.0) * np.sin(phase)
         c[:, _BEND] += sway[:, None] * [1.0, -0.5, -0.5]
 
     def _stride(self, rng: np.random.Generator, seconds: float, speed: float) -> Array:
         t, c = self._blank(rng, seconds, 0.7)
         c[:, SPEED] = speed * np.clip(1.0 + 0.13 * slow_noise(rng, len(t), 0.5)[:, 0], 0.5, 1.5)
-        c[:, TURN] = np.radians(rng.normal(0.0, 10.0)) + np.radians(11.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        c[:, TURN] = (
+            np.radians(rng.normal(0.0, 10.0))
+            + np.radians(11.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        )
         c[:, _STRETCH] += 0.02
         self._gait(c)
         return c
@@ -209,7 +278,9 @@ class MouseActor:
         rise, fall = rng.uniform(0.2, 0.4, 2)
         up = np.clip(np.minimum(t / rise, (t[-1] - t) / fall), 0.0, 1.0)[:, None] ** 1.3
         steep = rng.uniform(50.0, 80.0) if supported else rng.uniform(38.0, 76.0)
-        tower = np.radians(steep + rng.normal(0.0, 7.0, 4) + [8.0, 4.0, 0.0, -25.0 + rng.normal(0.0, 12.0)])
+        tower = np.radians(
+            steep + rng.normal(0.0, 7.0, 4) + [8.0, 4.0, 0.0, -25.0 + rng.normal(0.0, 12.0)]
+        )
         if not supported:
             tower = tower + np.radians(4.0) * slow_noise(rng, len(t), 0.35)
         c[:, _RISE] = c[:, _RISE] * (1.0 - up) + (tower + 0.5 * (c[:, _RISE] - self.rest)) * up
@@ -223,11 +294,25 @@ class MouseActor:
     def _groom(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, 0.4 + self._seconds(rng, 0.8, 5.0), 0.5)
         c[:, _RISE] += self._hunch(rng) - self.rest
-        rate = self.mouse.tempo * rng.uniform(3.0, 6.0) * (1.0 + 0.1 * slow_noise(rng, len(t), 0.7)[:, 0])
-        phase, strength = 2 * np.pi * np.cumsum(rate) * STEP_S, 0.7 + 0.3 * slow_noise(rng, len(t), 0.6)[:, 0]
-        lick = np.radians(rng.uniform(-30.0, 30.0)) * np.clip(slow_noise(rng, len(t), 1.2)[:, 0], 0.0, 1.0)
+        rate = (
+            self.mouse.tempo
+            * rng.uniform(3.0, 6.0)
+            * (1.0 + 0.1 * slow_noise(rng, len(t), 0.7)[:, 0])
+        )
+        phase, strength = (
+            2 * np.pi * np.cumsum(rate) * STEP_S,
+            0.7 + 0.3 * slow_noise(rng, len(t), 0.6)[:, 0],
+        )
+        lick = np.radians(rng.uniform(-30.0, 30.0)) * np.clip(
+            slow_noise(rng, len(t), 1.2)[:, 0], 0.0, 1.0
+        )
         c[:, 6] += np.radians(rng.uniform(4.0, 10.0)) * strength * np.sin(phase)
-        c[:, 9] += np.radians(rng.uniform(2.0, 11.0)) * strength * np.sin(phase * rng.choice([0.5, 1.0]) + 1.0) + lick
+        c[:, 9] += (
+            np.radians(rng.uniform(2.0, 11.0))
+            * strength
+            * np.sin(phase * rng.choice([0.5, 1.0]) + 1.0)
+            + lick
+        )
         c[:, 8] += 0.7 * lick
         c[:, SPEED] = rng.uniform(0.0, 12.0)
         return c
@@ -250,7 +335,9 @@ class MouseActor:
         c[:, 5] += np.radians(-rng.uniform(2.0, 9.0))
         sweep = 2 * np.pi * self.mouse.tempo * rng.uniform(1.3, 2.8) * t
         c[:, 9] += np.radians(rng.uniform(9.0, 24.0)) * np.sin(sweep + rng.uniform(0, 6))
-        c[:, 6] += np.radians(rng.uniform(1.0, 3.0)) * np.sin(2 * np.pi * rng.uniform(7.0, 10.0) * t)
+        c[:, 6] += np.radians(rng.uniform(1.0, 3.0)) * np.sin(
+            2 * np.pi * rng.uniform(7.0, 10.0) * t
+        )
         c[:, SPEED] = rng.uniform(0.0, 90.0)
         c[:, TURN] = np.radians(10.0) * slow_noise(rng, len(t), 0.5)[:, 0]
         self._gait(c)
@@ -271,7 +358,9 @@ class MouseActor:
         t, c = self._blank(rng, self._seconds(rng, 0.4, 1.6))
         shape = bump(t, t[-1])
         if kind == 0:
-            c[:, _RISE] += np.radians(rng.uniform(9.0, 20.0)) * shape[:, None] ** 0.6 * [0.5, 0.7, 1.0, 1.4]
+            c[:, _RISE] += (
+                np.radians(rng.uniform(9.0, 20.0)) * shape[:, None] ** 0.6 * [0.5, 0.7, 1.0, 1.4]
+            )
             c[:, SPEED] = rng.uniform(0.0, 50.0)
         elif kind == 1:
             deep = rng.uniform(0.7, 1.0) * (self._hunch(rng) - self.rest)
@@ -287,9 +376,13 @@ class MouseActor:
 
 
 def mouse_poses(
-    rng: np.random.Generator, habits: MouseHabits, motion: Motion, rows: NDArray[np.int64], size: float,
+    rng: np.random.Generator,
+    habits: MouseHabits,
+    motion: Motion,
+    rows: NDArray[np.int64],
+    size: float,
     shape: BodyShape,
-) -> tuple[Pose, Array]:  # fmt: skip
+) -> tuple[Pose, Array]:
     """Poses (n) in the arena frame, at steps `rows` (n,), of a mouse of this size over home, and girths (n,)."""
     c, n, skeleton = motion.channels[rows], len(rows), habits.skeleton
     turn = np.zeros((n, skeleton.n_joints))

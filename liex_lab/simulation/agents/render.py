@@ -42,7 +42,12 @@ class Camerawork:
 
     @staticmethod
     def draw(
-        rng: np.random.Generator, habits: Habits, sensor: Sensor, fur: Array, height_mm: float, stride: int
+        rng: np.random.Generator,
+        habits: Habits,
+        sensor: Sensor,
+        fur: Array,
+        height_mm: float,
+        stride: int,
     ) -> Camerawork:
         """A camera of that make, so high above the floor, of whose pictures only every `stride`-th pixel is looked at.
 
@@ -57,14 +62,24 @@ class Camerawork:
         picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
         error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * habits.setting.scale]
         return Camerawork(
-            np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]), picture, place, parameters, error
+            np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]),
+            picture,
+            place,
+            parameters,
+            error,
         )
 
 
 def film(
-    rng: np.random.Generator, habits: Habits, camera: Camerawork, shape: Body, pose: Pose, girth: Array,
-    walls: Array | None, window_px: int,
-) -> Iterator[Windows]:  # fmt: skip
+    rng: np.random.Generator,
+    habits: Habits,
+    camera: Camerawork,
+    shape: Body,
+    pose: Pose,
+    girth: Array,
+    walls: Array | None,
+    window_px: int,
+) -> Iterator[Windows]:
     """Windows around the animal in poses (n) of the arena frame and girths (n,), some hundred at a time.
 
     walls (n, WALL_COLUMNS): what wall each frame shows, None none.
@@ -77,7 +92,10 @@ def film(
         m = part.stop - part.start
         lying = None if bends is None else np.repeat(bends, m, axis=0)
         vertices = surface.vertices(pose[part], shape[0].broadcast(m), girth[part], lying)
-        T = SE3(np.tile(camera.T_arena_camera.rotation, (m, 1, 1)), np.tile(camera.T_arena_camera.translation, (m, 1)))
+        T = SE3(
+            np.tile(camera.T_arena_camera.rotation, (m, 1, 1)),
+            np.tile(camera.T_arena_camera.translation, (m, 1)),
+        )
         intrinsics = np.tile(camera.intrinsics, (m, 1))
         trunk = vertices[:, : surface.n_trunk_vertices]
         origin = window_origin(trunk, T.inverse(), intrinsics, window_px)
@@ -85,11 +103,31 @@ def film(
         background = np.empty_like(depth)
         nothing = rounded(np.zeros((m, 3)), np.ones((m, 3)), np.zeros(m), np.full(m, 2.0))
         _stage.draw_windows(
-            vertices, surface.faces, nothing, PART_FACES, np.zeros(m, np.bool_), T.rotation,
-            T.translation[:, 2].copy(), intrinsics, np.tile(camera.picture, (m, 1)), origin,
-            np.zeros((m, _stage.WALL_COLUMNS)) if walls is None else walls[part], np.zeros(m),
-            np.tile(camera.parameters, (m, 1)), seeds[part], NORMAL, depth, background,
-        )  # fmt: skip
+            vertices,
+            surface.faces,
+            nothing,
+            PART_FACES,
+            np.zeros(m, np.bool_),
+            T.rotation,
+            T.translation[:, 2].copy(),
+            intrinsics,
+            np.tile(camera.picture, (m, 1)),
+            origin,
+            np.zeros((m, _stage.WALL_COLUMNS)) if walls is None else walls[part],
+            np.zeros(m),
+            np.tile(camera.parameters, (m, 1)),
+            seeds[part],
+            NORMAL,
+            depth,
+            background,
+        )
         unit = np.float32(camera.parameters[UNIT])
         floor = inverse_depth_plane(T, intrinsics, np.tile(camera.floor_error, (m, 1)))
-        yield Windows(depth * unit, background * unit, intrinsics, origin.astype(float), floor, habits.skeleton.view)
+        yield Windows(
+            depth * unit,
+            background * unit,
+            intrinsics,
+            origin.astype(float),
+            floor,
+            habits.skeleton.view,
+        )

@@ -11,9 +11,24 @@ from liex_lab.simulation._sensor_kernels import ANIMAL, NOTHING, OBJECT, STILL, 
 
 @njit(cache=True)
 def picture(
-    hand, hand_faces, arm, arm_faces, body, body_faces, thing, thing_faces, has_thing, wall, intrinsics, size, origin,
-    sensor, seed, table, out,
-):  # fmt: skip
+    hand,
+    hand_faces,
+    arm,
+    arm_faces,
+    body,
+    body_faces,
+    thing,
+    thing_faces,
+    has_thing,
+    wall,
+    intrinsics,
+    size,
+    origin,
+    sensor,
+    seed,
+    table,
+    out,
+):
     """One picture or window (H, W) uint16 mm; meshes (V, 3) mm in the camera frame.
 
     wall (4,): 1 / z = a u + b v + c behind everything and its unevenness, mm; c = 0: nothing is in range there. size:
@@ -34,7 +49,9 @@ def picture(
     u0, v0 = float(origin[0]), float(origin[1])
     draw_onto(body, body_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what)
     if has_thing:
-        draw_onto(thing, thing_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what)
+        draw_onto(
+            thing, thing_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what
+        )
     draw_onto(arm, arm_faces, rotation, translation, intrinsics, u0, v0, ANIMAL, depth, what)
     draw_onto(hand, hand_faces, rotation, translation, intrinsics, u0, v0, ANIMAL, depth, what)
     for r in range(shape[0]):
@@ -42,15 +59,58 @@ def picture(
             u, v = origin[0] + c, origin[1] + r
             if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
                 depth[r, c], what[r, c] = 0.0, NOTHING
-    sense(depth, what, sensor, intrinsics[0], intrinsics[2] - u0, intrinsics[3] - v0, state, table, field, out)
+    sense(
+        depth,
+        what,
+        sensor,
+        intrinsics[0],
+        intrinsics[2] - u0,
+        intrinsics[3] - v0,
+        state,
+        table,
+        field,
+        out,
+    )
 
 
 @njit(cache=True, parallel=True)
 def pictures(
-    hand, hand_faces, arm, arm_faces, body, body_faces, thing, thing_faces, has_thing, wall, intrinsics, size, origin,
-    sensor, seed, table, out,
-):  # fmt: skip
+    hand,
+    hand_faces,
+    arm,
+    arm_faces,
+    body,
+    body_faces,
+    thing,
+    thing_faces,
+    has_thing,
+    wall,
+    intrinsics,
+    size,
+    origin,
+    sensor,
+    seed,
+    table,
+    out,
+):
     """`picture` for a batch (n)."""
     for i in prange(len(hand)):
-        picture(hand[i], hand_faces, arm[i], arm_faces, body[i], body_faces, thing[i], thing_faces, has_thing[i],
-                wall[i], intrinsics[i], size[i], origin[i], sensor[i], seed[i], table, out[i])  # fmt: skip
+        picture(
+            hand[i],
+            hand_faces,
+            arm[i],
+            arm_faces,
+            body[i],
+            body_faces,
+            thing[i],
+            thing_faces,
+            has_thing[i],
+            wall[i],
+            intrinsics[i],
+            size[i],
+            origin[i],
+            sensor[i],
+            seed[i],
+            table,
+            out[i],
+        )

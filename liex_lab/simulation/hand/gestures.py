@@ -29,7 +29,9 @@ class Gestures(NamedTuple):
     wrists: Array
 
 
-def draw_gestures(rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: float, middle: Array) -> Gestures:
+def draw_gestures(
+    rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: float, middle: Array
+) -> Gestures:
     """N moments of somebody who goes through postures that were seen, about a point (3,) mm of the camera frame.
 
     Each move lasts as long as its longest part, turning, bending or going, takes at a speed drawn for it.
@@ -40,17 +42,23 @@ def draw_gestures(rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: 
     wrists = rng.normal(0.0, 1.0, (keys, 3)) * _WRIST_RAD
     turning = so3.log(np.swapaxes(turns[:-1], 1, 2) @ turns[1:])
     bending, going, leaning = (np.diff(values, axis=0) for values in (angles, places, wrists))
-    longest = np.stack([
-        np.linalg.norm(turning, axis=-1) / rng.uniform(*_TURN, keys - 1),
-        np.abs(bending).max(axis=(1, 2)) / rng.uniform(*_BEND, keys - 1),
-        np.linalg.norm(going, axis=-1) / rng.uniform(*_GO, keys - 1),
-    ]).max(axis=0)  # fmt: skip
-    moves = np.maximum(0.5 * np.pi * longest, _SHORTEST_S)  # the fastest moment of a cosine is pi/2 times the mean
+    longest = np.stack(
+        [
+            np.linalg.norm(turning, axis=-1) / rng.uniform(*_TURN, keys - 1),
+            np.abs(bending).max(axis=(1, 2)) / rng.uniform(*_BEND, keys - 1),
+            np.linalg.norm(going, axis=-1) / rng.uniform(*_GO, keys - 1),
+        ]
+    ).max(axis=0)
+    moves = np.maximum(
+        0.5 * np.pi * longest, _SHORTEST_S
+    )  # the fastest moment of a cosine is pi/2 times the mean
     starts = np.concatenate([[0.0], np.cumsum(moves + rng.uniform(*_REST_S, keys - 1))])
     now = step_s * np.arange(n)
     at = np.clip(np.searchsorted(starts, now, side="right") - 1, 0, keys - 2)
     share = 0.5 - 0.5 * np.cos(np.pi * np.clip((now - starts[at]) / moves[at], 0.0, 1.0))[:, None]
     return Gestures(
-        angles[at] + share[..., None] * bending[at], turns[at] @ so3.exp(share * turning[at]),
-        places[at] + share * going[at], wrists[at] + share * leaning[at],
-    )  # fmt: skip
+        angles[at] + share[..., None] * bending[at],
+        turns[at] @ so3.exp(share * turning[at]),
+        places[at] + share * going[at],
+        wrists[at] + share * leaning[at],
+    )

@@ -21,7 +21,12 @@ Array = NDArray[np.float64]
 STATISTICS = Path(__file__).with_name("pose_prior.toml")
 _N_POSTURES, _N_TURNS, _N_AXES = 8, 8, 6
 _FREE_SHARE = 0.45  # of the training postures are what a hand can do, not what was seen
-_FAN_DEG = {"index": 10.0, "middle": 1.0, "ring": -8.0, "little": -19.0}  # how fingers part when a hand is spread
+_FAN_DEG = {
+    "index": 10.0,
+    "middle": 1.0,
+    "ring": -8.0,
+    "little": -19.0,
+}  # how fingers part when a hand is spread
 _BLEND_SHARE = 0.3  # of the seen ones lie between two
 
 
@@ -68,7 +73,9 @@ class HandPostures:
     def draw_turns(self, rng: np.random.Generator, n: int) -> Array:
         """Orientations (n, 3, 3) of the palm towards the viewer, as they were seen."""
         k = rng.choice(len(self.turn_share), n, p=self.turn_share / self.turn_share.sum())
-        return self.turn[k] @ so3.exp(np.einsum("na,nad->nd", rng.standard_normal((n, 3)), self.turn_axes[k]))
+        return self.turn[k] @ so3.exp(
+            np.einsum("na,nad->nd", rng.standard_normal((n, 3)), self.turn_axes[k])
+        )
 
 
 def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
@@ -98,14 +105,27 @@ def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     bent = np.clip(np.where(alike, together, each) + rng.normal(0.0, 0.05, (n, 4)), 0.0, 1.0)
     spread = rng.uniform(-0.6, 1.6, n)  # fingers closed up, or fanned out
     for f, (finger, fan) in enumerate(_FAN_DEG.items()):
-        root, middle, end = (skeleton.names.index(f"{finger}_{part}") for part in ("root", "middle", "end"))
+        root, middle, end = (
+            skeleton.names.index(f"{finger}_{part}") for part in ("root", "middle", "end")
+        )
         curl = bent[:, f]
-        angles[:, root, 1] = np.radians(-8.0 + 80.0 * curl * rng.uniform(0.2, 1.1, n) + rng.normal(0.0, 8.0, n))
+        angles[:, root, 1] = np.radians(
+            -8.0 + 80.0 * curl * rng.uniform(0.2, 1.1, n) + rng.normal(0.0, 8.0, n)
+        )
         angles[:, root, 2] = np.radians(fan * spread + rng.normal(0.0, 7.0, n)) * (1.0 - 0.7 * curl)
         angles[:, middle, 1] = np.radians(100.0 * curl + rng.normal(0.0, 8.0, n))
-        angles[:, end, 1] = angles[:, middle, 1] * rng.uniform(0.4, 0.8, n) + np.radians(rng.normal(0.0, 6.0, n))
-    root, middle, end = (skeleton.names.index(f"thumb_{part}") for part in ("root", "middle", "end"))
-    for joint, axis, low, high in ((root, 1, -28, 50), (root, 2, -25, 25), (middle, 1, -5, 65), (end, 1, -15, 75)):
+        angles[:, end, 1] = angles[:, middle, 1] * rng.uniform(0.4, 0.8, n) + np.radians(
+            rng.normal(0.0, 6.0, n)
+        )
+    root, middle, end = (
+        skeleton.names.index(f"thumb_{part}") for part in ("root", "middle", "end")
+    )
+    for joint, axis, low, high in (
+        (root, 1, -28, 50),
+        (root, 2, -25, 25),
+        (middle, 1, -5, 65),
+        (end, 1, -15, 75),
+    ):
         angles[:, joint, axis] = np.radians(rng.uniform(low, high, n))
     return _clipped(skeleton, angles)
 
@@ -153,16 +173,27 @@ def distil(skeleton: Skeleton, angles: Array, turns: Array) -> str:
         _, sd, axes = np.linalg.svd(rows - mean, full_matrices=False)
         axes = axes[:_N_AXES] * (sd[:_N_AXES, None] / np.sqrt(len(rows)))
         rest = np.sqrt(np.maximum((rows - mean).var(axis=0) - (axes**2).sum(axis=0), 0.0))
-        lines += ["[[postures]]", f"share = {len(rows) / len(values):.4f}", f"mean_deg = {_degrees(mean)}",
-                  f"axes_deg = {_degrees(axes)}", f"rest_deg = {_degrees(rest)}", ""]  # fmt: skip
+        lines += [
+            "[[postures]]",
+            f"share = {len(rows) / len(values):.4f}",
+            f"mean_deg = {_degrees(mean)}",
+            f"axes_deg = {_degrees(axes)}",
+            f"rest_deg = {_degrees(rest)}",
+            "",
+        ]
     kind = KMeans(_N_TURNS, n_init=10, random_state=0).fit_predict(turns.reshape(-1, 9))
     for k in range(_N_TURNS):
         group = turns[kind == k]
         mean = so3.mean(group)
         off = so3.log(mean.T @ group)
         _, sd, axes = np.linalg.svd(off, full_matrices=False)
-        lines += ["[[turns]]", f"share = {len(group) / len(turns):.4f}", f"turn_deg = {_degrees(so3.log(mean))}",
-                  f"axes_deg = {_degrees(axes * (sd[:, None] / np.sqrt(len(group))))}", ""]  # fmt: skip
+        lines += [
+            "[[turns]]",
+            f"share = {len(group) / len(turns):.4f}",
+            f"turn_deg = {_degrees(so3.log(mean))}",
+            f"axes_deg = {_degrees(axes * (sd[:, None] / np.sqrt(len(group))))}",
+            "",
+        ]
     return "\n".join(lines)
 
 

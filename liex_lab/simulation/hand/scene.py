@@ -24,7 +24,9 @@ Array = NDArray[np.float64]
 DISTANCE_MM = (400.0, 1200.0)
 ARM_FACES = joined_faces([(CAPSULE_RINGS, CAPSULE_SEGMENTS)] * N_ARM_CAPSULES)
 _N_BODY_PARTS = 3  # torso, head, and something else behind
-BODY_FACES = np.concatenate([PART_FACES + k * len(SPHERE) for k in range(_N_BODY_PARTS)]).astype(np.int32)
+BODY_FACES = np.concatenate([PART_FACES + k * len(SPHERE) for k in range(_N_BODY_PARTS)]).astype(
+    np.int32
+)
 _EDGE_MM = 110.0  # the palm stays this far inside the picture
 
 
@@ -54,9 +56,14 @@ class HandCast:
         return replace(self, **{name: getattr(self, name)[index] for name in columns})
 
     def pictures(
-        self, faces: NDArray[np.int32], intrinsics: Array, size: NDArray[np.int64], origin: NDArray[np.int64],
-        shape: tuple[int, int], parallel: bool = True,
-    ) -> NDArray[np.uint16]:  # fmt: skip
+        self,
+        faces: NDArray[np.int32],
+        intrinsics: Array,
+        size: NDArray[np.int64],
+        origin: NDArray[np.int64],
+        shape: tuple[int, int],
+        parallel: bool = True,
+    ) -> NDArray[np.uint16]:
         """What the cameras read: (n, *shape) uint16 mm from picture pixel origin (n, 2) on.
 
         faces of the hands' meshes; intrinsics (n, 4); size (n, 2): width and height of the whole pictures.
@@ -64,15 +71,34 @@ class HandCast:
         out = np.empty((len(self.seeds), *shape), np.uint16)
         with threads(parallel):
             kernels.pictures(
-                self.hand, faces, self.arm, ARM_FACES, self.body, BODY_FACES, self.thing, self.thing_faces,
+                self.hand,
+                faces,
+                self.arm,
+                ARM_FACES,
+                self.body,
+                BODY_FACES,
+                self.thing,
+                self.thing_faces,
                 self.shown,
-                self.wall, intrinsics, size, origin, self.parameters, self.seeds, NORMAL, out,
-            )  # fmt: skip
+                self.wall,
+                intrinsics,
+                size,
+                origin,
+                self.parameters,
+                self.seeds,
+                NORMAL,
+                out,
+            )
         return out
 
 
 def hold_out(
-    rng: np.random.Generator, skeleton: Skeleton, angles: Array, turns: Array, size: Array, p_camera: Array
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    angles: Array,
+    turns: Array,
+    size: Array,
+    p_camera: Array,
 ) -> Pose:
     """Poses (n) in the camera frame of hands with these angles (n, J, 3), palms at points (n, 3) mm.
 
@@ -82,7 +108,9 @@ def hold_out(
     return Pose(SE3(rotation, p_camera), angles, size)
 
 
-def draw_places(rng: np.random.Generator, intrinsics: Array, picture: Array, low: Array, high: Array) -> Array:
+def draw_places(
+    rng: np.random.Generator, intrinsics: Array, picture: Array, low: Array, high: Array
+) -> Array:
     """Points (n, 3) mm, camera frame, between depths low and high (n,), that are well inside pictures (n, 2) px."""
     n = len(low)
     depth = rng.uniform(low, high)
@@ -93,9 +121,17 @@ def draw_places(rng: np.random.Generator, intrinsics: Array, picture: Array, low
 
 
 def assemble(
-    rng: np.random.Generator, skeleton: Skeleton, pose: Pose, shape: HandShape, size: Array, intrinsics: Array,
-    parameters: Array, thing_share: float, scenery: int, wrists: Array | None = None,
-) -> HandCast:  # fmt: skip
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    pose: Pose,
+    shape: HandShape,
+    size: Array,
+    intrinsics: Array,
+    parameters: Array,
+    thing_share: float,
+    scenery: int,
+    wrists: Array | None = None,
+) -> HandCast:
     """Hands (n) with their arms, bodies, walls and things; `scenery` pictures in a row share the same surroundings.
 
     wrists (n, 3) rad: how each is bent, None draws it for every picture.
@@ -111,7 +147,19 @@ def assemble(
     thing, shown = _things(rng, hand, thing_share)
     wall = _walls(rng, n_scenes, intrinsics[::scenery][:n_scenes], hand, body)[each]
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    return HandCast(pose, positions, size * skeleton.length, hand, arm, body, thing, shown, wall, parameters, seeds)
+    return HandCast(
+        pose,
+        positions,
+        size * skeleton.length,
+        hand,
+        arm,
+        body,
+        thing,
+        shown,
+        wall,
+        parameters,
+        seeds,
+    )
 
 
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
@@ -128,12 +176,16 @@ def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Arra
     centre[:, 0, 1] = elbow[:, 1] + (u[:, 0, 4] - 0.4) * 400.0
     centre[:, 0, 2] = behind + 110.0 + 450.0 * u[:, 0, 5] ** 2 + radii[:, 0, 2]
     side = np.where(centre[:, 0, 0] > elbow[:, 0], -1.0, 1.0)
-    shoulder = centre[:, 0] + radii[:, 0] * np.stack([0.7 * side, np.full(n, -0.6), np.full(n, -0.2)], axis=1)
+    shoulder = centre[:, 0] + radii[:, 0] * np.stack(
+        [0.7 * side, np.full(n, -0.6), np.full(n, -0.2)], axis=1
+    )
     radii[:, 1] = [75.0, 105.0, 90.0] + u[:, 1, :3] * 20.0
     centre[:, 1] = centre[:, 0]
     centre[:, 1, 0] += 60.0 * (u[:, 1, 3] - 0.5)
     centre[:, 1, 1] -= radii[:, 0, 1] + 110.0
-    centre[:, 1, 2] = np.maximum(centre[:, 1, 2] - 120.0 * (u[:, 1, 4] - 0.4), behind + 60.0 + radii[:, 1, 2])
+    centre[:, 1, 2] = np.maximum(
+        centre[:, 1, 2] - 120.0 * (u[:, 1, 4] - 0.4), behind + 60.0 + radii[:, 1, 2]
+    )
     radii[:, 2] = 60.0 + 200.0 * u[:, 2, :3]
     centre[:, 2, :2] = centre[:, 0, :2] + (2.0 * u[:, 2, 3:5] - 1.0) * 500.0
     centre[:, 2, 2] = behind + 120.0 + radii[:, 2, 2] + 900.0 * u[:, 2, 5]
@@ -141,7 +193,9 @@ def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Arra
     alone = u[:, 0, 7] < 0.25
     shoulder[alone] = (elbow - 800.0 * forward)[alone]
     radii[alone, :2], radii[u[:, 2, 7] < 0.4, 2] = 0.01, 0.01
-    return rounded(centre, radii, np.pi * (2.0 * u[:, :, 6] - 1.0) * [0.1, 0.0, 1.0], power).reshape(n, -1, 3), shoulder
+    return rounded(
+        centre, radii, np.pi * (2.0 * u[:, :, 6] - 1.0) * [0.1, 0.0, 1.0], power
+    ).reshape(n, -1, 3), shoulder
 
 
 def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -156,7 +210,9 @@ def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array,
     off = (clear + rng.uniform(10.0, 80.0, n))[:, None] * toward
     depth = np.maximum(middle[:, 2] + rng.uniform(-30.0, 160.0, n), 300.0)
     # farther away it must stand further aside to appear beside the hand and not behind it
-    centre = np.column_stack([(middle[:, :2] + off) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None], depth])
+    centre = np.column_stack(
+        [(middle[:, :2] + off) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None], depth]
+    )
     power = np.where(rng.random(n) < 0.5, 2.0, 8.0)
     return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < share
 

@@ -61,13 +61,24 @@ class HandSession(TrueRecording):
     """A virtual recording of one person's hand; the joints are the person's own."""
 
     def __init__(
-        self, name: str, skeleton: Skeleton, sensor: Sensor, cast: stage.HandCast,
+        self,
+        name: str,
+        skeleton: Skeleton,
+        sensor: Sensor,
+        cast: stage.HandCast,
         times_ns: NDArray[np.int64] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         n = len(cast.seeds)
         times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
-        super().__init__(name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth)
-        self.skeleton, self.sensor, self.cast, self.surface = skeleton, sensor, cast, Surface.of(skeleton)
+        super().__init__(
+            name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth
+        )
+        self.skeleton, self.sensor, self.cast, self.surface = (
+            skeleton,
+            sensor,
+            cast,
+            Surface.of(skeleton),
+        )
         self.spine_mm = float(cast.spine_mm[0])
         self.floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
         self.T_arena_camera = self.floor.T_arena_camera
@@ -84,16 +95,18 @@ class HandSession(TrueRecording):
         intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n, 4)).copy()
         size = np.broadcast_to(np.array([c.width, c.height]), (n, 2)).copy()
         faces = stage.hand_faces(self.skeleton)
-        return part.pictures(faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)).astype(
-            np.float32
-        )
+        return part.pictures(
+            faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)
+        ).astype(np.float32)
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
         """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
         for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
-            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)]
+            yield [
+                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
+            ]
 
 
 @dataclass(frozen=True)
@@ -131,19 +144,46 @@ class HandWorld:
         )
 
     def training_blocks(
-        self, seed: int, n_blocks: int, *, first: int = 0, family: str = "train", noise: float = 1.0,
-        erosion_px: int = 0, degraded_share: float = 0.0, spine_mm: float | None = None, window_px: int = 320,
+        self,
+        seed: int,
+        n_blocks: int,
+        *,
+        first: int = 0,
+        family: str = "train",
+        noise: float = 1.0,
+        erosion_px: int = 0,
+        degraded_share: float = 0.0,
+        spine_mm: float | None = None,
+        window_px: int = 320,
         parallel: bool = True,
-    ) -> Iterator[TrainingWindows]:  # fmt: skip
+    ) -> Iterator[TrainingWindows]:
         """Blocks of training images; see `windows.training_blocks`."""
         for number in range(first, first + n_blocks):
             rng = np.random.default_rng([seed, number, 1])
-            yield self._block(rng, number, family, noise, erosion_px, degraded_share, spine_mm, window_px, parallel)
+            yield self._block(
+                rng,
+                number,
+                family,
+                noise,
+                erosion_px,
+                degraded_share,
+                spine_mm,
+                window_px,
+                parallel,
+            )
 
     def _block(
-        self, rng: np.random.Generator, number: int, family: str, noise: float, erosion_px: int, degraded_share: float,
-        spine_mm: float | None, window_px: int, parallel: bool,
-    ) -> TrainingWindows:  # fmt: skip
+        self,
+        rng: np.random.Generator,
+        number: int,
+        family: str,
+        noise: float,
+        erosion_px: int,
+        degraded_share: float,
+        spine_mm: float | None,
+        window_px: int,
+        parallel: bool,
+    ) -> TrainingWindows:
         """The images of one block."""
         skeleton, n, m = self.skeleton, BLOCK, BLOCK // PER_SESSION
         each = np.repeat(np.arange(m), PER_SESSION)
@@ -156,35 +196,80 @@ class HandWorld:
         angles, turns = draw_wide(rng, skeleton, n)
         places = stage.draw_places(rng, intrinsics[each], picture[each].astype(float), low, high)
         pose = stage.hold_out(rng, skeleton, angles, turns, size, places)
-        cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics[each], parameters[each], _THING_SHARE,
-                              PER_SESSION)  # fmt: skip
-        uv = cast.hand[..., :2] / cast.hand[..., 2:] * intrinsics[each][:, None, :2] + intrinsics[each][:, None, 2:]
+        cast = stage.assemble(
+            rng,
+            skeleton,
+            pose,
+            shape,
+            size,
+            intrinsics[each],
+            parameters[each],
+            _THING_SHARE,
+            PER_SESSION,
+        )
+        uv = (
+            cast.hand[..., :2] / cast.hand[..., 2:] * intrinsics[each][:, None, :2]
+            + intrinsics[each][:, None, 2:]
+        )
         shift = rng.uniform(-0.08, 0.08, (n, 2)) * window_px
-        origin = np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + shift).astype(np.int64)
-        origin = np.clip(origin, 0, np.maximum(picture[each] - window_px, 0))  # an arm leaves a window as a picture
-        depth = cast.pictures(stage.hand_faces(skeleton), intrinsics[each], picture[each], origin,
-                              (window_px, window_px), parallel)  # fmt: skip
+        origin = np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + shift).astype(
+            np.int64
+        )
+        origin = np.clip(
+            origin, 0, np.maximum(picture[each] - window_px, 0)
+        )  # an arm leaves a window as a picture
+        depth = cast.pictures(
+            stage.hand_faces(skeleton),
+            intrinsics[each],
+            picture[each],
+            origin,
+            (window_px, window_px),
+            parallel,
+        )
         flat = np.zeros((n, 3))
         return TrainingWindows(
-            depth, np.broadcast_to(np.zeros(1, np.uint16), depth.shape), origin.astype(np.int32), intrinsics[each],
-            flat, flat, SE3.identity(n), pose.root, pose.angles, pose.scale, cast.joints, cast.spine_mm,
-            number * m + each, kind[each], np.zeros(n, np.int64), own_bones=True,
-        )  # fmt: skip
+            depth,
+            np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
+            origin.astype(np.int32),
+            intrinsics[each],
+            flat,
+            flat,
+            SE3.identity(n),
+            pose.root,
+            pose.angles,
+            pose.scale,
+            cast.joints,
+            cast.spine_mm,
+            number * m + each,
+            kind[each],
+            np.zeros(n, np.int64),
+            own_bones=True,
+        )
 
-    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS) -> list[HandSession]:
+    def test_split(
+        self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS
+    ) -> list[HandSession]:
         """The recordings of a split, 40 of 50 independent frames, each of another person."""
         if name not in SPLITS:
             raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
         seed, family, noise, erosion_px, thing_share = SPLITS[name]
         return [
-            self._session([seed, k], f"{name}-{k:02d}", family, noise, erosion_px, thing_share, spine_mm)
+            self._session(
+                [seed, k], f"{name}-{k:02d}", family, noise, erosion_px, thing_share, spine_mm
+            )
             for k in range(n_sessions)
         ]
 
     def _session(
-        self, seed: list[int], name: str, family: str, noise: float, erosion_px: int, thing_share: float,
+        self,
+        seed: list[int],
+        name: str,
+        family: str,
+        noise: float,
+        erosion_px: int,
+        thing_share: float,
         spine_mm: float | None,
-    ) -> HandSession:  # fmt: skip
+    ) -> HandSession:
         """Independent frames of one person."""
         rng = np.random.default_rng(seed)
         n, camera = N_FRAMES, NYU_SENSOR.camera
@@ -192,13 +277,23 @@ class HandWorld:
         size = np.full(n, drawn if spine_mm is None else spine_mm / self.skeleton.length)
         shape = _same(draw_hands(rng, self.skeleton, family, 1), n)
         angles, turns = self._test_postures(rng, n)
-        intrinsics = np.broadcast_to(np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (n, 4)).copy()
+        intrinsics = np.broadcast_to(
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (n, 4)
+        ).copy()
         picture = np.broadcast_to(np.array([camera.width, camera.height]), (n, 2)).copy()
         low, high = np.full((2, n), np.array(stage.DISTANCE_MM)[:, None])
-        pose = stage.hold_out(rng, self.skeleton, angles, turns, size,
-                              stage.draw_places(rng, intrinsics, picture.astype(float), low, high))  # fmt: skip
+        pose = stage.hold_out(
+            rng,
+            self.skeleton,
+            angles,
+            turns,
+            size,
+            stage.draw_places(rng, intrinsics, picture.astype(float), low, high),
+        )
         parameters = np.repeat(NYU_SENSOR.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
-        cast = stage.assemble(rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1)
+        cast = stage.assemble(
+            rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1
+        )
         return HandSession(name, self.skeleton, NYU_SENSOR, cast)
 
     def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
@@ -227,10 +322,18 @@ def find_reference() -> Path | None:
 
 
 def gesture_session(
-    skeleton: Skeleton, seed: int | list[int], n_frames: int, *, sensor: Sensor = NYU_SENSOR, family: str = "train",
-    noise: float = 1.0, erosion_px: int = 0, thing_share: float = 0.0, spine_mm: float | None = None,
+    skeleton: Skeleton,
+    seed: int | list[int],
+    n_frames: int,
+    *,
+    sensor: Sensor = NYU_SENSOR,
+    family: str = "train",
+    noise: float = 1.0,
+    erosion_px: int = 0,
+    thing_share: float = 0.0,
+    spine_mm: float | None = None,
     name: str = "gestures",
-) -> HandSession:  # fmt: skip
+) -> HandSession:
     """N frames at 30 a second of one person who goes from gesture to gesture, holding each for a moment."""
     rng = np.random.default_rng(seed)
     drawn = float(rng.uniform(*SIZE_RANGE))
@@ -239,12 +342,24 @@ def gesture_session(
     c = sensor.camera
     intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n_frames, 4)).copy()
     picture = np.array([[c.width, c.height]], float)
-    (middle,) = stage.draw_places(rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0]))
+    (middle,) = stage.draw_places(
+        rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0])
+    )
     moving = draw_gestures(rng, skeleton, n_frames, FRAME_NS * 1e-9, middle)
     pose = stage.hold_out(rng, skeleton, moving.angles, moving.turns, size, moving.places)
     parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0)
-    cast = stage.assemble(rng, skeleton, pose, shape, size, intrinsics, parameters, thing_share, n_frames,
-                          moving.wrists)  # fmt: skip
+    cast = stage.assemble(
+        rng,
+        skeleton,
+        pose,
+        shape,
+        size,
+        intrinsics,
+        parameters,
+        thing_share,
+        n_frames,
+        moving.wrists,
+    )
     return HandSession(name, skeleton, sensor, cast)
 
 
@@ -264,6 +379,11 @@ def _draw_cameras(
         rows, c = kind == k, sensor.camera
         drawn = sensor.draw(rng, m, np.zeros(m), noise, erosion_px)
         parameters = np.where(rows[:, None], drawn, parameters) if parameters.size else drawn
-        whole = np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
-        intrinsics[rows], picture[rows] = whole[rows], (c.width // coarse, max(c.height // coarse, _LEAST_PX))
+        whole = (
+            np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
+        )
+        intrinsics[rows], picture[rows] = (
+            whole[rows],
+            (c.width // coarse, max(c.height // coarse, _LEAST_PX)),
+        )
     return kind, intrinsics, picture, parameters

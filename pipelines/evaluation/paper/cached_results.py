@@ -27,28 +27,47 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise LiexError(f"the kept results {path} should be JSON, but: {error}; install liex_lab again") from None
+        raise LiexError(
+            f"the kept results {path} should be JSON, but: {error}; install liex_lab again"
+        ) from None
     if kept.get("schema") != SCHEMA:
-        raise LiexError(f"the kept results {path} are of schema {kept.get('schema')}, not {SCHEMA}; use --fresh")
+        raise LiexError(
+            f"the kept results {path} are of schema {kept.get('schema')}, not {SCHEMA}; use --fresh"
+        )
     return dict(kept)
 
 
-def keep_results(folder: Path, animal: str, rows: Mapping[str, Any], sensitivity: Mapping[str, Any]) -> Path:
+def keep_results(
+    folder: Path, animal: str, rows: Mapping[str, Any], sensitivity: Mapping[str, Any]
+) -> Path:
     """Write results in the form in which they are kept; copied into datasets/kept_results they are used again."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{animal}.json"
-    content = {"schema": SCHEMA, "animal": animal, "rows": dict(rows), "sensitivity": dict(sensitivity)}
-    path.write_text(json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+    content = {
+        "schema": SCHEMA,
+        "animal": animal,
+        "rows": dict(rows),
+        "sensitivity": dict(sensitivity),
+    }
+    path.write_text(
+        json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8"
+    )
     return path
 
 
-def fits(row: Mapping[str, Any], made_from: Mapping[str, Any], tests: Mapping[str, Sequence[TrueRecording]]) -> bool:
+def fits(
+    row: Mapping[str, Any],
+    made_from: Mapping[str, Any],
+    tests: Mapping[str, Sequence[TrueRecording]],
+) -> bool:
     """Whether a kept row is of the same training and of the same test frames as would be measured now."""
     if row["made"]["from"] != json.loads(json.dumps(made_from)):
         return False
     for split, sessions in tests.items():
         known = row["splits"].get(split)
-        if known is None or not np.allclose(known["first_joints_mm"], first_joints(sessions), atol=_SAME_MM):
+        if known is None or not np.allclose(
+            known["first_joints_mm"], first_joints(sessions), atol=_SAME_MM
+        ):
             return False
     return True
 

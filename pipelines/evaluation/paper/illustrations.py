@@ -39,7 +39,9 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
     k, n, seen = method.n_candidates, len(data.size), None
     if (forest := model.cascade.proposals) is not None:
         k = min(k, N_WAYS * forest.n_trees)
-        seen = Proposals(forest, np.zeros((forest.n_trees, n), np.bool_))  # no tree has seen any of them
+        seen = Proposals(
+            forest, np.zeros((forest.n_trees, n), np.bool_)
+        )  # no tree has seen any of them
     candidates = start_candidates(data, skeleton, replace(method, training_candidates=k), rng, seen)
     names, errors, positions = _follow(model.cascade, data, candidates)
     scores = _scores(model, data, candidates).reshape(n, k)
@@ -51,23 +53,30 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
     of_best = np.arange(n) * k + best
     size = data.size[example] if method.session_size else 1.0
     return {
-        "animal": skeleton.name, "variant": method.variant, "n_images": n, "n_candidates": k, "protocol": PROTOCOL,
-        "edges": skeleton.edges, "heights": data.images.heights[example],
+        "animal": skeleton.name,
+        "variant": method.variant,
+        "n_images": n,
+        "n_candidates": k,
+        "protocol": PROTOCOL,
+        "edges": skeleton.edges,
+        "heights": data.images.heights[example],
         "true_px": _pixels(data.truth.positions[example][None], data, example)[0],
         "ranked": {
             "joints_px": _pixels(positions[-1][rows], data, example),
-            "score_mm": scores.ravel()[rows] * size, "error_mm": final.ravel()[rows] * size,
+            "score_mm": scores.ravel()[rows] * size,
+            "error_mm": final.ravel()[rows] * size,
         },
         "rank_correlation": _rank_correlation(scores, final),
         "steps": {
-            "names": names, "median_mm": [float(np.median(e)) for e in errors],
+            "names": names,
+            "median_mm": [float(np.median(e)) for e in errors],
             "low_mm": [float(np.quantile(e, 0.25)) for e in errors],
             "high_mm": [float(np.quantile(e, 0.75)) for e in errors],
             "best_mm": [float(e[of_best].mean()) for e in errors],
             "example_mm": [float(e[rows[0]] * size) for e in errors],
             "joints_px": [_pixels(p[rows[:1]], data, example)[0] for p in positions],
         },
-    }  # fmt: skip
+    }
 
 
 def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
@@ -88,7 +97,9 @@ def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
     return TrainingSet(some(data.images), some(data.truth), data.size[rows], data.animal[rows])
 
 
-def _follow(cascade: Cascade, data: TrainingSet, candidates: Candidates) -> tuple[list[str], list[Array], list[Array]]:
+def _follow(
+    cascade: Cascade, data: TrainingSet, candidates: Candidates
+) -> tuple[list[str], list[Array], list[Array]]:
     """Move the candidates as Algorithm 1 does, and keep errors (n K,) mm at home size and positions after each step."""
     from liex_lab.estimation.training import joint_error
 
@@ -130,6 +141,8 @@ def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
     from liex_lab.baselines.baseline import in_camera_frame
 
     look = data.images.looks[image]
-    x, y, z = np.moveaxis(in_camera_frame(positions, np.repeat(look[None], len(positions), 0)), -1, 0)
+    x, y, z = np.moveaxis(
+        in_camera_frame(positions, np.repeat(look[None], len(positions), 0)), -1, 0
+    )
     uv = np.stack([look[0] * x / z + look[2], look[1] * y / z + look[3]], axis=-1)
     return (uv - look[14:16]) / look[16]

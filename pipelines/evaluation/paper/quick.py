@@ -31,7 +31,9 @@ QUICK_SWEEP = Sweep(
 )
 
 
-def quick_subject(animal: str, variant: str, progress: Progress = silent) -> PoseEstimator | Baseline:
+def quick_subject(
+    animal: str, variant: str, progress: Progress = silent
+) -> PoseEstimator | Baseline:
     """As `evaluate.subject_of`, from next to no training; the default is the bundled model all the same."""
     from liex_lab.baselines.ablations import PlainMean
     from liex_lab.estimation.estimator import PoseEstimator

@@ -91,7 +91,10 @@ def _command(animals: Sequence[str], n_frames: int | None, quick: bool, fresh: b
 
 
 def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    return {name: {key: value for key, value in row.items() if key != "origin"} for name, row in rows.items()}
+    return {
+        name: {key: value for key, value in row.items() if key != "origin"}
+        for name, row in rows.items()
+    }
 
 
 def results_of(animal: str, budget: Budget, command: str, progress: Progress) -> Results:
@@ -114,14 +117,22 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
         row = kept["rows"].get(name)
         if row is not None and fits(row, made_from(name, skeleton), tests):
             results.rows[name] = {**row, "origin": "kept"}
-    subjects = _subjects(animal, [name for name in ROWS if name not in results.rows], budget, results, progress)
+    subjects = _subjects(
+        animal, [name for name in ROWS if name not in results.rows], budget, results, progress
+    )
     for name, row in measured_rows(animal, subjects, tests, progress).items():
         made = {"quick": True} if budget.quick else made_from(name, skeleton)
-        results.rows[name] = {"origin": "measured", "made": {"from": made, "command": command, **_made_by()}, **row}
+        results.rows[name] = {
+            "origin": "measured",
+            "made": {"from": made, "command": command, **_made_by()},
+            **row,
+        }
     results.rows = {name: results.rows[name] for name in ROWS if name in results.rows}
     results.sensitivity = _sensitivities(skeleton, kept["sensitivity"], budget, command, progress)
     progress(0, None, f"{skeleton.name}: candidates and convergence")
-    results.illustration = illustrate(cast("PoseEstimator", subjects["default"]).model, budget.n_illustrated)
+    results.illustration = illustrate(
+        cast("PoseEstimator", subjects["default"]).model, budget.n_illustrated
+    )
     return results
 
 
@@ -151,7 +162,10 @@ def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
     if variant in BASELINES:
         return training_of(variant, skeleton).to_dict()
     base = "default" if variant == "default" else "paper"
-    return {"recipe": plain(vars(recipe_of(base, skeleton))), "method": plain(method_of(base, skeleton).to_dict())}
+    return {
+        "recipe": plain(vars(recipe_of(base, skeleton))),
+        "method": plain(method_of(base, skeleton).to_dict()),
+    }
 
 
 def _made_by() -> dict[str, str]:
@@ -162,13 +176,19 @@ def _made_by() -> dict[str, str]:
     for path in sorted(MODELS.parent.rglob("*.py")):
         sources.update(path.read_bytes())
     machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
-    return {"version": package_version("liex_lab"), "code": sources.hexdigest()[:12], "machine": machine}
+    return {
+        "version": package_version("liex_lab"),
+        "code": sources.hexdigest()[:12],
+        "machine": machine,
+    }
 
 
 def measured_rows(
-    animal: str, subjects: Mapping[str, PoseEstimator | Baseline], tests: Mapping[str, Sequence[TrueRecording]],
+    animal: str,
+    subjects: Mapping[str, PoseEstimator | Baseline],
+    tests: Mapping[str, Sequence[TrueRecording]],
     progress: Progress,
-) -> dict[str, dict[str, Any]]:  # fmt: skip
+) -> dict[str, dict[str, Any]]:
     """The numbers of each subject: `splits` and `rate`."""
     from ..pose import errors_of
     from .cached_results import first_joints
@@ -176,7 +196,10 @@ def measured_rows(
     rows: dict[str, dict[str, Any]] = {name: {"splits": {}} for name in subjects}
     for split, sessions in tests.items():
         for name, errors in errors_of(subjects, sessions, plan_of(animal), progress).items():
-            rows[name]["splits"][split] = {**_numbers(errors), "first_joints_mm": first_joints(sessions)}
+            rows[name]["splits"][split] = {
+                **_numbers(errors),
+                "first_joints_mm": first_joints(sessions),
+            }
     progress(0, None, "timing")
     for name, rate in rates_of(animal, subjects, next(iter(tests.values()))).items():
         rows[name]["rate"] = rate
@@ -186,7 +209,11 @@ def measured_rows(
 def _numbers(errors: PoseErrors) -> dict[str, Any]:
     """What is kept of the errors of one split: the figures, the error of each joint, and the distribution."""
     seen = np.isfinite(errors.error_mm)
-    quantiles = np.quantile(errors.error_mm[seen], np.linspace(0, 1, _QUANTILES)) if seen.any() else np.array([])
+    quantiles = (
+        np.quantile(errors.error_mm[seen], np.linspace(0, 1, _QUANTILES))
+        if seen.any()
+        else np.array([])
+    )
     return {
         **plain(errors.summary()),
         "n_frames": len(errors.error_mm),
@@ -214,11 +241,20 @@ def rates_of(
     rates = {}
     for name, subject in subjects.items():
         size = subject.find_size(sample, scene)
-        rates[name] = _RATE_FRAMES / best_seconds(partial(subject.estimate, frames, scene, size), _RATE_REPEATS)
+        rates[name] = _RATE_FRAMES / best_seconds(
+            partial(subject.estimate, frames, scene, size), _RATE_REPEATS
+        )
     numba.set_num_threads(before)
     picture = f"{recording.width} x {recording.height}"
-    return {name: {"frames_per_s": rate, "ratio_to_default": rate / rates["default"], "cores": cores,
-                   "picture": picture} for name, rate in rates.items()}  # fmt: skip
+    return {
+        name: {
+            "frames_per_s": rate,
+            "ratio_to_default": rate / rates["default"],
+            "cores": cores,
+            "picture": picture,
+        }
+        for name, rate in rates.items()
+    }
 
 
 def _sensitivities(
@@ -238,5 +274,9 @@ def _sensitivities(
             curves[variant] = {**known, "origin": "kept"}
             continue
         curve = sensitivity(skeleton, variant, sweep, progress)
-        curves[variant] = {**curve, "made": {"from": made, "command": command, **_made_by()}, "origin": "measured"}
+        curves[variant] = {
+            **curve,
+            "made": {"from": made, "command": command, **_made_by()},
+            "origin": "measured",
+        }
     return curves

@@ -71,7 +71,9 @@ def with_value(method: Method, number: str, value: int) -> Method:
     return replace(method, metric=replace(method.metric, n_trees=value))
 
 
-def sensitivity(skeleton: Skeleton, variant: str, sweep: Sweep, progress: Progress = silent) -> dict[str, Any]:
+def sensitivity(
+    skeleton: Skeleton, variant: str, sweep: Sweep, progress: Progress = silent
+) -> dict[str, Any]:
     """Curves of a variant: for each number its value, and the mean and median error there."""
     from liex_lab.estimation.method import method_of
 
@@ -94,8 +96,15 @@ def sensitivity(skeleton: Skeleton, variant: str, sweep: Sweep, progress: Progre
             mean, median = _errors(trained, with_value(method, number, value), test, recipe.seed)
             curves[number].append({"value": value, "mean_mm": mean, "median_mm": median})
             done += 1
-    return {"variant": variant, "n_images": len(data.size), "n_test": int(test.animal.sum()), "seed": recipe.seed,
-            "chosen": own, "curves": curves, "protocol": PROTOCOL}  # fmt: skip
+    return {
+        "variant": variant,
+        "n_images": len(data.size),
+        "n_test": int(test.animal.sum()),
+        "seed": recipe.seed,
+        "chosen": own,
+        "curves": curves,
+        "protocol": PROTOCOL,
+    }
 
 
 def _train(data: TrainingSet, skeleton: Skeleton, method: Method, seed: int) -> Trained:
@@ -106,7 +115,9 @@ def _train(data: TrainingSet, skeleton: Skeleton, method: Method, seed: int) -> 
     return Trained(cascade, candidates, train_metric(data, cascade, candidates, rng))
 
 
-def _trained_with(base: Trained, data: TrainingSet, method: Method, number: str, value: int, seed: int) -> Trained:
+def _trained_with(
+    base: Trained, data: TrainingSet, method: Method, number: str, value: int, seed: int
+) -> Trained:
     """The base model where the number does not change training, else one of its own, as far as it has to be."""
     from liex_lab.estimation.training import train_metric
 
@@ -115,7 +126,10 @@ def _trained_with(base: Trained, data: TrainingSet, method: Method, number: str,
         return base
     if number == "metric trees":
         cascade = replace(base.cascade, method=changed)
-        return replace(base, metric=train_metric(data, cascade, base.candidates, np.random.default_rng(seed + 1)))
+        return replace(
+            base,
+            metric=train_metric(data, cascade, base.candidates, np.random.default_rng(seed + 1)),
+        )
     return _train(data, base.cascade.skeleton, changed, seed)
 
 

@@ -23,18 +23,61 @@ TITLES = {
     "cnn": "CNN",
 }
 PUBLISHED_MM = {  # Lie-X, Tables 1 and 2: mean joint error, real recordings, another camera and other animals
-    "fish": {"paper": 0.68, "paper-one-pose": 3.28, "paper-no-metric": 1.71, "rf": 1.28, "cnn": 0.79},
-    "mouse": {"paper": 6.64, "paper-one-pose": 13.27, "paper-no-metric": 9.82, "rf": 12.24, "cnn": 9.17},
-    "hand": {"paper": 14.51, "paper-one-pose": 20.50, "paper-no-metric": 16.72, "rf": 24.81, "cnn": 18.82},
+    "fish": {
+        "paper": 0.68,
+        "paper-one-pose": 3.28,
+        "paper-no-metric": 1.71,
+        "rf": 1.28,
+        "cnn": 0.79,
+    },
+    "mouse": {
+        "paper": 6.64,
+        "paper-one-pose": 13.27,
+        "paper-no-metric": 9.82,
+        "rf": 12.24,
+        "cnn": 9.17,
+    },
+    "hand": {
+        "paper": 14.51,
+        "paper-one-pose": 20.50,
+        "paper-no-metric": 16.72,
+        "rf": 24.81,
+        "cnn": 18.82,
+    },
 }
-OTHERS_MM = {"Tompson et al.": 21.0, "Oberweger et al. (a)": 20.0, "Oberweger et al. (b)": 16.5, "Zhou et al.": 16.9}
+OTHERS_MM = {
+    "Tompson et al.": 21.0,
+    "Oberweger et al. (a)": 20.0,
+    "Oberweger et al. (b)": 16.5,
+    "Zhou et al.": 16.9,
+}
 PUBLISHED_FPS = {"fish": 83.0, "mouse": 267.0, "hand": 123.0}
-OTHERS_FPS = {"Tompson et al.": 30, "Oberweger et al. (a)": 5000, "Oberweger et al. (b)": 400, "Zhou et al.": 125}
+OTHERS_FPS = {
+    "Tompson et al.": 30,
+    "Oberweger et al. (a)": 5000,
+    "Oberweger et al. (b)": 400,
+    "Zhou et al.": 125,
+}
 _COLUMNS = (
-    "animal", "split", "method", "variant", "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm",
-    "flip_rate", "lost_rate", "n_frames", "frames_per_s", "ratio_to_default", "published_mean_joint_error_mm",
-    "published_frames_per_s", "origin", "seed", "version", "command",
-)  # fmt: skip
+    "animal",
+    "split",
+    "method",
+    "variant",
+    "mean_joint_error_mm",
+    "median_joint_error_mm",
+    "p95_joint_error_mm",
+    "flip_rate",
+    "lost_rate",
+    "n_frames",
+    "frames_per_s",
+    "ratio_to_default",
+    "published_mean_joint_error_mm",
+    "published_frames_per_s",
+    "origin",
+    "seed",
+    "version",
+    "command",
+)
 _QUICK = (
     "**A quick run: few frames, and every row but the default trained on next to nothing. Its numbers say that "
     "everything runs, and nothing about the methods.**"
@@ -55,18 +98,38 @@ def write_tables(folder: Path, results: Sequence[Results], quick: bool) -> list[
     first = [r for r in results if r.animal != "hand"]
     second = [r for r in results if r.animal == "hand"]
     written = []
-    for number, part, only_rates in ((1, first, False), (2, second, False), (3, list(results), True)):
+    for number, part, only_rates in (
+        (1, first, False),
+        (2, second, False),
+        (3, list(results), True),
+    ):
         if part:
             rows = [row for r in part for row in _rows(r, only_rates)]
             written.append(_write_csv(folder / f"table{number}.csv", rows))
-    text = ["# Tables 1 to 3 of Lie-X, on rendered test frames", *([_QUICK] if quick else []), _HOW, POSE_PROTOCOL]
+    text = [
+        "# Tables 1 to 3 of Lie-X, on rendered test frames",
+        *([_QUICK] if quick else []),
+        _HOW,
+        POSE_PROTOCOL,
+    ]
     for number, part in ((1, first), (2, second)):
         for r in part:
-            text += [f"## Table {number}: {r.animal}, joint error in mm", _table(r), *_words(r, quick)]
-    text += ["## Table 3: frames per second", _rate_table(results), "## How each row was made", _origins(results)]
+            text += [
+                f"## Table {number}: {r.animal}, joint error in mm",
+                _table(r),
+                *_words(r, quick),
+            ]
+    text += [
+        "## Table 3: frames per second",
+        _rate_table(results),
+        "## How each row was made",
+        _origins(results),
+    ]
     (folder / "tables.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
     content = plain({r.animal: vars(r) for r in results})
-    (folder / "results.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / "results.json").write_text(
+        json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8"
+    )
     return [*written, folder / "tables.md", folder / "results.json"]
 
 
@@ -75,12 +138,19 @@ def _rows(results: Results, only_rates: bool) -> Iterator[dict[str, Any]]:
     published = PUBLISHED_MM.get(results.animal, {})
     for variant, row in results.rows.items():
         fixed = {
-            "animal": results.animal, "method": TITLES[variant], "variant": variant, "origin": row["origin"],
-            **row["rate"], "published_mean_joint_error_mm": published.get(variant),
-            "published_frames_per_s": PUBLISHED_FPS.get(results.animal) if variant == "paper" else None,
-            "seed": row["made"]["from"].get("recipe", {}).get("seed"), "version": row["made"]["version"],
+            "animal": results.animal,
+            "method": TITLES[variant],
+            "variant": variant,
+            "origin": row["origin"],
+            **row["rate"],
+            "published_mean_joint_error_mm": published.get(variant),
+            "published_frames_per_s": PUBLISHED_FPS.get(results.animal)
+            if variant == "paper"
+            else None,
+            "seed": row["made"]["from"].get("recipe", {}).get("seed"),
+            "version": row["made"]["version"],
             "command": row["made"]["command"],
-        }  # fmt: skip
+        }
         if only_rates:
             yield fixed
             continue
@@ -117,13 +187,24 @@ def _table(results: Results) -> str:
     for variant, title in TITLES.items():
         row = results.rows.get(variant)
         if row is None:
-            rows.append([title, *[""] * (3 * len(results.splits)), "", _number(published.get(variant)), "not measured"])
+            rows.append(
+                [
+                    title,
+                    *[""] * (3 * len(results.splits)),
+                    "",
+                    _number(published.get(variant)),
+                    "not measured",
+                ]
+            )
             continue
         cells = [title]
         for split in results.splits:
             numbers = row["splits"][split]
             flips = numbers["flip_rate"]
-            cells += [_number(numbers["mean_joint_error_mm"]), _number(numbers["median_joint_error_mm"])]
+            cells += [
+                _number(numbers["mean_joint_error_mm"]),
+                _number(numbers["median_joint_error_mm"]),
+            ]
             cells.append("" if flips is None else f"{100 * flips:.1f} %")
         n_frames = "/".join(str(row["splits"][split]["n_frames"]) for split in results.splits)
         rows.append([*cells, n_frames, _number(published.get(variant)), row["origin"]])
@@ -135,7 +216,9 @@ def _table(results: Results) -> str:
 
 def _words(results: Results, quick: bool) -> list[str]:
     """Which rows are missing and, unless the run was quick, where the order is not the paper's, in sentences."""
-    sentences = [f"{TITLES[variant]} was not measured: {why}." for variant, why in results.missing.items()]
+    sentences = [
+        f"{TITLES[variant]} was not measured: {why}." for variant, why in results.missing.items()
+    ]
     if quick:
         return sentences
     for variant in results.rows:
@@ -171,7 +254,10 @@ def _turned_pairs(results: Results) -> Iterator[str]:
 
 def _means(results: Results, split: str) -> dict[str, float]:
     """Mean errors by variant."""
-    found = {variant: row["splits"][split]["mean_joint_error_mm"] for variant, row in results.rows.items()}
+    found = {
+        variant: row["splits"][split]["mean_joint_error_mm"]
+        for variant, row in results.rows.items()
+    }
     return {variant: value for variant, value in found.items() if value is not None}
 
 
@@ -181,12 +267,24 @@ def _rate_table(results: Sequence[Results]) -> str:
         for variant, row in r.rows.items():
             rate = row["rate"]
             published = _number(PUBLISHED_FPS.get(r.animal) if variant == "paper" else None, 0)
-            rows.append([r.animal, TITLES[variant], _number(rate["frames_per_s"], 0),
-                         _number(rate["ratio_to_default"], 3), rate["picture"], str(rate["cores"]), published,
-                         row["origin"]])  # fmt: skip
+            rows.append(
+                [
+                    r.animal,
+                    TITLES[variant],
+                    _number(rate["frames_per_s"], 0),
+                    _number(rate["ratio_to_default"], 3),
+                    rate["picture"],
+                    str(rate["cores"]),
+                    published,
+                    row["origin"],
+                ]
+            )
     for title, value in OTHERS_FPS.items() if any(r.animal == "hand" for r in results) else ():
         rows.append(["hand", title, "", "", "", "", f"{_number(value, 0)} (GPU)", "published"])
-    return _grid(["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published", ""], rows)
+    return _grid(
+        ["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published", ""],
+        rows,
+    )
 
 
 def _origins(results: Sequence[Results]) -> str:
@@ -196,7 +294,19 @@ def _origins(results: Sequence[Results]) -> str:
         for variant, row in r.rows.items():
             made = row["made"]
             recipe = made["from"].get("recipe", {})
-            rows.append([r.animal, TITLES[variant], row["origin"], str(recipe.get("n_images", "")),
-                         str(recipe.get("seed", "")), f"{made['version']} ({made['code']})", made["machine"],
-                         f"`{made['command']}`"])  # fmt: skip
-    return _grid(["animal", "method", "", "training images", "seed", "version (code)", "machine", "command"], rows)
+            rows.append(
+                [
+                    r.animal,
+                    TITLES[variant],
+                    row["origin"],
+                    str(recipe.get("n_images", "")),
+                    str(recipe.get("seed", "")),
+                    f"{made['version']} ({made['code']})",
+                    made["machine"],
+                    f"`{made['command']}`",
+                ]
+            )
+    return _grid(
+        ["animal", "method", "", "training images", "seed", "version (code)", "machine", "command"],
+        rows,
+    )

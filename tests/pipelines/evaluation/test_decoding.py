@@ -14,7 +14,13 @@ from liex_lab.runtime.progress import silent
 
 
 def test_what_is_promised_is_measured() -> None:
-    assert set(job._FORMATS) == {"mcap_zstd_raw", "mcap_zstd_png", "png_folder", "moseq_dat", "oni_16zt"}
+    assert set(job._FORMATS) == {
+        "mcap_zstd_raw",
+        "mcap_zstd_png",
+        "png_folder",
+        "moseq_dat",
+        "oni_16zt",
+    }
     camera, pictures = job._rendered(silent)
     assert (camera.width, camera.height) == pictures.shape[:0:-1] == (640, 480)
     assert 300 < np.median(pictures) < 1000
@@ -23,9 +29,13 @@ def test_what_is_promised_is_measured() -> None:
 def test_a_format_is_written_read_and_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     some = {name: job._FORMATS[name] for name in ("mcap_zstd_raw", "moseq_dat")}
     monkeypatch.setattr(job, "_FORMATS", some)
-    monkeypatch.setattr(job, "_rendered", lambda progress: (PRIMESENSE, np.full((2, 480, 640), 700, np.float32)))
+    monkeypatch.setattr(
+        job, "_rendered", lambda progress: (PRIMESENSE, np.full((2, 480, 640), 700, np.float32))
+    )
     told: list[str] = []
-    result = job.evaluate_recordings(n_frames=3, n_hour=24, n_repeats=1, progress=lambda *facts: told.append(facts[2]))
+    result = job.evaluate_recordings(
+        n_frames=3, n_hour=24, n_repeats=1, progress=lambda *facts: told.append(facts[2])
+    )
     for name in ("frames_per_s_1core", "open_ms_per_frame", "peak_mb", "peak_mb_of_an_hour"):
         assert set(result[name]) == set(some)
         assert all(value > 0 for value in result[name].values())
@@ -37,6 +47,8 @@ def test_a_format_is_written_read_and_timed(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_process_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job, "_READ", "raise SystemExit('it broke')")
-    monkeypatch.setattr(job, "_rendered", lambda progress: (PRIMESENSE, np.full((2, 480, 640), 700, np.float32)))
+    monkeypatch.setattr(
+        job, "_rendered", lambda progress: (PRIMESENSE, np.full((2, 480, 640), 700, np.float32))
+    )
     with pytest.raises(LiexError, match="it broke"):
         job.evaluate_recordings(n_frames=1, n_hour=6, n_repeats=1)

@@ -33,8 +33,13 @@ from liex_lab.simulation.species import MouseHabits
 from tests.estimation.toy import toy_mice, trained, training_set
 
 N_SESSIONS, N_FRAMES = 2, 10
-FIGURES = ["error_per_joint.png", "fig07_sensitivity.png", "fig08_cumulative_error.png", "fig13_candidates_mouse.png",
-           "fig16_convergence_mouse.png"]  # fmt: skip
+FIGURES = [
+    "error_per_joint.png",
+    "fig07_sensitivity.png",
+    "fig08_cumulative_error.png",
+    "fig13_candidates_mouse.png",
+    "fig16_convergence_mouse.png",
+]
 
 
 class SmallWorld(worlds.MouseWorld):
@@ -43,9 +48,13 @@ class SmallWorld(worlds.MouseWorld):
     def __init__(self) -> None:
         super().__init__(MouseHabits(Skeleton.load("mouse")), ("clean", "hard"))
 
-    def test_split(self, name: str, spine_mm: float | None = None, n_sessions: int = 40) -> list[SyntheticSession]:
+    def test_split(
+        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
+    ) -> list[SyntheticSession]:
         return [
-            SyntheticSession.draw([len(name), k], N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, name=f"{name}-{k}")
+            SyntheticSession.draw(
+                [len(name), k], N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, name=f"{name}-{k}"
+            )
             for k in range(min(n_sessions, N_SESSIONS))
         ]
 
@@ -53,7 +62,9 @@ class SmallWorld(worlds.MouseWorld):
 def toy_rf() -> Any:
     toy, few = toy_mice(300, 1), GrowthPlan(4, 12, 8, 40, 0.5, 0.0, 0.0, 0.63)
     data = training_set(toy, METHODS["paper"])
-    return train_forests(data, toy.skeleton, ForestPlan(few, few), np.random.default_rng(0), lambda *_: None)
+    return train_forests(
+        data, toy.skeleton, ForestPlan(few, few), np.random.default_rng(0), lambda *_: None
+    )
 
 
 def toy_subject(animal: str, variant: str, progress: Any = silent) -> Any:
@@ -74,7 +85,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worlds, "world_of", lambda skeleton: SmallWorld())
         patch.setattr(quick, "quick_subject", toy_subject)
-        patch.setattr(quick, "QUICK_SWEEP", Sweep(512, 512, (("initial poses", (1,)), ("metric trees", (2,)))))
+        patch.setattr(
+            quick, "QUICK_SWEEP", Sweep(512, 512, (("initial poses", (1,)), ("metric trees", (2,))))
+        )
         patch.setattr(tables, "_RATE_FRAMES", 8)
         patch.setattr(tables, "_RATE_REPEATS", 1)
         written = tables.make_tables(out, ["mouse"], quick=True, n_frames=20, draw=draw_figures)
@@ -128,26 +141,36 @@ def test_every_figure_is_a_picture(made):
 
 
 @pytest.mark.slow
-def test_numbers_of_the_json_are_those_of_the_frames_and_the_way_of_the_candidates_ends_at_them(made):
+def test_numbers_of_the_json_are_those_of_the_frames_and_the_way_of_the_candidates_ends_at_them(
+    made,
+):
     results = json.loads((made / "results.json").read_text())["mouse"]
     for row in results["rows"].values():
         for numbers in row["splits"].values():
             quantiles = numbers["error_quantiles_mm"]
             assert quantiles == sorted(quantiles)
             assert quantiles[50] == pytest.approx(numbers["median_joint_error_mm"], abs=2e-3)
-            assert np.mean(numbers["joint_mm"]) == pytest.approx(numbers["mean_joint_error_mm"], abs=2e-3)
+            assert np.mean(numbers["joint_mm"]) == pytest.approx(
+                numbers["mean_joint_error_mm"], abs=2e-3
+            )
     shown = results["illustration"]
     assert shown["ranked"]["score_mm"] == sorted(shown["ranked"]["score_mm"])
     assert shown["steps"]["example_mm"][-1] == pytest.approx(shown["ranked"]["error_mm"][0])
-    assert shown["steps"]["best_mm"][-1] < 0.75 * shown["steps"]["median_mm"][0]  # a model of next to no trees
+    assert (
+        shown["steps"]["best_mm"][-1] < 0.75 * shown["steps"]["median_mm"][0]
+    )  # a model of next to no trees
     curves = results["sensitivity"]["paper"]["curves"]
     assert [p["value"] for p in curves["initial poses"]] == [1, 40]
-    assert curves["initial poses"][-1] == curves["metric trees"][-1] | {"value": 40}  # the method itself, both times
+    assert curves["initial poses"][-1] == curves["metric trees"][-1] | {
+        "value": 40
+    }  # the method itself, both times
     assert curves["initial poses"][0]["mean_mm"] > curves["initial poses"][-1]["mean_mm"]
 
 
 @pytest.mark.slow
-def test_kept_rows_are_used_where_training_and_test_frames_are_the_same(made, monkeypatch, tmp_path):
+def test_kept_rows_are_used_where_training_and_test_frames_are_the_same(
+    made, monkeypatch, tmp_path
+):
     rows = kept.kept_results("mouse", made / "kept")["rows"]
     skeleton, world = Skeleton.load("mouse"), SmallWorld()
     tests = {split: world.test_split(split) for split in world.splits}
@@ -171,25 +194,44 @@ def test_kept_results_of_another_schema_are_refused_in_a_sentence(tmp_path):
 
 def results_with(means: dict[str, float]) -> tables.Results:
     rows = {
-        variant: {"splits": {"clean": {"mean_joint_error_mm": mean}, "hard": {"mean_joint_error_mm": mean + 1}}}
+        variant: {
+            "splits": {
+                "clean": {"mean_joint_error_mm": mean},
+                "hard": {"mean_joint_error_mm": mean + 1},
+            }
+        }
         for variant, mean in means.items()
     }
     return tables.Results("mouse", [], ["clean", "hard"], rows)
 
 
 def test_words_follow_the_numbers():
-    order = {"default": 2.0, "paper": 3.0, "cnn": 4.0, "paper-no-metric": 5.0, "rf": 6.0, "paper-one-pose": 7.0}
+    order = {
+        "default": 2.0,
+        "paper": 3.0,
+        "cnn": 4.0,
+        "paper-no-metric": 5.0,
+        "rf": 6.0,
+        "paper-one-pose": 7.0,
+    }
     (sentence,) = table_text._words(results_with(order), quick=False)
     assert sentence == "The methods come out in the paper's order on every split."
     (turned,) = table_text._words(results_with(order | {"rf": 4.5}), quick=False)
-    assert "here, RF is ahead on clean (4.50 against 5.00 mm), hard (5.50 against 6.00 mm)." in turned
+    assert (
+        "here, RF is ahead on clean (4.50 against 5.00 mm), hard (5.50 against 6.00 mm)." in turned
+    )
     ahead, *others = table_text._words(results_with(order | {"cnn": 1.5}), quick=False)
-    assert ahead == "CNN is ahead of the default on clean (1.50 against 2.00 mm), hard (2.50 against 3.00 mm)."
+    assert (
+        ahead
+        == "CNN is ahead of the default on clean (1.50 against 2.00 mm), hard (2.50 against 3.00 mm)."
+    )
     assert len(others) == 1  # and of the paper's variant
 
 
 def test_every_variant_that_can_be_named_is_known_and_any_other_is_refused(monkeypatch):
-    monkeypatch.setattr(evaluate, "estimator_of", lambda animal, variant, progress: f"{variant} model")
+    monkeypatch.setattr(
+        evaluate, "estimator_of", lambda animal, variant, progress: f"{variant} model"
+    )
     assert evaluate.subject_of("mouse", "paper") == "paper model"
     with pytest.raises(PlanError, match=r"no variant 'knn'.*paper-no-metric, rf, cnn"):
         evaluate.subject_of("mouse", "knn")
@@ -231,7 +273,9 @@ def check_kept(path: Path) -> None:
         assert made["code"]
         assert isinstance(made["from"]["recipe"]["seed"], int)
         assert row["rate"]["frames_per_s"] > 0
-        assert kept.fits(row, tables.made_from(variant, skeleton), tests), f"{variant}: refresh with --fresh"
+        assert kept.fits(row, tables.made_from(variant, skeleton), tests), (
+            f"{variant}: refresh with --fresh"
+        )
         for numbers in row["splits"].values():
             assert numbers["n_frames"] >= 2000
             assert len(numbers["joint_mm"]) == skeleton.n_joints

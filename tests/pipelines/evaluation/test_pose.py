@@ -26,10 +26,27 @@ from tests.sessions import walking_mouse
 from tests.sessions.walking_mouse import FLOOR_MM, SMALL, SPINE_MM, WalkingMouse, steady
 
 POSE_KEYS = [
-    "animal", "split", "variant", "n_frames", "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm",
-    "flip_rate", "lost_rate", "spearman_predicted_error", "interval90_coverage", "protocol",
-]  # fmt: skip
-SPEED_KEYS = {"animal", "frames_per_s_1core", "frames_per_s_2cores", "ratio_to_paper", "stages_ms", "machine"}
+    "animal",
+    "split",
+    "variant",
+    "n_frames",
+    "mean_joint_error_mm",
+    "median_joint_error_mm",
+    "p95_joint_error_mm",
+    "flip_rate",
+    "lost_rate",
+    "spearman_predicted_error",
+    "interval90_coverage",
+    "protocol",
+]
+SPEED_KEYS = {
+    "animal",
+    "frames_per_s_1core",
+    "frames_per_s_2cores",
+    "ratio_to_paper",
+    "stages_ms",
+    "machine",
+}
 LEFT_OUT = (5, 17)  # frames of the hand-made session without a pose
 TURNED = (10, 13)  # from when to when nose and rump are exchanged in it
 
@@ -46,10 +63,14 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Two recordings of 10 small frames stand for every split, toy models for every variant; what was asked for."""
     asked: list[str] = []
 
-    def small_split(name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any) -> list[SyntheticSession]:
+    def small_split(
+        name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any
+    ) -> list[SyntheticSession]:
         asked.append(f"{name} {spine_mm}")
         return [
-            SyntheticSession.draw([5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}")
+            SyntheticSession.draw(
+                [5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}"
+            )
             for k in range(min(n_sessions, 2))
         ]
 
@@ -59,9 +80,13 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.parametrize(("split", "variant"), [("clean", "default"), ("hard", "paper")])
-def test_the_numbers_of_evaluate_pose_are_called_as_they_have_always_been(small_world, split, variant):
+def test_the_numbers_of_evaluate_pose_are_called_as_they_have_always_been(
+    small_world, split, variant
+):
     told: list[str] = []
-    result = evaluate.evaluate_pose("mouse", split, variant, progress=lambda done, total, what: told.append(what))
+    result = evaluate.evaluate_pose(
+        "mouse", split, variant, progress=lambda done, total, what: told.append(what)
+    )
     assert list(result) == POSE_KEYS
     assert (result["animal"], result["split"], result["variant"]) == ("mouse", split, variant)
     assert result["n_frames"] == 20
@@ -77,7 +102,9 @@ def test_the_numbers_of_evaluate_pose_are_called_as_they_have_always_been(small_
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
-def test_evaluating_twice_gives_the_same_numbers_and_fewer_frames_take_whole_recordings(small_world):
+def test_evaluating_twice_gives_the_same_numbers_and_fewer_frames_take_whole_recordings(
+    small_world,
+):
     once, twice = (evaluate.evaluate_pose("mouse") for _ in range(2))
     assert once == twice
     assert evaluate.evaluate_pose("mouse", n_frames=10)["n_frames"] == 10
@@ -111,7 +138,9 @@ def test_errors_over_sizes_are_told_in_per_cent_of_the_spine(monkeypatch):
     assert result["worst_ratio"] == pytest.approx(4 / 3)
 
 
-def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(small_world, monkeypatch):
+def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(
+    small_world, monkeypatch
+):
     def one_of_640(name: str, *how: Any) -> list[SyntheticSession]:
         return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
@@ -139,7 +168,9 @@ def test_what_is_lost_in_a_rendered_recording_counts_as_lost(small_world, monkey
 
     monkeypatch.setattr(SyntheticSession, "depths", without_frame_4)
     sessions = synthetic.test_split("clean", n_sessions=1)
-    errors = evaluate.pose_errors(toy_estimator("mouse", "default"), sessions, Plan.load("mouse"), silent)
+    errors = evaluate.pose_errors(
+        toy_estimator("mouse", "default"), sessions, Plan.load("mouse"), silent
+    )
     assert np.flatnonzero(np.isnan(errors.error_mm)).tolist() == [4]
     assert errors.summary()["lost_rate"] == pytest.approx(0.1)
 
@@ -153,7 +184,10 @@ class TurnedMouse(WalkingMouse):
     def track(self) -> Track:
         track = super().track()
         part = slice(*TURNED)
-        track.joints_mm[part], track.uv_px[part] = track.joints_mm[part, ::-1].copy(), track.uv_px[part, ::-1].copy()
+        track.joints_mm[part], track.uv_px[part] = (
+            track.joints_mm[part, ::-1].copy(),
+            track.uv_px[part, ::-1].copy(),
+        )
         return track
 
 
@@ -172,16 +206,25 @@ def reference_of(mouse: WalkingMouse, off_px: tuple[float, float], off_rad: floa
     track = WalkingMouse.track(replace(mouse, lost=()))
     along = track.uv_px[:, -1] - track.uv_px[:, 0]
     n = track.n_frames
-    angle = np.arctan2(-along[:, 1], along[:, 0]) + off_rad + np.pi * (np.arange(n) % 3)  # head and tail unknown
+    angle = (
+        np.arctan2(-along[:, 1], along[:, 0]) + off_rad + np.pi * (np.arange(n) % 3)
+    )  # head and tail unknown
     centroid = track.centroid_px + off_px
     return pd.DataFrame(
-        {"frame": np.arange(n), "centroid_x_px": centroid[:, 0], "centroid_y_px": centroid[:, 1], "angle_rad": angle}
+        {
+            "frame": np.arange(n),
+            "centroid_x_px": centroid[:, 0],
+            "centroid_y_px": centroid[:, 1],
+            "angle_rad": angle,
+        }
     )
 
 
 @pytest.mark.parametrize("off_deg", [0.0, 7.0, -20.0])
 def test_known_offsets_come_out_as_they_went_in(tmp_path, mouse, session, off_deg):
-    reference_of(mouse, (3.0, -4.0), np.radians(off_deg)).to_csv(tmp_path / "other.csv", index=False)
+    reference_of(mouse, (3.0, -4.0), np.radians(off_deg)).to_csv(
+        tmp_path / "other.csv", index=False
+    )
     result = evaluate.evaluate_reference(session, tmp_path / "other.csv")
     assert result["n_frames"] == result["n_compared"] == 30
     assert result["n_lost"] == len(LEFT_OUT)
@@ -195,7 +238,9 @@ def test_known_offsets_come_out_as_they_went_in(tmp_path, mouse, session, off_de
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
-def test_rows_that_the_reference_does_not_trust_and_frames_that_do_not_exist_are_left_out(tmp_path, mouse, session):
+def test_rows_that_the_reference_does_not_trust_and_frames_that_do_not_exist_are_left_out(
+    tmp_path, mouse, session
+):
     table = reference_of(mouse, (3.0, -4.0), 0.1)
     table["reliable"] = 1
     table.loc[::2, "reliable"] = 0
@@ -209,7 +254,9 @@ def test_rows_that_the_reference_does_not_trust_and_frames_that_do_not_exist_are
 
 
 def test_a_reference_without_its_columns_is_refused(tmp_path, mouse, session):
-    reference_of(mouse, (0, 0), 0).drop(columns="angle_rad").to_csv(tmp_path / "other.csv", index=False)
+    reference_of(mouse, (0, 0), 0).drop(columns="angle_rad").to_csv(
+        tmp_path / "other.csv", index=False
+    )
     with pytest.raises(LiexError, match="angle_rad") as error:
         evaluate.evaluate_reference(session, tmp_path / "other.csv")
     assert "\n" not in str(error.value)
@@ -224,6 +271,8 @@ def test_a_reference_that_is_missing_or_empty_is_refused(tmp_path, session):
 
 
 def test_a_reference_that_shares_no_frame_with_the_session_is_refused(tmp_path, mouse, session):
-    reference_of(mouse, (0, 0), 0).assign(frame=lambda t: t["frame"] + 1000).to_csv(tmp_path / "o.csv", index=False)
+    reference_of(mouse, (0, 0), 0).assign(frame=lambda t: t["frame"] + 1000).to_csv(
+        tmp_path / "o.csv", index=False
+    )
     with pytest.raises(LiexError, match="frame"):
         evaluate.evaluate_reference(session, tmp_path / "o.csv")

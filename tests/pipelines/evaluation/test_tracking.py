@@ -11,8 +11,14 @@ from liex_lab.dashboards.paper.tracking import draw_tracking, worst_moments
 from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
 
 ROWS = ("single", "online", "smoothed")
-FIGURES = {"mean_joint_error_mm", "p95_joint_error_mm", "longest_flip_frames", "interval90_coverage",
-           "recovery_frames", "frames_per_s"}  # fmt: skip
+FIGURES = {
+    "mean_joint_error_mm",
+    "p95_joint_error_mm",
+    "longest_flip_frames",
+    "interval90_coverage",
+    "recovery_frames",
+    "frames_per_s",
+}
 
 
 @pytest.mark.slow

@@ -34,7 +34,9 @@ def make_study(folder: Path, names: list[str], **more: str) -> Path:
         if not name.startswith("missing"):
             (raw / f"{name}.mcap").write_bytes(name.encode())
         text += f'[[animals]]\nid = "{name}"\ngroup = "@g"\n'
-        text += f'[[sessions]]\nanimal = "{name}"\nsession = "01"\nrecording = "rawdata/{name}.mcap"\n'
+        text += (
+            f'[[sessions]]\nanimal = "{name}"\nsession = "01"\nrecording = "rawdata/{name}.mcap"\n'
+        )
         text += more.get(name, "") + "\n"
     (folder / "study.toml").write_text(text)
     return folder / "study.toml"
@@ -52,25 +54,33 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
     return file, result.output, result.exit_code
 
 
-def test_what_can_be_done_is_done_and_the_rest_is_quarantined(finished: tuple[Path, str, int]) -> None:
+def test_what_can_be_done_is_done_and_the_rest_is_quarantined(
+    finished: tuple[Path, str, int],
+) -> None:
     file, printed, code = finished
     assert code == 3, printed
     states = {one.session.animal.id: one.state for one in standings(Study.load(file))}
     assert {name for name, state in states.items() if state == "failed"} == set(BROKEN)
     assert {name for name, state in states.items() if state == "excluded"} == {"skipped"}
-    assert list(states.values()).count("done") == 11, "a worker that dies once is no reason to give up its session"
+    assert list(states.values()).count("done") == 11, (
+        "a worker that dies once is no reason to give up its session"
+    )
     assert "18 sessions: 11 done, 1 excluded, 6 failed" in printed
     assert f"liex cohort {file} --retry" in printed
 
 
-def test_no_session_is_measured_more_often_than_its_worker_dies(finished: tuple[Path, str, int]) -> None:
+def test_no_session_is_measured_more_often_than_its_worker_dies(
+    finished: tuple[Path, str, int],
+) -> None:
     runs = {path.stem: path.stat().st_size for path in finished[0].parent.glob("*.runs")}
     assert 2 <= runs["deadly"] <= 4
     assert runs["unlucky"] == 2
     assert {runs[f"good{k}"] for k in range(9)} == {1}
 
 
-def test_a_quarantined_session_says_why_where_and_what_to_do(finished: tuple[Path, str, int]) -> None:
+def test_a_quarantined_session_says_why_where_and_what_to_do(
+    finished: tuple[Path, str, int],
+) -> None:
     told = {one.session.animal.id: one.failure or {} for one in standings(Study.load(finished[0]))}
     assert told["empty"]["reason"] == "no animal was found in the sampled frames"
     assert told["empty"]["remedy"] == "check the depth unit and the plan"
@@ -82,7 +92,10 @@ def test_a_quarantined_session_says_why_where_and_what_to_do(finished: tuple[Pat
     assert any("ZeroDivisionError" in line for line in told["fault"]["traceback"])
     assert "worker process died" in told["deadly"]["reason"]
     assert "there is no recording" in told["missing"]["reason"]
-    assert all({"stage", "frame", "reason", "remedy", "versions", "plan"} <= set(told[name]) for name in BROKEN)
+    assert all(
+        {"stage", "frame", "reason", "remedy", "versions", "plan"} <= set(told[name])
+        for name in BROKEN
+    )
 
 
 def test_every_session_ends_with_exactly_one_of_two_files(finished: tuple[Path, str, int]) -> None:
@@ -92,14 +105,21 @@ def test_every_session_ends_with_exactly_one_of_two_files(finished: tuple[Path, 
     assert not list(finished[0].parent.rglob("*.part"))
 
 
-def test_the_studys_table_lists_every_session_and_holds_no_formula(finished: tuple[Path, str, int]) -> None:
+def test_the_studys_table_lists_every_session_and_holds_no_formula(
+    finished: tuple[Path, str, int],
+) -> None:
     folder = Study.load(finished[0]).cohort_folder
     table = pd.read_parquet(folder / "study.parquet")
     assert table["state"].value_counts().to_dict() == {"done": 11, "failed": 6, "excluded": 1}
     assert (table["group"] == "@g").all()
     rows = list(csv.reader((folder / "study.csv").read_text(encoding="utf-8").splitlines()))
     assert len(rows) == 19
-    assert not [cell for row in rows for cell in row if cell[:1] in ("=", "+", "-", "@") and not cell[1:].isdigit()]
+    assert not [
+        cell
+        for row in rows
+        for cell in row
+        if cell[:1] in ("=", "+", "-", "@") and not cell[1:].isdigit()
+    ]
     described = {entry["name"] for entry in json.loads((folder / "study_columns.json").read_text())}
     assert described == set(table.columns)
 
@@ -110,12 +130,17 @@ def test_workers_share_the_cores(finished: tuple[Path, str, int]) -> None:
     assert int(told) == max(1, len(os.sched_getaffinity(0)) // 2)
 
 
-def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(finished: tuple[Path, str, int]) -> None:
+def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(
+    finished: tuple[Path, str, int],
+) -> None:
     assert [cohort.n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
     assert [cohort.n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
     assert cohort.n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
     done = [one.session for one in standings(Study.load(finished[0])) if one.state == "done"]
-    shared = {one.animal.id: json.loads((one.folder / "session.json").read_text())["shared"] for one in done}
+    shared = {
+        one.animal.id: json.loads((one.folder / "session.json").read_text())["shared"]
+        for one in done
+    }
     assert [name for name, so in shared.items() if so] == ["last"]
 
 
@@ -155,7 +180,9 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     recording.write_bytes(b"other bytes")
     monkeypatch.setattr("liex_lab.pipelines.build.open_planned", lambda *_: _Digest("0" * 64))
     assert why(file) == ("changed", "input changed: its content")
-    stored = json.loads((Study.load(file).sessions[0].folder / "session.json").read_text())["input"]["sha256"]
+    stored = json.loads((Study.load(file).sessions[0].folder / "session.json").read_text())[
+        "input"
+    ]["sha256"]
     monkeypatch.setattr("liex_lab.pipelines.build.open_planned", lambda *_: _Digest(stored))
     assert why(file) == ("done", ""), "only copied to another place"
     recording.unlink()
@@ -175,7 +202,9 @@ class _Digest:
         pass
 
 
-def test_a_failed_session_is_left_alone_until_something_changed_or_it_is_asked_for(tmp_path: Path) -> None:
+def test_a_failed_session_is_left_alone_until_something_changed_or_it_is_asked_for(
+    tmp_path: Path,
+) -> None:
     file = one_session(tmp_path, "torn")
     study = Study.load(file)
     assert why(file)[0] == "failed"
@@ -214,7 +243,10 @@ def test_dry_run_changes_nothing(tmp_path: Path) -> None:
     before = sorted(tmp_path.rglob("*"))
     result = CliRunner().invoke(cli.app, ["cohort", str(file), "--dry-run"])
     assert result.exit_code == 0
-    assert result.output == "new      sub-good_ses-01  new\nnew      sub-bad_ses-01  new\n2 sessions: 2 new\n"
+    assert (
+        result.output
+        == "new      sub-good_ses-01  new\nnew      sub-bad_ses-01  new\n2 sessions: 2 new\n"
+    )
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -250,13 +282,28 @@ def test_the_job_script_for_slurm_asks_for_what_the_file_says(tmp_path: Path) ->
     from liex_lab.pipelines.study.dask_cluster import slurm_options
 
     table = SlurmTable(
-        partition="batch", account="neuro", memory="6GB", cores_per_job=3, walltime="02:00:00",
-        prologue=["module load python/3.11"], directives=["--qos=normal"], log_folder="logs",
-    )  # fmt: skip
-    script = SLURMJob("tls://10.0.0.1:8786", name="w0", **slurm_options(table, str(tmp_path))).job_script()
-    for line in ("#SBATCH -p batch", "#SBATCH -A neuro", "#SBATCH --cpus-per-task=3", "#SBATCH --mem=6G",
-                 "#SBATCH -t 02:00:00", "#SBATCH --qos=normal", "module load python/3.11",
-                 "export NUMBA_NUM_THREADS=3"):  # fmt: skip
+        partition="batch",
+        account="neuro",
+        memory="6GB",
+        cores_per_job=3,
+        walltime="02:00:00",
+        prologue=["module load python/3.11"],
+        directives=["--qos=normal"],
+        log_folder="logs",
+    )
+    script = SLURMJob(
+        "tls://10.0.0.1:8786", name="w0", **slurm_options(table, str(tmp_path))
+    ).job_script()
+    for line in (
+        "#SBATCH -p batch",
+        "#SBATCH -A neuro",
+        "#SBATCH --cpus-per-task=3",
+        "#SBATCH --mem=6G",
+        "#SBATCH -t 02:00:00",
+        "#SBATCH --qos=normal",
+        "module load python/3.11",
+        "export NUMBA_NUM_THREADS=3",
+    ):
         assert f"\n{line}\n" in script, script
     assert "distributed.cli.dask_worker tls://10.0.0.1:8786" in script
     assert "--nthreads 1" in script
@@ -264,8 +311,13 @@ def test_the_job_script_for_slurm_asks_for_what_the_file_says(tmp_path: Path) ->
 
 def test_the_bundled_slurm_file_loads_and_slips_are_told(tmp_path: Path) -> None:
     assert SlurmTable.load("slurm") == SlurmTable()
-    for text, said in (("jobs = 0", "greater"), ("job = 3", "job"), ("partition = 'a\\nb'", "partition"),
-                       ("prologue = ['a\\nrm']", "TOML|prologue"), ("[", "TOML")):  # fmt: skip
+    for text, said in (
+        ("jobs = 0", "greater"),
+        ("job = 3", "job"),
+        ("partition = 'a\\nb'", "partition"),
+        ("prologue = ['a\\nrm']", "TOML|prologue"),
+        ("[", "TOML"),
+    ):
         (tmp_path / "own.toml").write_text(text.replace("'", '"'))
         with pytest.raises(StudyError, match=said):
             SlurmTable.load(tmp_path / "own.toml")

@@ -43,7 +43,9 @@ def test_a_cut_out_action_is_tracked_with_what_lies_around_it(cut: Acted) -> Non
     assert track_error_mm([one]) < 3.0
 
 
-def test_only_the_beginning_is_filmed_and_a_slower_camera_has_fewer_frames(recording: Acted) -> None:
+def test_only_the_beginning_is_filmed_and_a_slower_camera_has_fewer_frames(
+    recording: Acted,
+) -> None:
     usual, slower = recording.tracked(), recording.tracked(15.0)
     assert usual.track.times_ns[-1] == pytest.approx(1.5e9, abs=4e7)
     assert len(slower) == pytest.approx(len(usual) / 2, abs=1)
@@ -51,7 +53,9 @@ def test_only_the_beginning_is_filmed_and_a_slower_camera_has_fewer_frames(recor
     assert track_error_mm([slower]) < 12.0
 
 
-def test_what_was_measured_is_not_measured_again(cut: Acted, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_measured_is_not_measured_again(
+    cut: Acted, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "act", None)
     again = acted([CUT], PoseEstimator.load("fish"))[0]
     np.testing.assert_array_equal(again.tracked().track.joints_mm, cut.tracked().track.joints_mm)
@@ -77,6 +81,8 @@ def test_the_confusions_are_drawn_as_a_picture(tmp_path: Path) -> None:
     result = {
         "confusion": {"words": ["c_turn", "scoot"], **dict.fromkeys(shares, matrix)},
         "accuracy_interval95": dict.fromkeys(shares, (0.5, 0.98)),
-        "tangent_accuracy": 0.875, "joint_accuracy": 0.875, "default_accuracy": 0.875,
-    }  # fmt: skip
+        "tangent_accuracy": 0.875,
+        "joint_accuracy": 0.875,
+        "default_accuracy": 0.875,
+    }
     assert draw_confusions(result, tmp_path / "new" / "fig20.png").read_bytes()[:4] == b"\x89PNG"

@@ -30,13 +30,24 @@ def measured() -> list[Seen]:
     made = []
     for kind, seed, sd_mm in (("easy", 1, 0.8), ("hard", 2, 2.0)):
         seen = told(SECONDS, noisy(truth, np.random.default_rng(seed), sd_mm))
-        made.append(Seen(kind, seen, SUBJECT, truth, truth.joints(MOUSE), [Event("hidden", 10, 12)], 0.0, 0.0))
+        made.append(
+            Seen(
+                kind, seen, SUBJECT, truth, truth.joints(MOUSE), [Event("hidden", 10, 12)], 0.0, 0.0
+            )
+        )
     return made
 
 
 def error(measured: list[Seen], tuning: Tuning) -> float:
     tracks = [track_whole(each.subject, each.seen, (), tuning).track for each in measured]
-    return float(np.mean([each.errors(track.joints_mm).mean() for each, track in zip(measured, tracks, strict=True)]))
+    return float(
+        np.mean(
+            [
+                each.errors(track.joints_mm).mean()
+                for each, track in zip(measured, tracks, strict=True)
+            ]
+        )
+    )
 
 
 def flat(value: object) -> list[float]:
@@ -70,8 +81,12 @@ def covered(measured: list[Seen], tuning: Tuning) -> list[float]:
     shares, (per_blur, per_spread) = [], tuning.motion.stretch
     for each in measured:
         stretch_sd = float(np.hypot(per_blur * each.blur, per_spread * each.size_spread))
-        track = track_whole(replace(each.subject, stretch_sd=stretch_sd), each.seen, (), tuning).track
-        shares.append(float(np.mean(np.abs(track.joints_mm - each.truth) < 1.645 * track.sd_mm[..., None])))
+        track = track_whole(
+            replace(each.subject, stretch_sd=stretch_sd), each.seen, (), tuning
+        ).track
+        shares.append(
+            float(np.mean(np.abs(track.joints_mm - each.truth) < 1.645 * track.sd_mm[..., None]))
+        )
     return shares
 
 
@@ -89,9 +104,13 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
         each = measured[k % 2]
         pose = replace(each.pose, scale=size * each.pose.scale)
         truth = pose.joints(MOUSE)
-        sequences.append(replace(each, pose=pose, truth=truth, size_spread=0.0 if size == 1.0 else spread))
+        sequences.append(
+            replace(each, pose=pose, truth=truth, size_spread=0.0 if size == 1.0 else spread)
+        )
     tuning = honest_about_joints(sequences, Tuning.of("mouse"))
-    alike = honest_about_joints([replace(each, size_spread=0.0) for each in sequences], Tuning.of("mouse"))
+    alike = honest_about_joints(
+        [replace(each, size_spread=0.0) for each in sequences], Tuning.of("mouse")
+    )
     assert tuning.motion.stretch[1] > 0
     assert alike.motion.stretch == (0.0, 0.0), "what tells nothing is not used"
     assert np.ptp(covered(sequences, tuning)) < 0.5 * np.ptp(covered(sequences, alike))
@@ -100,7 +119,9 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
 @pytest.mark.slow
 def test_the_table_is_the_same_on_one_thread_and_on_two(tmp_path):
     made = [
-        train_tracking("mouse", tmp_path / f"{workers}.toml", n_frames=100, seeds=(31,), workers=workers)
+        train_tracking(
+            "mouse", tmp_path / f"{workers}.toml", n_frames=100, seeds=(31,), workers=workers
+        )
         for workers in (1, 2)
     ]
     assert made[0].read_bytes() == made[1].read_bytes()
@@ -115,6 +136,9 @@ def test_roots_and_bends_are_covered_as_well(measured):
         turned.append(np.abs(so3.log(off.rotation)) / track.sd_root[:, :3])
         placed.append(np.abs(off.translation) / track.sd_root[:, 3:])
         free = MOUSE.axes[1:]
-        bent.append((np.abs(track.angles_rad - each.pose.angles)[:, 1:][:, free]) / track.sd_angles_rad[:, 1:][:, free])
+        bent.append(
+            (np.abs(track.angles_rad - each.pose.angles)[:, 1:][:, free])
+            / track.sd_angles_rad[:, 1:][:, free]
+        )
     for z in (turned, placed, bent):
         assert 0.85 < np.mean(np.concatenate(z) < 1.645) < 0.95

@@ -31,13 +31,21 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A model of the snake, from few pictures and few shallow trees."""
     default = methods.METHODS["default"]
     small = replace(
-        default, rounds=2, n_candidates=6, training_candidates=4, survivors=0, pruner=None, corrector=None,
+        default,
+        rounds=2,
+        n_candidates=6,
+        training_candidates=4,
+        survivors=0,
+        pruner=None,
+        corrector=None,
         regressors=replace(default.regressors, n_trees=5, max_depth=12, n_tests=50),
         metric=replace(default.metric, n_trees=16, max_depth=7, n_tests=40),
-    )  # fmt: skip
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(methods.METHODS, "default", small)
-        yield train.train_model(SNAKE, "default", tmp_path_factory.mktemp("models") / "snake.npz", n_images=1024)
+        yield train.train_model(
+            SNAKE, "default", tmp_path_factory.mktemp("models") / "snake.npz", n_images=1024
+        )
 
 
 def test_the_model_knows_its_animal_and_how_it_is_looked_at(model):
@@ -51,7 +59,9 @@ def test_the_model_knows_its_animal_and_how_it_is_looked_at(model):
 
 def test_its_accuracy_is_measured_on_rendered_snakes(model, monkeypatch):
     drawn = synthetic.test_split
-    monkeypatch.setattr(synthetic, "test_split", lambda name, spine, n, habits: drawn(name, spine, 2, habits))
+    monkeypatch.setattr(
+        synthetic, "test_split", lambda name, spine, n, habits: drawn(name, spine, 2, habits)
+    )
     result = evaluate_pose(SNAKE, "clean", model=model)
     assert result["n_frames"] == 100
     assert result["lost_rate"] < 0.05

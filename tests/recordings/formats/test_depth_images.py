@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from liex_lab.recordings.formats.messages.depth_images import LARGEST_PICTURE, decode, picture_size
-from liex_lab.recordings.formats.messages.messages import DepthMessage, PackedPicture, PointCloud, RawPicture
+from liex_lab.recordings.formats.messages.messages import (
+    DepthMessage,
+    PackedPicture,
+    PointCloud,
+    RawPicture,
+)
 from tests.recordings.writers import SMALL
 
 PIXELS = bytes(2 * 64 * 48)
@@ -17,7 +22,9 @@ HUGE = 1 << 31
 
 
 def png_head(width: int, height: int) -> bytes:
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", width, height, 16, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(
+        ">I4sIIBBBBB", 13, b"IHDR", width, height, 16, 0, 0, 0, 0
+    )
 
 
 def rvl(width: int, height: int) -> bytes:

@@ -37,19 +37,28 @@ from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_ti
 STORED = depth_frames(9)
 
 
-def write_json(path: Path, schema: str, contents: list[Any], calibration: dict[str, Any] | None = None) -> Path:
+def write_json(
+    path: Path, schema: str, contents: list[Any], calibration: dict[str, Any] | None = None
+) -> Path:
     """Foxglove's messages in JSON, with the least that an MCAP file may have: no chunk, no index, no summary."""
     with path.open("wb") as file:
         writer = McapWriter(
-            file, use_chunking=False, index_types=IndexType.NONE, repeat_channels=False, repeat_schemas=False,
-            use_statistics=False, use_summary_offsets=False,
-        )  # fmt: skip
+            file,
+            use_chunking=False,
+            index_types=IndexType.NONE,
+            repeat_channels=False,
+            repeat_schemas=False,
+            use_statistics=False,
+            use_summary_offsets=False,
+        )
         writer.start()
         for topic, kind, messages in (
             ("/camera/calibration", "foxglove.CameraCalibration", [calibration or {}]),
             ("/camera/depth", schema, contents),
         ):
-            channel = writer.register_channel(topic, "json", writer.register_schema(kind, "jsonschema", b"{}"))
+            channel = writer.register_channel(
+                topic, "json", writer.register_schema(kind, "jsonschema", b"{}")
+            )
             for time_ns, message in zip(even_times(len(messages)), messages, strict=True):
                 writer.add_message(channel, time_ns, json.dumps(message).encode(), time_ns)
         writer.finish()
@@ -62,21 +71,34 @@ def json_message(k: int, data: bytes, **more: Any) -> dict[str, Any]:
     return {"timestamp": {"sec": sec, "nsec": nsec}, "frame_id": "camera", "data": content, **more}
 
 
-CALIBRATION = {"frame_id": "camera", "width": 64, "height": 48, "D": [], "K": SMALL.matrix.ravel().tolist()}
+CALIBRATION = {
+    "frame_id": "camera",
+    "width": 64,
+    "height": 48,
+    "D": [],
+    "K": SMALL.matrix.ravel().tolist(),
+}
 
 
 def test_raw_pictures_in_json(tmp_path: Path) -> None:
     shape = {"width": 64, "height": 48, "step": 128, "encoding": "16UC1"}
     messages = [json_message(k, frame.tobytes(), **shape) for k, frame in enumerate(STORED)]
-    with open_recording(write_json(tmp_path / "r.mcap", "foxglove.RawImage", messages, CALIBRATION)) as recording:
+    with open_recording(
+        write_json(tmp_path / "r.mcap", "foxglove.RawImage", messages, CALIBRATION)
+    ) as recording:
         assert recording.times_ns.tolist() == even_times(len(STORED))
-        assert (recording.camera.fx, recording.problems, recording.truncated) == (SMALL.fx, [], False)
+        assert (recording.camera.fx, recording.problems, recording.truncated) == (
+            SMALL.fx,
+            [],
+            False,
+        )
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
 
 
 def test_packed_pictures_in_json(tmp_path: Path) -> None:
     messages = [
-        json_message(k, cv2.imencode(".png", frame)[1].tobytes(), format="png") for k, frame in enumerate(STORED)
+        json_message(k, cv2.imencode(".png", frame)[1].tobytes(), format="png")
+        for k, frame in enumerate(STORED)
     ]
     with open_recording(
         write_json(tmp_path / "r.mcap", "foxglove.CompressedImage", messages, CALIBRATION)
@@ -87,14 +109,28 @@ def test_packed_pictures_in_json(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        [], "text", {"width": "wide"}, {"timestamp": 7}, {"data": "%%%"}, {"encoding": 5}, {"width": 1e300},
-        {"width": -64, "height": -48, "step": -128, "encoding": "16UC1"}, {"width": float("nan")}, {"timestamp": []},
+        [],
+        "text",
+        {"width": "wide"},
+        {"timestamp": 7},
+        {"data": "%%%"},
+        {"encoding": 5},
+        {"width": 1e300},
+        {"width": -64, "height": -48, "step": -128, "encoding": "16UC1"},
+        {"width": float("nan")},
+        {"timestamp": []},
     ],
-)  # fmt: skip
-@pytest.mark.parametrize("schema", ["foxglove.RawImage", "foxglove.CompressedImage", "foxglove.PointCloud"])
+)
+@pytest.mark.parametrize(
+    "schema", ["foxglove.RawImage", "foxglove.CompressedImage", "foxglove.PointCloud"]
+)
 def test_any_json_is_refused_in_a_sentence(tmp_path: Path, schema: str, message: Any) -> None:
-    assert "no depth pictures" in refusal(write_json(tmp_path / "r.mcap", schema, [message], CALIBRATION))
-    assert "no depth pictures" in refusal(write_json(tmp_path / "r.mcap", schema, [message], message))
+    assert "no depth pictures" in refusal(
+        write_json(tmp_path / "r.mcap", schema, [message], CALIBRATION)
+    )
+    assert "no depth pictures" in refusal(
+        write_json(tmp_path / "r.mcap", schema, [message], message)
+    )
 
 
 def write_clouds(path: Path, clouds: list[NDArray[np.float32]], pose: Pose | None = None) -> Path:
@@ -102,7 +138,9 @@ def write_clouds(path: Path, clouds: list[NDArray[np.float32]], pose: Pose | Non
     context = foxglove.Context()
     writer = foxglove.open_mcap(path, context=context, allow_overwrite=True)
     k = [float(value) for value in SMALL.matrix.ravel()]
-    lens = CameraCalibration(timestamp=Timestamp(sec=0, nsec=0), frame_id="camera", width=64, height=48, K=k)
+    lens = CameraCalibration(
+        timestamp=Timestamp(sec=0, nsec=0), frame_id="camera", width=64, height=48, K=k
+    )
     CameraCalibrationChannel("/camera/calibration", context=context).log(lens, log_time=START_NS)
     channel = PointCloudChannel("/camera/points", context=context)
     fields = [
@@ -112,7 +150,12 @@ def write_clouds(path: Path, clouds: list[NDArray[np.float32]], pose: Pose | Non
     for time_ns, points in zip(even_times(len(clouds)), clouds, strict=True):
         stamp = Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         cloud = PointCloud(
-            timestamp=stamp, frame_id="camera", pose=pose, point_stride=12, fields=fields, data=points.tobytes()
+            timestamp=stamp,
+            frame_id="camera",
+            pose=pose,
+            point_stride=12,
+            fields=fields,
+            data=points.tobytes(),
         )
         channel.log(cloud, log_time=time_ns)
     writer.close()
@@ -130,7 +173,9 @@ def test_point_clouds(tmp_path: Path, loose: bool) -> None:
 
 def test_a_cloud_may_lie_in_a_frame_of_its_own(tmp_path: Path) -> None:
     """Points in a frame with x ahead, y left, z up; its pose takes them into the camera's."""
-    T = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # of the camera's axes in that frame's
+    T = np.array(
+        [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
+    )  # of the camera's axes in that frame's
     at = np.array([0.1, 0.0, 0.05])
     clouds = [((points_of(f, SMALL).reshape(-1, 3) - at) @ T).astype(np.float32) for f in STORED]
     x, y, z, w = Rotation.from_matrix(T).as_quat().tolist()
@@ -157,7 +202,9 @@ def test_a_cut_chunk_gives_what_it_still_holds(
     with recording:
         assert recording.truncated
         assert len(recording) >= int(share * 80) - (3 if compression is None else 23)
-        np.testing.assert_array_equal([frame.depth for frame in recording], stored[: len(recording)])
+        np.testing.assert_array_equal(
+            [frame.depth for frame in recording], stored[: len(recording)]
+        )
 
 
 def test_zeros_at_the_end_are_no_records(tmp_path: Path) -> None:
@@ -174,7 +221,9 @@ def test_a_chunk_that_promises_too_much_is_damaged(tmp_path: Path) -> None:
     """Its unpacked size is bounded before any memory is asked for."""
     path = write_mcap(tmp_path / "r.mcap", STORED, chunk_size=1 << 20)
     content = bytearray(path.read_bytes())
-    size_at = content.index(b"zstd") - 16  # before the name: the size (8), its checksum (4), the name's length (4)
+    size_at = (
+        content.index(b"zstd") - 16
+    )  # before the name: the size (8), its checksum (4), the name's length (4)
     content[size_at : size_at + 8] = struct.pack("<Q", 1 << 60)
     path.write_bytes(content)
     assert "cut or damaged" in refusal(path)

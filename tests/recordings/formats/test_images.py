@@ -53,7 +53,9 @@ def test_stamps_are_exact_in_nanoseconds_and_in_seconds(tmp_path: Path) -> None:
 def test_units_and_unread_values_are_as_stated(tmp_path: Path) -> None:
     stored = np.full((2, 48, 64), 5000, np.uint16)
     stored[:, 0, 0], stored[:, 0, 1] = 65535, 0
-    with open_recording(write_png_folder(tmp_path / "r", stored, unit_mm=0.2, unread=[0, 65535])) as recording:
+    with open_recording(
+        write_png_folder(tmp_path / "r", stored, unit_mm=0.2, unread=[0, 65535])
+    ) as recording:
         depth = recording.frame(0).depth
     assert depth[1, 1] == 1000.0
     np.testing.assert_array_equal(depth[0, :3], [0.0, 0.0, 1000.0])
@@ -61,11 +63,21 @@ def test_units_and_unread_values_are_as_stated(tmp_path: Path) -> None:
 
 def test_an_animal_is_known_by_its_camera_file(tmp_path: Path) -> None:
     folder = write_png_folder(
-        tmp_path / "r", STORED, subject_id="m7", session_start_time="2024-05-01T10:00:00+02:00", focal=3, unit_mn=2
+        tmp_path / "r",
+        STORED,
+        subject_id="m7",
+        session_start_time="2024-05-01T10:00:00+02:00",
+        focal=3,
+        unit_mn=2,
     )
     with open_recording(folder) as recording:
-        assert recording.metadata == {"subject_id": "m7", "session_start_time": "2024-05-01T10:00:00+02:00"}
-        assert any("'unit_mn'" in problem and "'unit_mm'" in problem for problem in recording.problems)
+        assert recording.metadata == {
+            "subject_id": "m7",
+            "session_start_time": "2024-05-01T10:00:00+02:00",
+        }
+        assert any(
+            "'unit_mn'" in problem and "'unit_mm'" in problem for problem in recording.problems
+        )
         assert any("'focal'" in problem for problem in recording.problems)
 
 
@@ -123,7 +135,10 @@ def test_a_cut_png_is_there_and_wholly_unread(tmp_path: Path, share: float) -> N
     cut(folder / "frame_4.png", share)
     with open_recording(folder) as recording:
         assert (len(recording), recording.truncated, recording.n_whole) == (12, True, 11)
-        assert any("1 of 12 pictures" in problem and "frame_4.png" in problem for problem in recording.problems)
+        assert any(
+            "1 of 12 pictures" in problem and "frame_4.png" in problem
+            for problem in recording.problems
+        )
         assert not recording.frame(4).depth.any()
         np.testing.assert_array_equal(recording.frame(5).depth, STORED[5])
     sentence = refusal(folder, strict=True)
@@ -161,7 +176,9 @@ def test_a_single_cut_picture_is_refused(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_pictures_for_people_are_refused(tmp_path: Path, picture: np.ndarray, kind: str, suffix: str) -> None:
+def test_pictures_for_people_are_refused(
+    tmp_path: Path, picture: np.ndarray, kind: str, suffix: str
+) -> None:
     folder = tmp_path / "r"
     write_camera_folder = write_png_folder(folder, STORED[:0])
     path = folder / f"a{suffix}"
@@ -252,10 +269,18 @@ def test_keys_may_stand_without_a_table_and_sizes_may_be_left_out(tmp_path: Path
     (folder / "camera.toml").write_text("fx = 60\nfy = 61.0\ncx = 31.5\ncy = 23.5")
     with open_recording(folder) as recording:
         camera = recording.camera
-    assert (camera.fx, camera.cy, camera.width, camera.height, camera.source) == (60.0, 23.5, 64, 48, "camera.toml")
+    assert (camera.fx, camera.cy, camera.width, camera.height, camera.source) == (
+        60.0,
+        23.5,
+        64,
+        48,
+        "camera.toml",
+    )
 
 
-@pytest.mark.parametrize("how", [{}, {"compression": "zlib"}, {"bigtiff": True}, {"rowsperstrip": 5}])
+@pytest.mark.parametrize(
+    "how", [{}, {"compression": "zlib"}, {"bigtiff": True}, {"rowsperstrip": 5}]
+)
 def test_tiff_stacks_hold_many_frames(tmp_path: Path, how: dict[str, Any]) -> None:
     path = tmp_path / "depth.tif"
     write_tiff_stack(path, STORED, **{key: value for key, value in how.items() if key != "bigtiff"})
@@ -307,7 +332,9 @@ def test_float_tiffs_are_millimetres_and_may_point_the_other_way(tmp_path: Path)
 
 @pytest.mark.parametrize("share", np.linspace(0.03, 0.99, 25).round(3).tolist())
 @pytest.mark.parametrize("compression", [None, "zlib"])
-def test_a_cut_stack_gives_its_whole_pages(tmp_path: Path, share: float, compression: str | None) -> None:
+def test_a_cut_stack_gives_its_whole_pages(
+    tmp_path: Path, share: float, compression: str | None
+) -> None:
     path = write_tiff_stack(tmp_path / "depth.tif", STORED, compression=compression)
     cut(path, share)
     recording, sentence = opened_or_refused(path)
@@ -340,7 +367,9 @@ def test_a_cut_tiff_among_whole_ones_is_wholly_unread(tmp_path: Path) -> None:
 
 def test_a_camera_toml_written_from_a_camera_reads_back(tmp_path: Path) -> None:
     folder = write_png_folder(tmp_path / "r", STORED[:2])
-    lines = [f"{key} = {json.dumps(value)}" for key, value in SMALL.to_dict().items() if key != "source"]
+    lines = [
+        f"{key} = {json.dumps(value)}" for key, value in SMALL.to_dict().items() if key != "source"
+    ]
     (folder / "camera.toml").write_text("\n".join(["[camera]", *lines]))
     with open_recording(folder) as recording:
         assert recording.camera.to_dict() | {"source": "stated"} == SMALL.to_dict()

@@ -17,7 +17,15 @@ from liex_lab.optics.camera import Camera, Distortion
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.messages.mcap import McapFile
 from tests.recordings.asking import opened_or_refused, refusal
-from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times, write_camera, write_mcap
+from tests.recordings.writers import (
+    SMALL,
+    START_NS,
+    cut,
+    depth_frames,
+    even_times,
+    write_camera,
+    write_mcap,
+)
 
 STORED = depth_frames(20)
 
@@ -48,7 +56,9 @@ def test_floats_are_metres_and_nan_is_unread(path: Path) -> None:
 
 @pytest.mark.parametrize("compression", [MCAPCompression.Zstd, MCAPCompression.Lz4, None])
 @pytest.mark.parametrize("use_chunks", [True, False])
-def test_every_packing_reads_alike(path: Path, compression: MCAPCompression | None, use_chunks: bool) -> None:
+def test_every_packing_reads_alike(
+    path: Path, compression: MCAPCompression | None, use_chunks: bool
+) -> None:
     write_mcap(path, STORED, compression=compression, use_chunks=use_chunks, padding=6)
     with open_recording(path, strict=True) as recording:
         for index in (19, 3, 4, 0):
@@ -59,7 +69,10 @@ def test_it_agrees_with_the_reader_of_mcap_itself(path: Path) -> None:
     write_mcap(path, STORED, log_delay_ns=5_000_000)
     with path.open("rb") as file, open_recording(path) as recording:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        decoded = [message.decoded_message for message in reader.iter_decoded_messages(topics=["/camera/depth"])]
+        decoded = [
+            message.decoded_message
+            for message in reader.iter_decoded_messages(topics=["/camera/depth"])
+        ]
         assert len(decoded) == len(recording)
         for frame, message in zip(recording, decoded, strict=True):
             assert frame.time_ns == message.timestamp.ToNanoseconds()
@@ -71,14 +84,18 @@ def test_the_sensors_stamp_comes_before_the_time_of_logging(path: Path) -> None:
     with open_recording(write_mcap(path, STORED, log_delay_ns=7_000_000)) as recording:
         assert recording.times_ns.tolist() == times
         assert recording.metadata["session_start_time"].startswith("2025-10-09T08:53:20")
-    with open_recording(write_mcap(path, STORED, stamped=False, log_delay_ns=7_000_000)) as recording:
+    with open_recording(
+        write_mcap(path, STORED, stamped=False, log_delay_ns=7_000_000)
+    ) as recording:
         assert recording.times_ns.tolist() == [t + 7_000_000 for t in times]
         assert any("no stamp" in problem for problem in recording.problems)
 
 
 def test_a_sensor_clock_may_begin_at_zero(path: Path) -> None:
     times = even_times(20, start_ns=0)
-    with open_recording(write_mcap(path, STORED, times_ns=times, log_delay_ns=START_NS)) as recording:
+    with open_recording(
+        write_mcap(path, STORED, times_ns=times, log_delay_ns=START_NS)
+    ) as recording:
         assert recording.times_ns.tolist() == times
         assert recording.metadata == {}
 
@@ -86,7 +103,9 @@ def test_a_sensor_clock_may_begin_at_zero(path: Path) -> None:
 def test_messages_come_in_the_order_of_logging(path: Path) -> None:
     order = [0, 2, 1, *range(3, 20)]
     times = np.array(even_times(20))
-    with open_recording(write_mcap(path, STORED[order], times_ns=times[order].tolist())) as recording:
+    with open_recording(
+        write_mcap(path, STORED[order], times_ns=times[order].tolist())
+    ) as recording:
         assert recording.times_ns.tolist() == times.tolist()
         for frame in recording:
             np.testing.assert_array_equal(frame.depth, STORED[frame.index])
@@ -125,7 +144,9 @@ def test_distortion_belongs_to_the_camera(path: Path) -> None:
 
 @pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 20).round(3).tolist())
 @pytest.mark.parametrize("use_chunks", [True, False])
-def test_a_cut_file_gives_the_frames_that_are_whole(path: Path, share: float, use_chunks: bool) -> None:
+def test_a_cut_file_gives_the_frames_that_are_whole(
+    path: Path, share: float, use_chunks: bool
+) -> None:
     write_mcap(path, STORED, use_chunks=use_chunks)
     cut(path, share)
     write_camera(path.parent)
@@ -138,7 +159,9 @@ def test_a_cut_file_gives_the_frames_that_are_whole(path: Path, share: float, us
         assert recording.truncated
         assert any("cut or damaged" in problem for problem in recording.problems)
         assert len(recording) >= min(20, int(share * 20) - 3)
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED[: len(recording)])
+        np.testing.assert_array_equal(
+            [frame.depth for frame in recording], STORED[: len(recording)]
+        )
     assert f"{len(recording)} whole frame" in refusal(path, strict=True)
 
 
@@ -178,9 +201,13 @@ def test_a_picture_of_another_size_is_wholly_unread_and_told(path: Path) -> None
     channel = RawImageChannel("/depth", context=context)
     for k, (width, height) in enumerate([(64, 48), (64, 48), (32, 48)]):
         image = RawImage(
-            timestamp=Timestamp(sec=k + 1, nsec=0), encoding="16UC1", width=width, height=height, step=2 * width,
+            timestamp=Timestamp(sec=k + 1, nsec=0),
+            encoding="16UC1",
+            width=width,
+            height=height,
+            step=2 * width,
             data=np.full(width * height, 700, np.uint16).tobytes(),
-        )  # fmt: skip
+        )
         channel.log(image, log_time=k + 1)
     writer.close()
     with open_recording(path, camera=SMALL) as recording:
@@ -210,7 +237,9 @@ def test_colour_topics_are_not_depth(path: Path) -> None:
 
 
 @pytest.mark.parametrize("use_chunks", [True, False])
-def test_a_file_that_is_still_being_written_is_read_on_from_where_it_ended(path: Path, use_chunks: bool) -> None:
+def test_a_file_that_is_still_being_written_is_read_on_from_where_it_ended(
+    path: Path, use_chunks: bool
+) -> None:
     whole = write_mcap(path, STORED, use_chunks=use_chunks).read_bytes()
     growing = path.with_name("growing.mcap")
     growing.write_bytes(whole[: len(whole) // 3])
@@ -232,7 +261,9 @@ def test_a_file_that_is_still_being_written_is_read_on_from_where_it_ended(path:
     recording.close()
 
 
-def test_reading_on_does_not_read_again_what_was_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_on_does_not_read_again_what_was_read(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording = open_recording(write_mcap(path, STORED))
     looked_at: list[int] = []
     record = McapFile._record

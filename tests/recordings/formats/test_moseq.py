@@ -14,7 +14,14 @@ import pytest
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from tests.recordings.asking import opened_or_refused, refusal
-from tests.recordings.writers import SMALL, cut, depth_frames, write_archive, write_camera, write_moseq_folder
+from tests.recordings.writers import (
+    SMALL,
+    cut,
+    depth_frames,
+    write_archive,
+    write_camera,
+    write_moseq_folder,
+)
 
 STORED = depth_frames(20)
 KINECT = depth_frames(3, 512, 424)
@@ -32,15 +39,19 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_kinect_session_needs_no_camera_file_but_says_so(tmp_path: Path) -> None:
-    with open_recording(write_moseq_folder(tmp_path / "s", KINECT, ["1000", "1033.3333", "1100.5"])) as recording:
+    with open_recording(
+        write_moseq_folder(tmp_path / "s", KINECT, ["1000", "1033.3333", "1100.5"])
+    ) as recording:
         camera = recording.camera
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (365.0, 365.0, 255.5, 211.5)
         assert camera.source == "typical Kinect v2"
         assert any("typical Kinect v2" in problem for problem in recording.problems)
         assert recording.times_ns.tolist() == [1_000_000_000, 1_033_333_300, 1_100_500_000]
         assert recording.metadata == {
-            "subject_id": "m01", "session_name": "a session", "session_start_time": "2017-01-25T10:42:07.173469-05:00",
-        }  # fmt: skip
+            "subject_id": "m01",
+            "session_name": "a session",
+            "session_start_time": "2017-01-25T10:42:07.173469-05:00",
+        }
         assert (recording.name, recording.format) == ("s", "moseq")
         for frame in recording:
             np.testing.assert_array_equal(frame.depth, KINECT[frame.index])
@@ -64,14 +75,18 @@ def test_another_size_than_the_kinects_is_found_out(tmp_path: Path) -> None:
     assert '"DepthResolution": [640, 480]' in sentence
     write_moseq_folder(path, depth_frames(2, 640, 480))
     assert "camera.toml" in refusal(path)  # no camera is guessed for it
-    write_camera(path.parent, Camera(600, 600, 320, 240, 640, 480))  # one file for all the sessions beside it
+    write_camera(
+        path.parent, Camera(600, 600, 320, 240, 640, 480)
+    )  # one file for all the sessions beside it
     with open_recording(path) as recording:
         assert recording.camera.fx == 600
 
 
 def test_big_endian_depth_is_what_metadata_says(folder: Path) -> None:
     STORED.astype(">u2").tofile(folder / "depth.dat")
-    (folder / "metadata.json").write_text(json.dumps({"DepthResolution": [64, 48], "IsLittleEndian": False}))
+    (folder / "metadata.json").write_text(
+        json.dumps({"DepthResolution": [64, 48], "IsLittleEndian": False})
+    )
     with open_recording(folder) as recording:
         np.testing.assert_array_equal(recording.frame(3).depth, STORED[3])
 
@@ -108,7 +123,9 @@ def test_gaps_are_where_the_camera_left_frames_out(folder: Path) -> None:
         assert (gap.start_frame, gap.n_frames_missing, gap.reason) == (7, 4, "camera_dropped")
 
 
-@pytest.mark.parametrize("n_bytes", [FRAME_BYTES, FRAME_BYTES + 1, 7 * FRAME_BYTES - 1, 19 * FRAME_BYTES + 100])
+@pytest.mark.parametrize(
+    "n_bytes", [FRAME_BYTES, FRAME_BYTES + 1, 7 * FRAME_BYTES - 1, 19 * FRAME_BYTES + 100]
+)
 def test_a_cut_depth_file_gives_its_whole_frames(folder: Path, n_bytes: int) -> None:
     content = (folder / "depth.dat").read_bytes()
     (folder / "depth.dat").write_bytes(content[:n_bytes])
@@ -116,7 +133,10 @@ def test_a_cut_depth_file_gives_its_whole_frames(folder: Path, n_bytes: int) -> 
     with open_recording(folder) as recording:
         assert len(recording) == n
         assert recording.truncated == bool(n_bytes % FRAME_BYTES)
-        assert any(f"{n} frames" in problem and "20 time stamps" in problem for problem in recording.problems)
+        assert any(
+            f"{n} frames" in problem and "20 time stamps" in problem
+            for problem in recording.problems
+        )
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED[:n])
     if n_bytes % FRAME_BYTES:
         assert f"{n} whole frame" in refusal(folder, strict=True)
@@ -146,7 +166,9 @@ def test_wrong_metadata_is_told_in_a_sentence(folder: Path, content: str, says: 
 
 
 def test_a_start_without_a_zone_is_left_out_and_told(folder: Path) -> None:
-    (folder / "metadata.json").write_text('{"DepthResolution": [64, 48], "StartTime": "2017-01-25T10:42:07"}')
+    (folder / "metadata.json").write_text(
+        '{"DepthResolution": [64, 48], "StartTime": "2017-01-25T10:42:07"}'
+    )
     with open_recording(folder) as recording:
         assert "session_start_time" not in recording.metadata
         assert any("StartTime" in problem for problem in recording.problems)
@@ -177,7 +199,9 @@ def test_an_archive_is_unpacked_once_and_cleared_away(
     assert not list(tmp_path.glob("liex-*"))
 
 
-def test_members_may_lie_in_folders_and_a_tar_may_be_unpacked_already(folder: Path, tmp_path: Path) -> None:
+def test_members_may_lie_in_folders_and_a_tar_may_be_unpacked_already(
+    folder: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "s.tar"
     with tarfile.open(path, "w") as tar:
         tar.add(folder, arcname="./2017/session_1")
@@ -205,7 +229,9 @@ def test_a_cut_archive_gives_every_whole_frame(
 ) -> None:
     archive = write_archive(folder, tmp_path / "s.tar.gz", order)
     cut(archive, share)
-    if order == DEPTH_FIRST:  # what states the frame size and the camera is lost: one beside the archive serves
+    if (
+        order == DEPTH_FIRST
+    ):  # what states the frame size and the camera is lost: one beside the archive serves
         write_camera(tmp_path)
     by_hand = _slow_gunzip(archive)
     at = by_hand.index(b"depth.dat") + 512
@@ -253,19 +279,27 @@ def test_a_cut_kinect_archive_loses_its_stamps_but_not_its_frames(tmp_path: Path
         np.testing.assert_array_equal(recording.frame(1).depth, frames[1])
 
 
-def test_an_archive_that_is_cut_among_its_stamps_keeps_every_frame(folder: Path, tmp_path: Path) -> None:
+def test_an_archive_that_is_cut_among_its_stamps_keeps_every_frame(
+    folder: Path, tmp_path: Path
+) -> None:
     stamps = (folder / "depth_ts.txt").read_text().splitlines()
     (folder / "depth_ts.txt").write_text("\n".join(stamps[:8]) + "\n" + stamps[8][:3])
     plain = gzip.decompress(
         write_archive(
-            folder, tmp_path / "s.tar.gz", ("camera.toml", "metadata.json", "depth.dat", "depth_ts.txt")
+            folder,
+            tmp_path / "s.tar.gz",
+            ("camera.toml", "metadata.json", "depth.dat", "depth_ts.txt"),
         ).read_bytes()
     )
     end = plain.index(stamps[7].encode()) + len(stamps[7]) + 3  # within the stamp after the eighth
-    (tmp_path / "s.tar.gz").write_bytes(gzip.compress(plain[:end])[:-8])  # without gzip's trailer: cut
+    (tmp_path / "s.tar.gz").write_bytes(
+        gzip.compress(plain[:end])[:-8]
+    )  # without gzip's trailer: cut
     with open_recording(tmp_path / "s.tar.gz") as recording:
         assert (len(recording), recording.truncated) == (20, True)
-        assert recording.times_ns[:8].tolist() == [int(float(line.split()[0]) * 1e6 + 0.5) for line in stamps[:8]]
+        assert recording.times_ns[:8].tolist() == [
+            int(float(line.split()[0]) * 1e6 + 0.5) for line in stamps[:8]
+        ]
         np.testing.assert_allclose(np.diff(recording.times_ns[7:]), 33_333_300, rtol=1e-5)
         assert any("the last 12 frames are cut off" in problem for problem in recording.problems)
 
@@ -285,7 +319,9 @@ def test_an_archive_damaged_inside_gives_what_comes_before(folder: Path, tmp_pat
         np.testing.assert_array_equal(recording.frame(0).depth, STORED[0])
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x1f\x8b", b"\x1f\x8b garbage that is no gzip", bytes(2000)])
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"\x1f\x8b", b"\x1f\x8b garbage that is no gzip", bytes(2000)]
+)
 def test_what_is_no_archive_is_told_in_a_sentence(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "s.tar.gz"
     path.write_bytes(content)

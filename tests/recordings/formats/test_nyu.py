@@ -25,7 +25,12 @@ def test_its_camera_is_known_and_its_rate_assumed(tmp_path: Path) -> None:
     (folder / "camera.toml").unlink()
     with open_recording(folder) as recording:
         camera = recording.camera
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (588.036865, 587.075073, 320.0, 240.0)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (
+            588.036865,
+            587.075073,
+            320.0,
+            240.0,
+        )
         assert camera.source == "NYU hand pose data set"
         assert any("constant 30 frames/s was assumed" in problem for problem in recording.problems)
     write_times(folder, even_times(2))
@@ -60,7 +65,10 @@ def joint_file(folder: Path, **other: Any) -> np.ndarray:
     lens = NYU_CAMERA
     xyz = np.stack([(u - lens.cx) * d / lens.fx, (lens.cy - v) * d / lens.fy, d], axis=-1)  # y up
     names = np.array([f"F1_KNU{k}" for k in range(36)], object)
-    savemat(folder / "joint_data.mat", {"joint_uvd": uvd, "joint_xyz": xyz, "joint_names": names} | other)
+    savemat(
+        folder / "joint_data.mat",
+        {"joint_uvd": uvd, "joint_xyz": xyz, "joint_names": names} | other,
+    )
     return uvd
 
 
@@ -69,7 +77,9 @@ def test_joints_are_where_the_camera_sees_them(tmp_path: Path) -> None:
     for given, view in ((tmp_path, 1), (tmp_path / "joint_data.mat", 3)):
         joints = read_nyu_joints(given, view=view)
         np.testing.assert_array_equal(joints.uvd, uvd[view - 1])
-        np.testing.assert_allclose(NYU_CAMERA.project(joints.xyz), uvd[view - 1, ..., :2], atol=1e-9)
+        np.testing.assert_allclose(
+            NYU_CAMERA.project(joints.xyz), uvd[view - 1, ..., :2], atol=1e-9
+        )
         assert joints.names == tuple(f"F1_KNU{k}" for k in range(36))
 
 
@@ -81,7 +91,9 @@ def test_joints_are_where_the_camera_sees_them(tmp_path: Path) -> None:
         ({"joint_xyz": np.zeros((3, 4, 36, 3))}, "(3, 4, 36, 3)"),
     ],
 )
-def test_joints_of_another_shape_are_refused(tmp_path: Path, other: dict[str, Any], says: str) -> None:
+def test_joints_of_another_shape_are_refused(
+    tmp_path: Path, other: dict[str, Any], says: str
+) -> None:
     joint_file(tmp_path, **other)
     with pytest.raises(RecordingError) as error:
         read_nyu_joints(tmp_path)

@@ -30,8 +30,11 @@ def labels(n: int) -> np.ndarray:
     """Pixels and depths (n, 14, 3) of hands in some postures."""
     rng = np.random.default_rng(1)
     angles = 0.6 * rng.uniform(HAND.limits[..., 0], HAND.limits[..., 1], (n, HAND.n_joints, 3))
-    pose = Pose(SE3(SE3.exp(rng.normal(0.0, 0.5, (n, 6))).rotation, np.tile([0.0, 0.0, 700.0], (n, 1))), angles,
-                np.ones(n))  # fmt: skip
+    pose = Pose(
+        SE3(SE3.exp(rng.normal(0.0, 0.5, (n, 6))).rotation, np.tile([0.0, 0.0, 700.0], (n, 1))),
+        angles,
+        np.ones(n),
+    )
     points = points_of_joints(HAND) @ pose.joints(HAND)
     return np.concatenate([NYU_CAMERA.project(points), points[..., 2:]], axis=-1)
 
@@ -50,7 +53,10 @@ def test_hands_are_found_from_their_fourteen_points() -> None:
 
 def test_our_skeleton_fits_both_people_of_the_test_set(reference_data: Path) -> None:
     truth = NyuReference.load(reference_data / "hand_nyu").truth
-    for rows, size in ((slice(0, N_FIRST_PERSON, 60), 1.09), (slice(N_FIRST_PERSON, None, 150), 0.91)):
+    for rows, size in (
+        (slice(0, N_FIRST_PERSON, 60), 1.09),
+        (slice(N_FIRST_PERSON, None, 150), 0.91),
+    ):
         fit = fit_hands(HAND, truth[rows])
         assert fit.residual_mm.mean() < 3.0  # the labels' own scatter is about that
         assert np.median(fit.pose.scale) == pytest.approx(size, abs=0.03)
@@ -72,6 +78,8 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / REFERENCE_FILE).write_bytes(b"PK\x03\x04 not an archive")
     with pytest.raises(LiexError, match="not a whole file of NYU labels"):
         NyuReference.load(tmp_path)
-    np.savez(tmp_path / REFERENCE_FILE, groundtruth_uvd=labels(2), joint_names=np.array([*POINTS][::-1]))
+    np.savez(
+        tmp_path / REFERENCE_FILE, groundtruth_uvd=labels(2), joint_names=np.array([*POINTS][::-1])
+    )
     with pytest.raises(LiexError, match="in this order"):
         NyuReference.load(tmp_path)

@@ -59,9 +59,15 @@ def payloads(codec: str, frames: np.ndarray = STORED) -> list[bytes]:
 # the code
 
 
-@given(seed=st.integers(0, 2**32), n=st.integers(1, 300), spread=st.sampled_from([0, 1, 3, 7, 40, 66, 30_000]))
+@given(
+    seed=st.integers(0, 2**32),
+    n=st.integers(1, 300),
+    spread=st.sampled_from([0, 1, 3, 7, 40, 66, 30_000]),
+)
 @pytest.mark.parametrize("codec", ["16zT", "16zP"])
-def test_packing_is_undone_and_read_alike_by_the_slow_twin(codec: str, seed: int, n: int, spread: int) -> None:
+def test_packing_is_undone_and_read_alike_by_the_slow_twin(
+    codec: str, seed: int, n: int, spread: int
+) -> None:
     rng = np.random.default_rng(seed)
     changes = rng.integers(-spread, spread + 1, n) * (rng.random(n) < rng.random())
     pixels = np.clip(np.cumsum(changes) + rng.integers(0, 0x8000), 0, 0x7FFF).astype(np.uint16)
@@ -74,7 +80,9 @@ def test_packing_is_undone_and_read_alike_by_the_slow_twin(codec: str, seed: int
 
 @given(payload=st.binary(max_size=60), n=st.integers(1, 200))
 @pytest.mark.parametrize("codec", ["16zT", "16zP"])
-def test_any_bytes_are_read_as_the_slow_twin_reads_them_or_not_at_all(codec: str, payload: bytes, n: int) -> None:
+def test_any_bytes_are_read_as_the_slow_twin_reads_them_or_not_at_all(
+    codec: str, payload: bytes, n: int
+) -> None:
     if codec == "16zT":
         payload = struct.pack("<HHHH", 3, 500, 700, 900) + payload
     try:
@@ -90,7 +98,10 @@ def test_any_bytes_are_read_as_the_slow_twin_reads_them_or_not_at_all(codec: str
 def test_depths_that_the_code_cannot_hold_are_not_packed() -> None:
     assert pack_16z(np.array([0, 0x8000], np.uint16), embedded_table=False) is None
     assert pack_16z(np.array([0, 0x8000], np.uint16), embedded_table=True) is not None
-    assert pack_16z(np.array([*range(0, 0x10000, 2), 0xFFFF, 0], np.uint16), embedded_table=True) is not None
+    assert (
+        pack_16z(np.array([*range(0, 0x10000, 2), 0xFFFF, 0], np.uint16), embedded_table=True)
+        is not None
+    )
     assert pack_16z(np.arange(0x10000).astype(np.uint16), embedded_table=True) is None
 
 
@@ -99,8 +110,12 @@ def test_depths_that_the_code_cannot_hold_are_not_packed() -> None:
 
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("table", [False, True])
-@pytest.mark.parametrize(("old", "record"), [(False, 0x0D), (True, 0x0D), (True, 0x0C), (True, 0x02)])
-def test_files_of_every_version_are_read(path: Path, codec: str, old: bool, record: int, table: bool) -> None:
+@pytest.mark.parametrize(
+    ("old", "record"), [(False, 0x0D), (True, 0x0D), (True, 0x0C), (True, 0x02)]
+)
+def test_files_of_every_version_are_read(
+    path: Path, codec: str, old: bool, record: int, table: bool
+) -> None:
     depth_builder(payloads(codec), codec, old=old, record=record, table=table).write(path)
     with open_recording(path, strict=True) as recording:
         assert (recording.name, recording.format, recording.problems) == ("r", "oni", [])
@@ -110,9 +125,13 @@ def test_files_of_every_version_are_read(path: Path, codec: str, old: bool, reco
 
 
 @pytest.mark.parametrize("old", [False, True])
-def test_a_large_file_is_read_by_its_seek_table(path: Path, monkeypatch: pytest.MonkeyPatch, old: bool) -> None:
+def test_a_large_file_is_read_by_its_seek_table(
+    path: Path, monkeypatch: pytest.MonkeyPatch, old: bool
+) -> None:
     monkeypatch.setattr(_oni_index, "SCAN_UP_TO_BYTES", 0)
-    monkeypatch.setattr(_oni_index.DepthNode, "add", (add := Counted(_oni_index.DepthNode.add)).method())
+    monkeypatch.setattr(
+        _oni_index.DepthNode, "add", (add := Counted(_oni_index.DepthNode.add)).method()
+    )
     depth_builder(payloads("16zT"), "16zT", old=old, table=True).write(path)
     with open_recording(path, strict=True) as recording:
         assert recording.problems == []
@@ -139,8 +158,12 @@ def lie(made: OniBuilder, at: int, content: bytes) -> None:
     made.content = made.content[:at] + content + made.content[at + len(content) :]
 
 
-@pytest.mark.parametrize("wrong", ["time", "position", "backward", "size", "configuration", "kind", "unclosed"])
-def test_a_seek_table_that_lies_is_not_believed(path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
+@pytest.mark.parametrize(
+    "wrong", ["time", "position", "backward", "size", "configuration", "kind", "unclosed"]
+)
+def test_a_seek_table_that_lies_is_not_believed(
+    path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str
+) -> None:
     monkeypatch.setattr(_oni_index, "SCAN_UP_TO_BYTES", 0)
     made = depth_builder(payloads("16zT"), "16zT", table=True)
     table, entry = len(made.content) - 10 * 20, struct.calcsize("<QIQ")
@@ -194,14 +217,20 @@ def test_of_two_depth_cameras_the_first_with_frames_is_read_and_it_is_told(path:
     made.write(path)
     with open_recording(path) as recording:
         assert_frames(recording, STORED)
-        assert recording.problems == ["r.oni holds frames of 2 depth cameras; those of the first, Depth1, are read"]
+        assert recording.problems == [
+            "r.oni holds frames of 2 depth cameras; those of the first, Depth1, are read"
+        ]
 
 
 # the camera
 
 
 def lens_file(
-    path: Path, *, fov: tuple[float, float] | None = None, size: tuple[int, int] = (64, 48), **more: bytes
+    path: Path,
+    *,
+    fov: tuple[float, float] | None = None,
+    size: tuple[int, int] = (64, 48),
+    **more: bytes,
 ) -> Path:
     made = OniBuilder()
     made.node(1, "Depth", DEPTH, "NONE")
@@ -224,13 +253,17 @@ def test_intrinsics_come_from_the_field_of_view(path: Path) -> None:
 
 def test_intrinsics_of_old_files_come_from_the_lens_itself(path: Path) -> None:
     translation = struct.pack("<ddd", 120.0, 0.1052, 2.0)
-    with open_recording(lens_file(path, size=(640, 480), xnRealWorldTranslationData=translation)) as recording:
+    with open_recording(
+        lens_file(path, size=(640, 480), xnRealWorldTranslationData=translation)
+    ) as recording:
         assert recording.camera.fx == recording.camera.fy == pytest.approx(570.342, abs=1e-3)
         assert "xnRealWorldTranslationData" in recording.camera.source
         assert recording.problems == []
 
 
-def test_intrinsics_come_from_the_sensors_geometry_where_nothing_else_tells_them(path: Path) -> None:
+def test_intrinsics_come_from_the_sensors_geometry_where_nothing_else_tells_them(
+    path: Path,
+) -> None:
     made = OniBuilder()
     made.node(1, "Depth", DEPTH, "NONE")
     made.depth_properties(1, 320, 240, None)
@@ -246,11 +279,15 @@ def test_intrinsics_come_from_the_sensors_geometry_where_nothing_else_tells_them
 def test_where_nothing_is_stated_a_typical_camera_is_taken_and_it_is_told(path: Path) -> None:
     assert "camera.toml" in refusal(lens_file(path))  # 64 x 48 is no size that such a camera has
     with open_recording(lens_file(path, size=(320, 240))) as recording:
-        assert recording.camera == Camera(285.171, 285.171, 160, 120, 320, 240, source="typical PrimeSense")
+        assert recording.camera == Camera(
+            285.171, 285.171, 160, 120, 320, 240, source="typical PrimeSense"
+        )
         assert "typical PrimeSense" in recording.problems[0]
 
 
-@pytest.mark.parametrize("fov", [(0.0, 0.8), (float("nan"), 0.8), (1.0, 9.0), (1e-9, 1e-9), (3.1, 3.1), (0.2, 1.5)])
+@pytest.mark.parametrize(
+    "fov", [(0.0, 0.8), (float("nan"), 0.8), (1.0, 9.0), (1e-9, 1e-9), (3.1, 3.1), (0.2, 1.5)]
+)
 def test_a_field_of_view_that_cannot_be_is_not_taken(path: Path, fov: tuple[float, float]) -> None:
     assert "camera.toml" in refusal(lens_file(path, fov=fov))
     with open_recording(path, camera=SMALL) as recording:
@@ -270,7 +307,9 @@ def test_a_stated_camera_and_a_camera_toml_come_before_the_file(path: Path) -> N
 # how the camera looked
 
 
-def looks_file(path: Path, frames: list[tuple[dict[str, bytes], dict[str, int], np.ndarray]], width: int = 64) -> Path:
+def looks_file(
+    path: Path, frames: list[tuple[dict[str, bytes], dict[str, int], np.ndarray]], width: int = 64
+) -> Path:
     """Frames, and the properties that change before each."""
     made = OniBuilder()
     made.node(1, "Depth", DEPTH, "16zT", len(frames))
@@ -307,28 +346,38 @@ def test_a_cropped_frame_lies_in_its_place_of_the_whole_picture(path: Path) -> N
 
 
 def test_cropping_may_change_and_end(path: Path) -> None:
-    looks_file(path, [
-        ({}, {}, STORED[0]),
-        ({"xnCropping": cropping(0, 0, 40, 20)}, {}, STORED[1, :20, :40]),
-        ({"xnCropping": cropping(60, 0, 40, 20)}, {}, STORED[2, :20, :40]),
-        ({"xnCropping": cropping(60, 0, 40, 20, on=0)}, {}, STORED[3]),
-    ])  # fmt: skip
+    looks_file(
+        path,
+        [
+            ({}, {}, STORED[0]),
+            ({"xnCropping": cropping(0, 0, 40, 20)}, {}, STORED[1, :20, :40]),
+            ({"xnCropping": cropping(60, 0, 40, 20)}, {}, STORED[2, :20, :40]),
+            ({"xnCropping": cropping(60, 0, 40, 20, on=0)}, {}, STORED[3]),
+        ],
+    )
     expected = STORED[:4].copy()
     expected[1, 20:], expected[1, :, 40:], expected[2] = 0, 0, 0
     with open_recording(path) as recording:
         assert_frames(recording, expected)
-        assert recording.problems == ["frame 2 is damaged or not of 64 x 48 pixels, and was taken as wholly unread"]
+        assert recording.problems == [
+            "frame 2 is damaged or not of 64 x 48 pixels, and was taken as wholly unread"
+        ]
 
 
 def test_frames_of_another_size_or_unit_are_unread_and_told(path: Path) -> None:
-    looks_file(path, [
-        ({"xnMapOutputMode": mode(32, 24)}, {}, STORED[0, :24, :32]),
-        *(({"xnMapOutputMode": mode(64, 48)}, {}, frame) for frame in STORED[1:4]),
-        ({}, {"oniPixelFormat": 101}, STORED[4]),
-    ])  # fmt: skip
+    looks_file(
+        path,
+        [
+            ({"xnMapOutputMode": mode(32, 24)}, {}, STORED[0, :24, :32]),
+            *(({"xnMapOutputMode": mode(64, 48)}, {}, frame) for frame in STORED[1:4]),
+            ({}, {"oniPixelFormat": 101}, STORED[4]),
+        ],
+    )
     with open_recording(path) as recording:
         assert_frames(recording, np.stack([np.zeros((48, 64)), *STORED[1:4], np.zeros((48, 64))]))
-        assert recording.problems[0].startswith("2 of 5 frames have another size or unit than 64 x 48")
+        assert recording.problems[0].startswith(
+            "2 of 5 frames have another size or unit than 64 x 48"
+        )
 
 
 def test_depth_in_tenths_of_a_millimetre(path: Path) -> None:
@@ -355,12 +404,18 @@ def test_time_is_the_files_own_to_the_microsecond(path: Path) -> None:
         assert [(gap.start_frame, gap.n_frames_missing) for gap in recording.gaps] == [(3, 2)]
 
 
-@pytest.mark.parametrize(("wild", "says"), [(3, "out of order"), (2**63, "later than any clock"), (2**64 - 1, "later")])
-def test_a_stamp_that_cannot_be_is_told_and_does_not_drag_the_others(path: Path, wild: int, says: str) -> None:
+@pytest.mark.parametrize(
+    ("wild", "says"), [(3, "out of order"), (2**63, "later than any clock"), (2**64 - 1, "later")]
+)
+def test_a_stamp_that_cannot_be_is_told_and_does_not_drag_the_others(
+    path: Path, wild: int, says: str
+) -> None:
     times = [k * STEP_US for k in range(9)]
     depth_builder(payloads("NONE"), "NONE", times_us=[*times[:4], wild, *times[5:]]).write(path)
     with open_recording(path) as recording:
-        assert np.delete(recording.times_ns, 4).tolist() == [t * 1000 for t in np.delete(times, 4).tolist()]
+        assert np.delete(recording.times_ns, 4).tolist() == [
+            t * 1000 for t in np.delete(times, 4).tolist()
+        ]
         assert len(recording.problems) == 1
         assert "1 of 9" in recording.problems[0]
         assert says in recording.problems[0]
@@ -425,10 +480,15 @@ def test_a_size_that_the_frames_do_not_have_is_refused(path: Path) -> None:
         ((b"NI10", b"NI20"), "something else"),
         ((b"NI10\1\0\1\0", b"NI10\1\0\2\0"), "of version 1.0.2.0"),
         ((b"NI10\1\0\1\0\0", b"NI10\1\0\0\0\3"), "of version 1.0.0.3"),
-        ((struct.pack("<i", DEPTH) + b"16zT", struct.pack("<i", COLOUR) + b"16zT"), "its nodes are Depth"),
+        (
+            (struct.pack("<i", DEPTH) + b"16zT", struct.pack("<i", COLOUR) + b"16zT"),
+            "its nodes are Depth",
+        ),
     ],
 )
-def test_what_cannot_be_read_is_told_in_a_sentence(path: Path, change: tuple[bytes, bytes], says: str) -> None:
+def test_what_cannot_be_read_is_told_in_a_sentence(
+    path: Path, change: tuple[bytes, bytes], says: str
+) -> None:
     made = depth_builder(payloads("16zT"), "16zT")
     assert change[0] in made.content
     made.content = made.content.replace(*change)
@@ -460,7 +520,10 @@ def test_a_folder_around_one_file_is_that_file(path: Path) -> None:
 @pytest.mark.parametrize("table", [False, True])
 def test_a_cut_file_gives_the_frames_that_are_whole(path: Path, share: float, table: bool) -> None:
     made = depth_builder(payloads("16zT"), "16zT", table=table)
-    ends = [at + 40 + len(payload) for (_, at), payload in zip(made.frames[1], payloads("16zT"), strict=True)]
+    ends = [
+        at + 40 + len(payload)
+        for (_, at), payload in zip(made.frames[1], payloads("16zT"), strict=True)
+    ]
     cut(made.write(path), share)
     n = sum(end <= path.stat().st_size for end in ends)
     if not n:

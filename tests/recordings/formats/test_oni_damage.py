@@ -19,12 +19,18 @@ CODECS = ("16zT", "16zP", "NONE")
 
 @pytest.mark.parametrize("codec", CODECS)
 def test_a_damaged_frame_costs_only_itself(tmp_path: Path, codec: str) -> None:
-    made = depth_builder([plain_payload(frame, codec) for frame in STORED], codec, 32, 24, table=True)
+    made = depth_builder(
+        [plain_payload(frame, codec) for frame in STORED], codec, 32, 24, table=True
+    )
     made.record(0x0B)
     path = tmp_path / "r.oni"
     head = made.frames[1][5][1]
     for field, value in [(0, 7), (4, 0x1A), (12, 2**20), (16, 2**31), (16, 3), (16, 2**16)]:
-        content = made.content[: head + field] + struct.pack("<I", value) + made.content[head + field + 4 :]
+        content = (
+            made.content[: head + field]
+            + struct.pack("<I", value)
+            + made.content[head + field + 4 :]
+        )
         path.write_bytes(content)
         recording, sentence = opened_or_refused(path)
         assert recording is not None, sentence

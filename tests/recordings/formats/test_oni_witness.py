@@ -35,14 +35,18 @@ def test_openni2_plays_what_we_write(tmp_path: Path, codec: Codec) -> None:
     with open_recording(path) as recording:
         np.testing.assert_array_equal(played.times_us.astype(np.int64) * 1000, recording.times_ns)
     # the angle between the picture's edges
-    assert played.fov == pytest.approx((2 * np.arctan(160 / 285), 2 * np.arctan(120 / 287)), abs=1e-6)
+    assert played.fov == pytest.approx(
+        (2 * np.arctan(160 / 285), 2 * np.arctan(120 / 287)), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("codec", ["16zT", "16zP", "NONE"])
 def test_pictures_of_a_real_camera_survive_the_way_through_openni2(
     tmp_path: Path, reference_data: Path, codec: Codec
 ) -> None:
-    with open_recording(reference_data / "depth_files" / "xtion_open3d", camera=XTION, fps=30) as pictures:
+    with open_recording(
+        reference_data / "depth_files" / "xtion_open3d", camera=XTION, fps=30
+    ) as pictures:
         stored = np.stack([frame.depth for frame in pictures]).astype(np.uint16)
     path = write_oni_file(tmp_path / "r.oni", stored, XTION, codec=codec)
     np.testing.assert_array_equal(play(path).frames, stored)
@@ -71,7 +75,9 @@ def test_openni2_and_we_read_the_same_part_of_a_cropped_picture(tmp_path: Path) 
     played = play(path)
     assert played.frames.shape == (3, 20, 40)
     with open_recording(path) as recording:
-        np.testing.assert_array_equal([frame.depth[10:30, 5:45] for frame in recording], played.frames)
+        np.testing.assert_array_equal(
+            [frame.depth[10:30, 5:45] for frame in recording], played.frames
+        )
 
 
 def test_we_read_what_openni2_records_of_its_dummy_device(tmp_path: Path) -> None:
@@ -99,7 +105,9 @@ def test_we_read_what_openni2_packs_as_it_reads_it_itself(tmp_path: Path, seed: 
         assert recording.problems == []
         ours = np.stack([frame.depth for frame in recording])
         assert recording.camera.source == "field of view in the .oni file (xnFOV)"
-        assert [recording.camera.fx, recording.camera.fy] == pytest.approx([QVGA.fx, QVGA.fy], rel=1e-6)
+        assert [recording.camera.fx, recording.camera.fy] == pytest.approx(
+            [QVGA.fx, QVGA.fy], rel=1e-6
+        )
     np.testing.assert_array_equal(ours, played.frames)
     # its encoder changes some of the last pixels of a frame, and only those
     np.testing.assert_array_equal(ours[:, :-1], handed_out.frames[:, :-1])
@@ -110,6 +118,9 @@ def test_openni2_loses_the_last_pixels_of_a_frame_and_we_do_not(tmp_path: Path) 
     frames[:, -1, -1] = 702
     frames[:, 0, 0] = 701
     record(write_oni_file(tmp_path / "source.oni", frames, QVGA), tmp_path / "r.oni", 2)
-    with open_recording(tmp_path / "r.oni") as theirs, open_recording(tmp_path / "source.oni") as ours:
+    with (
+        open_recording(tmp_path / "r.oni") as theirs,
+        open_recording(tmp_path / "source.oni") as ours,
+    ):
         assert np.any(theirs.frame(0).depth[-1, -29:] != frames[0, -1, -29:])
         np.testing.assert_array_equal(ours.frame(0).depth, frames[0])

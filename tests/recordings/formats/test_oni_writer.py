@@ -12,7 +12,14 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.oni import writer as primesense_writer
 from liex_lab.recordings.formats.oni.writer import Codec, write_oni
-from tests.recordings.writers import SMALL, depth_frames, even_times, in_memory, write_mcap, write_oni_file
+from tests.recordings.writers import (
+    SMALL,
+    depth_frames,
+    even_times,
+    in_memory,
+    write_mcap,
+    write_oni_file,
+)
 
 STORED = depth_frames(6)
 
@@ -40,9 +47,9 @@ def test_what_is_written_is_read_again(path: Path, codec: Codec) -> None:
         assert recording.problems == []
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
         assert np.abs(recording.times_ns - np.array(times)).max() <= 500
-        assert [getattr(recording.camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")] == [
-            60.0, 61.0, 31.5, 23.5, 64, 48
-        ]  # fmt: skip
+        assert [
+            getattr(recording.camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")
+        ] == [60.0, 61.0, 31.5, 23.5, 64, 48]
         assert "liexIntrinsics" in recording.camera.source
     assert [entry.name for entry in path.parent.iterdir()] == ["r.oni"]
 
@@ -50,7 +57,12 @@ def test_what_is_written_is_read_again(path: Path, codec: Codec) -> None:
 def test_a_recording_goes_from_another_format_into_oni(path: Path) -> None:
     with open_recording(write_mcap(path.with_name("r.mcap"), STORED)) as recording:
         seen: list[tuple[int, int | None]] = []
-        assert write_oni(recording, path, progress=lambda done, total, what: seen.append((done, total))) == path
+        assert (
+            write_oni(
+                recording, path, progress=lambda done, total, what: seen.append((done, total))
+            )
+            == path
+        )
     assert seen == [(k + 1, 6) for k in range(6)]
     with open_recording(path) as recording:
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
@@ -95,7 +107,9 @@ def test_tenths_of_a_millimetre_are_kept(path: Path) -> None:
 def test_depths_too_large_for_the_code_are_refused(path: Path) -> None:
     far = STORED.copy()
     far[2, 0, 0] = 40_000
-    assert "frame 2 holds depths up to 40000 mm, and 16zP holds up to 32767 mm" in sentence(path, far, codec="16zP")
+    assert "frame 2 holds depths up to 40000 mm, and 16zP holds up to 32767 mm" in sentence(
+        path, far, codec="16zP"
+    )
     assert "steps of 0.1 mm" in sentence(path, far, unit_mm=0.1, codec="NONE")
     write_oni(in_memory(far), path)
     with open_recording(path) as recording:
@@ -120,7 +134,9 @@ def test_a_file_that_is_there_is_not_overwritten(path: Path) -> None:
         assert len(recording) == 6
 
 
-def test_a_place_that_cannot_be_written_is_told(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_that_cannot_be_written_is_told(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(RecordingError, match="there is no folder"):
         write_oni(in_memory(STORED), path / "in" / "r.oni")
 

@@ -25,7 +25,9 @@ STORED = depth_frames(4)
 
 @pytest.mark.parametrize("order", [">u2", "<u2"])
 @pytest.mark.parametrize("stated", [True, False])
-def test_pgm_is_read_in_the_byte_order_stated_or_plain_to_see(tmp_path: Path, order: str, stated: bool) -> None:
+def test_pgm_is_read_in_the_byte_order_stated_or_plain_to_see(
+    tmp_path: Path, order: str, stated: bool
+) -> None:
     name = "big" if order == ">u2" else "little"
     how = {"byte_order": name} if stated else {}
     folder = write_folder(tmp_path / "r", STORED, ".pgm", partial(write_pgm, order=order), **how)
@@ -44,7 +46,8 @@ def test_a_stated_byte_order_is_believed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "head", ["P5 {w} {h} 65535\n", "P5\n# a comment\n{w}\n#\n {h}\n4095 ", "P5\r\n{w}\t{h}\r\n65535\n"]
+    "head",
+    ["P5 {w} {h} 65535\n", "P5\n# a comment\n{w}\n#\n {h}\n4095 ", "P5\r\n{w}\t{h}\r\n65535\n"],
 )
 def test_pgm_headers_are_loose(tmp_path: Path, head: str) -> None:
     folder = write_folder(tmp_path / "r", STORED, ".pgm", partial(write_pgm, head=head))
@@ -90,7 +93,9 @@ XML = (
 )
 
 
-def test_pclzf_takes_its_camera_and_unit_from_the_xml_and_its_times_from_the_names(tmp_path: Path) -> None:
+def test_pclzf_takes_its_camera_and_unit_from_the_xml_and_its_times_from_the_names(
+    tmp_path: Path,
+) -> None:
     for k, second in enumerate(("55.814212", "56.068683", "56.100000")):
         write_pclzf(tmp_path / f"frame_20121214T1422{second}_depth.pclzf", STORED[k])
         write_pclzf(tmp_path / f"frame_20121214T1422{second}_rgb.pclzf", STORED[k], b"rgb24")
@@ -109,7 +114,9 @@ def test_pclzf_takes_its_camera_and_unit_from_the_xml_and_its_times_from_the_nam
     assert "8-bit rgb24" in refusal(tmp_path / "frame_20121214T142256.100000_rgb.pclzf")
 
 
-@pytest.mark.parametrize("text", ["", "<depth>", XML.format(z="nan"), XML.format(z="x"), "<depth></depth>", "&&&"])
+@pytest.mark.parametrize(
+    "text", ["", "<depth>", XML.format(z="nan"), XML.format(z="x"), "<depth></depth>", "&&&"]
+)
 def test_an_xml_that_tells_nothing_leaves_the_camera_unknown(tmp_path: Path, text: str) -> None:
     write_pclzf(tmp_path / "a_depth.pclzf", STORED[0])
     (tmp_path / "a.xml").write_text(text)
@@ -131,7 +138,9 @@ def test_the_encodings_of_data_sets() -> None:
 
 def test_an_encoding_is_stated_in_camera_toml(tmp_path: Path) -> None:
     stored = (STORED * 5).astype(np.uint16)
-    folder = write_folder(tmp_path / "r", stored, ".png", lambda p, f: cv2.imwrite(str(p), f), encoding="tum")
+    folder = write_folder(
+        tmp_path / "r", stored, ".png", lambda p, f: cv2.imwrite(str(p), f), encoding="tum"
+    )
     with open_recording(folder) as recording:
         np.testing.assert_allclose(recording.frame(1).depth, STORED[1], rtol=1e-6)
     write_camera(folder, encoding="nyu-hand")
@@ -146,8 +155,16 @@ def test_an_encoding_is_stated_in_camera_toml(tmp_path: Path) -> None:
     ("header", "row", "how"),
     [
         ("frame;stamp", "{k};{ms}", {"time_column": "stamp", "time_unit": "ms"}),
-        ("# timestamp filename", "{s} frame_{k}.png", {"time_column": "timestamp", "time_unit": "s"}),
-        ("# depth maps\n# timestamp filename", "{s} frame_{k}.png", {"time_column": 0, "time_unit": "s"}),
+        (
+            "# timestamp filename",
+            "{s} frame_{k}.png",
+            {"time_column": "timestamp", "time_unit": "s"},
+        ),
+        (
+            "# depth maps\n# timestamp filename",
+            "{s} frame_{k}.png",
+            {"time_column": 0, "time_unit": "s"},
+        ),
         ("", "frame_{k}.png,{us}", {"time_column": 1, "time_unit": "us"}),
         ("time_us", "{us}", {}),
     ],
@@ -159,7 +176,9 @@ def test_a_stamp_file_of_another_program_is_read_as_stated(
     write_camera(folder, SMALL, timestamps="stamps.txt", **how)
     times = [10**18 + k * 33_333_000 for k in range(4)]
     rows = [
-        row.format(k=k, s=f"{t // 10**9}.{t % 10**9:09d}", ms=f"{t // 10**6}.{t % 10**6:06d}", us=t // 1000)
+        row.format(
+            k=k, s=f"{t // 10**9}.{t % 10**9:09d}", ms=f"{t // 10**6}.{t % 10**6:06d}", us=t // 1000
+        )
         for k, t in enumerate(times)
     ]
     (folder / "stamps.txt").write_text("\n".join([*header.splitlines(), *rows]))
@@ -178,7 +197,9 @@ def test_a_stamp_file_of_another_program_is_read_as_stated(
         ({"time_unit": "min"}, '"ns", "us", "ms", "s"'),
     ],
 )
-def test_a_column_of_times_that_is_not_there_is_told(tmp_path: Path, how: dict[str, object], says: str) -> None:
+def test_a_column_of_times_that_is_not_there_is_told(
+    tmp_path: Path, how: dict[str, object], says: str
+) -> None:
     folder = write_folder(tmp_path / "r", STORED, ".pgm", write_pgm)
     (folder / "timestamps.csv").write_text("frame,stamp\n0,1.5\n1,2.5\n")
     write_camera(folder, SMALL, **how)
@@ -192,7 +213,9 @@ def test_the_stamps_of_a_file_come_before_those_in_names_and_a_rate(tmp_path: Pa
     for k, frame in enumerate(STORED):
         write_pgm(folder / f"d-1305031102.{175304 + k * 33333}-7.pgm", frame)
     with open_recording(folder, strict=True) as recording:
-        assert recording.times_ns.tolist() == [1305031102_175304000 + k * 33_333_000 for k in range(4)]
+        assert recording.times_ns.tolist() == [
+            1305031102_175304000 + k * 33_333_000 for k in range(4)
+        ]
         assert recording.metadata["session_start_time"].startswith("2011-05-10T12:38:22.175")
     write_times(folder, even_times(4))
     with open_recording(folder) as recording:

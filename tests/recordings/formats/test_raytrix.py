@@ -42,7 +42,16 @@ def png(path: Path, frame: np.ndarray) -> None:
 def test_the_shipped_profiles_state_every_key_and_are_told_as_unconfirmed() -> None:
     for name, table in shipped_profiles().items():
         profile = Profile(name=name, **table)
-        assert {"kind", "stored", "unit_mm", "offset_mm", "sign", "invalid", "valid_mm", "evidence"} <= set(table)
+        assert {
+            "kind",
+            "stored",
+            "unit_mm",
+            "offset_mm",
+            "sign",
+            "invalid",
+            "valid_mm",
+            "evidence",
+        } <= set(table)
         assert profile.doubt is not None
         assert profile.evidence in profile.doubt
 
@@ -57,7 +66,11 @@ def test_float_maps_are_negative_millimetres(tmp_path: Path) -> None:
         assert recording.format == "raytrix"
         assert [problem for problem in recording.problems if "not confirmed" in problem]
         profile = recording.metadata["profile"]
-        assert (profile["name"], profile["sign"], profile["unit_mm"]) == ("raytrix-f32-negative-mm", -1, 1.0)
+        assert (profile["name"], profile["sign"], profile["unit_mm"]) == (
+            "raytrix-f32-negative-mm",
+            -1,
+            1.0,
+        )
 
 
 def test_sixteen_bits_are_ten_micrometres(tmp_path: Path) -> None:
@@ -110,7 +123,9 @@ def test_a_profile_may_be_stated_in_full_and_a_part_of_one_is_not_enough(tmp_pat
     (folder / "raytrix.toml").write_text('kind = "metric"\n')
     assert "is not stated" in refusal(folder)
     table = shipped_profiles()["raytrix-f32-negative-mm"]
-    lines = [f"{key} = {str(value) if key == 'invalid' else repr(value)}" for key, value in table.items()]
+    lines = [
+        f"{key} = {str(value) if key == 'invalid' else repr(value)}" for key, value in table.items()
+    ]
     (folder / "raytrix.toml").write_text("\n".join(lines))
     with open_recording(folder) as recording:
         np.testing.assert_array_equal(recording.frame(1).depth, STORED[1])
@@ -165,15 +180,25 @@ def test_virtual_depth_without_a_calibration_is_refused_with_the_reason(tmp_path
 def test_virtual_depth_with_a_calibration_obeys_the_thin_lens(tmp_path: Path, raw: bool) -> None:
     f, to_grid, gap = 35.0, 34.0, 1.0
     distance = np.where(STORED > 0, STORED, np.nan).astype(float)
-    v = (distance * f / (distance - f) - to_grid) / gap  # 1 / f = 1 / distance + 1 / image, image = to_grid + v gap
+    v = (
+        distance * f / (distance - f) - to_grid
+    ) / gap  # 1 / f = 1 / distance + 1 / image, image = to_grid + v gap
     stored = np.nan_to_num(1.0 - 1.0 / v if raw else v).astype(np.float32)
-    more = f"lens_f_mm = {f}\nlens_to_grid_mm = {to_grid}\ngrid_to_sensor_mm = {gap}\n" + 'virtual = "raw"\n' * raw
+    more = (
+        f"lens_f_mm = {f}\nlens_to_grid_mm = {to_grid}\ngrid_to_sensor_mm = {gap}\n"
+        + 'virtual = "raw"\n' * raw
+    )
     folder = write_raytrix(tmp_path, stored, "raytrix-virtual", ".tif", write_tiff, more)
     with open_recording(folder) as recording:
         np.testing.assert_allclose([frame.depth for frame in recording], STORED, rtol=2e-4)
 
 
-XYZ: list[dict[str, Any]] = [{}, {"separator": ","}, {"separator": "; "}, {"separator": "\t", "header": "x\ty\tz"}]
+XYZ: list[dict[str, Any]] = [
+    {},
+    {"separator": ","},
+    {"separator": "; "},
+    {"separator": "\t", "header": "x\ty\tz"},
+]
 
 
 @pytest.mark.parametrize("how", XYZ)
@@ -185,7 +210,9 @@ def test_points_as_text_are_seen_by_the_camera(tmp_path: Path, how: dict[str, An
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_points_as_ply_are_seen_by_the_camera(tmp_path: Path, form: str) -> None:
-    folder = write_raytrix(tmp_path, STORED, "raytrix-points-mm", ".ply", partial(write_ply, form=form))
+    folder = write_raytrix(
+        tmp_path, STORED, "raytrix-points-mm", ".ply", partial(write_ply, form=form)
+    )
     with open_recording(folder, strict=True) as recording:
         np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
 

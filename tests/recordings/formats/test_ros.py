@@ -16,15 +16,26 @@ from rosbags.highlevel import AnyReader
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings import open_recording
 from tests.recordings.asking import opened_or_refused, refusal
-from tests.recordings.ros_writers import How, ros_messages, store, write_bag, write_db3, write_ros_mcap
+from tests.recordings.ros_writers import (
+    How,
+    ros_messages,
+    store,
+    write_bag,
+    write_db3,
+    write_ros_mcap,
+)
 from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times
 
 STORED = depth_frames(9)
 FLOATS = STORED.astype(np.float32) / 1000
 Writer = Callable[..., Path]
 WRITERS: dict[str, Writer] = {
-    "mcap, ROS 1": lambda folder, frames, **how: write_ros_mcap(folder / "r.mcap", frames, 1, **how),
-    "mcap, ROS 2": lambda folder, frames, **how: write_ros_mcap(folder / "r.mcap", frames, 2, **how),
+    "mcap, ROS 1": lambda folder, frames, **how: write_ros_mcap(
+        folder / "r.mcap", frames, 1, **how
+    ),
+    "mcap, ROS 2": lambda folder, frames, **how: write_ros_mcap(
+        folder / "r.mcap", frames, 2, **how
+    ),
     "bag": lambda folder, frames, **how: write_bag(folder / "r.bag", frames, **how),
     "db3": lambda folder, frames, **how: write_db3(folder / "r", frames, **how),
 }
@@ -50,9 +61,13 @@ def test_sixteen_bits_are_millimetres(write: Writer, kind: str) -> None:
 @pytest.mark.parametrize("big_endian", [False, True])
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("frames", [STORED, FLOATS])
-def test_either_byte_order_and_padded_rows(write: Writer, frames: Any, big_endian: bool, padding: int) -> None:
+def test_either_byte_order_and_padded_rows(
+    write: Writer, frames: Any, big_endian: bool, padding: int
+) -> None:
     kind = "16UC1" if frames is STORED else "32FC1"
-    with open_recording(write(frames, kind=kind, big_endian=big_endian, padding=padding)) as recording:
+    with open_recording(
+        write(frames, kind=kind, big_endian=big_endian, padding=padding)
+    ) as recording:
         np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-4)
 
 
@@ -116,7 +131,9 @@ def test_pictures_come_before_the_clouds_made_of_them(tmp_path: Path) -> None:
 
 
 def test_infrared_is_not_taken_for_depth(write: Writer) -> None:
-    path = write(kind="mono16", topics=("/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw"))
+    path = write(
+        kind="mono16", topics=("/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw")
+    )
     with open_recording(path) as recording:
         assert recording.camera.source.endswith("/camera/depth/camera_info")
     with open_recording(path, topic="/camera/infra1/image_rect_raw") as recording:
@@ -144,7 +161,9 @@ def test_a_file_without_stamps_has_the_times_of_logging(write: Writer) -> None:
 
 
 def test_distortion_belongs_to_the_camera_unless_the_picture_is_straightened(write: Writer) -> None:
-    path = write(distortion=(0.1, 0.0, 0.0, 0.0, 0.0), topics=("/d/image_raw", "/straight/image_rect_raw"))
+    path = write(
+        distortion=(0.1, 0.0, 0.0, 0.0, 0.0), topics=("/d/image_raw", "/straight/image_rect_raw")
+    )
     with open_recording(path, topic="/d/image_raw") as recording:
         assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
     with open_recording(path, topic="/straight/image_rect_raw") as recording:
@@ -152,21 +171,29 @@ def test_distortion_belongs_to_the_camera_unless_the_picture_is_straightened(wri
 
 
 def test_points_are_straight_already(write: Writer) -> None:
-    with open_recording(write(kind="loose cloud", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))) as recording:
+    with open_recording(
+        write(kind="loose cloud", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
+    ) as recording:
         assert recording.camera.distortion is None
         np.testing.assert_allclose(recording.frame(2).depth, STORED[2], atol=1e-3)
 
 
 def test_a_distortion_that_is_not_known_is_told(write: Writer) -> None:
-    with open_recording(write(model="Inverse Brown Conrady", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))) as recording:
+    with open_recording(
+        write(model="Inverse Brown Conrady", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
+    ) as recording:
         assert recording.camera.distortion is None
         assert "Inverse Brown Conrady" in recording.problems[0]
 
 
 @pytest.mark.parametrize("compression", [*CompressionType])
 @pytest.mark.parametrize("use_chunking", [True, False])
-def test_every_packing_of_an_mcap_reads_alike(tmp_path: Path, compression: Any, use_chunking: bool) -> None:
-    path = write_ros_mcap(tmp_path / "r.mcap", STORED, compression=compression, use_chunking=use_chunking)
+def test_every_packing_of_an_mcap_reads_alike(
+    tmp_path: Path, compression: Any, use_chunking: bool
+) -> None:
+    path = write_ros_mcap(
+        tmp_path / "r.mcap", STORED, compression=compression, use_chunking=use_chunking
+    )
     with open_recording(path, strict=True) as recording:
         for index in (8, 3, 4, 0):
             np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
@@ -174,7 +201,9 @@ def test_every_packing_of_an_mcap_reads_alike(tmp_path: Path, compression: Any, 
 
 @pytest.mark.parametrize("compression", ["lz4", "bz2", None])
 @pytest.mark.parametrize("chunk_bytes", [1, 1 << 20])
-def test_every_packing_of_a_bag_reads_alike(tmp_path: Path, compression: str | None, chunk_bytes: int) -> None:
+def test_every_packing_of_a_bag_reads_alike(
+    tmp_path: Path, compression: str | None, chunk_bytes: int
+) -> None:
     path = write_bag(tmp_path / "r.bag", STORED, compression=compression, chunk_bytes=chunk_bytes)
     with open_recording(path, strict=True) as recording:
         for index in (8, 3, 4, 0):
@@ -186,7 +215,9 @@ def test_it_agrees_with_the_reader_of_rosbags(tmp_path: Path, writer: str) -> No
     path = WRITERS[writer](tmp_path, STORED, log_delay_ns=5_000_000)
     with AnyReader([path]) as reader, open_recording(path) as recording:
         depth = [c for c in reader.connections if c.msgtype.endswith("/Image")]
-        messages: list[Any] = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(depth)]
+        messages: list[Any] = [
+            reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(depth)
+        ]
         assert len(messages) == len(recording)
         for frame, message in zip(recording, messages, strict=True):
             assert frame.time_ns == message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
@@ -194,7 +225,9 @@ def test_it_agrees_with_the_reader_of_rosbags(tmp_path: Path, writer: str) -> No
 
 
 @pytest.mark.parametrize(("unit_m", "step_mm"), [(0.001, 1.0), (0.00025, 0.25), (0.0001, 0.1)])
-def test_a_realsense_recording_states_its_unit(tmp_path: Path, unit_m: float, step_mm: float) -> None:
+def test_a_realsense_recording_states_its_unit(
+    tmp_path: Path, unit_m: float, step_mm: float
+) -> None:
     topic = "/device_0/sensor_0/Depth_0/image/data"
     path = write_bag(tmp_path / "r.bag", STORED, kind="mono16", topics=(topic,), unit_m=unit_m)
     with open_recording(path) as recording:
@@ -202,7 +235,9 @@ def test_a_realsense_recording_states_its_unit(tmp_path: Path, unit_m: float, st
 
 
 @pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 15).round(3).tolist())
-@pytest.mark.parametrize(("compression", "n_lost"), [("lz4", 13), (None, 3)])  # lz4 packs 64 kB at once: 11 pictures
+@pytest.mark.parametrize(
+    ("compression", "n_lost"), [("lz4", 13), (None, 3)]
+)  # lz4 packs 64 kB at once: 11 pictures
 def test_a_cut_bag_gives_the_frames_that_are_whole(
     tmp_path: Path, share: float, compression: str | None, n_lost: int
 ) -> None:
@@ -220,7 +255,9 @@ def test_a_cut_bag_gives_the_frames_that_are_whole(
     with recording:
         assert recording.truncated
         assert len(recording) >= int(share * len(stored)) - n_lost
-        np.testing.assert_array_equal([frame.depth for frame in recording], stored[: len(recording)])
+        np.testing.assert_array_equal(
+            [frame.depth for frame in recording], stored[: len(recording)]
+        )
 
 
 def test_a_cut_db3_gives_frames_or_a_sentence(tmp_path: Path) -> None:
@@ -233,7 +270,9 @@ def test_a_cut_db3_gives_frames_or_a_sentence(tmp_path: Path) -> None:
             continue
         with recording:
             assert recording.truncated
-            np.testing.assert_array_equal([frame.depth for frame in recording], STORED[: len(recording)])
+            np.testing.assert_array_equal(
+                [frame.depth for frame in recording], STORED[: len(recording)]
+            )
 
 
 @pytest.mark.parametrize(
@@ -246,7 +285,9 @@ def test_a_cut_db3_gives_frames_or_a_sentence(tmp_path: Path) -> None:
         ("r.db3", b"SQLite format 3\0" + bytes(5000), "holds no depth pictures"),
     ],
 )
-def test_what_is_no_bag_is_told_in_a_sentence(tmp_path: Path, name: str, content: bytes, says: str) -> None:
+def test_what_is_no_bag_is_told_in_a_sentence(
+    tmp_path: Path, name: str, content: bytes, says: str
+) -> None:
     (tmp_path / name).write_bytes(content)
     assert says in refusal(tmp_path / name)
 

@@ -19,7 +19,13 @@ from liex_lab.recordings.formats.video.video import open_video
 from liex_lab.runtime.progress import silent
 from tests.oracles import ffv1
 from tests.recordings.asking import refusal
-from tests.recordings.video_writers import even_ms, factory_calibration, write_avi, write_mkv, write_video_session
+from tests.recordings.video_writers import (
+    even_ms,
+    factory_calibration,
+    write_avi,
+    write_mkv,
+    write_video_session,
+)
 from tests.recordings.writers import SMALL, cut, depth_frames, write_archive, write_camera
 
 STORED = depth_frames(30)
@@ -46,14 +52,22 @@ def test_pyav_finds_the_same_pictures_at_the_same_times(tmp_path: Path) -> None:
         assert len(theirs) == len(ours)
         for index, frame in enumerate(theirs):
             np.testing.assert_array_equal(ours.read(index), frame.to_ndarray())
-            assert ours.track.times_ns[index] == round((frame.pts or 0) * (frame.time_base or 0) * 10**9)
+            assert ours.track.times_ns[index] == round(
+                (frame.pts or 0) * (frame.time_base or 0) * 10**9
+            )
         ours.close()
 
 
 def test_opencv_writes_what_is_read(tmp_path: Path) -> None:
     size = (64, 48)
-    writer = cv2.VideoWriter(str(tmp_path / "depth.avi"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"FFV1"), 30.0, size,
-                             [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0])  # fmt: skip
+    writer = cv2.VideoWriter(
+        str(tmp_path / "depth.avi"),
+        cv2.CAP_FFMPEG,
+        cv2.VideoWriter.fourcc(*"FFV1"),
+        30.0,
+        size,
+        [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0],
+    )
     assert writer.isOpened()
     for frame in STORED:
         writer.write(frame)
@@ -67,14 +81,20 @@ def test_check_sums_agree_with_their_slow_twin(data: bytes, sealed: bool) -> Non
     if sealed:  # length, no error, and the check sum that makes all of it 0
         body = data + len(data).to_bytes(3, "big") + b"\0"
         data = body + ffv1.remainder(body).to_bytes(4, "big")
-    assert slices_agree(np.frombuffer(data, np.uint8), crc_table()) == ffv1.slices_agree(data) == sealed
+    assert (
+        slices_agree(np.frombuffer(data, np.uint8), crc_table())
+        == ffv1.slices_agree(data)
+        == sealed
+    )
 
 
 def test_key_pictures_are_told_by_their_first_bytes(tmp_path: Path) -> None:
     path = write_avi(tmp_path / "a.avi", STORED, gop=7)
     with av.open(str(path)) as container:
         packets = [packet for packet in container.demux(video=0) if packet.size]
-        assert [is_key(bytes(packet)[:2]) for packet in packets] == [packet.is_keyframe for packet in packets]
+        assert [is_key(bytes(packet)[:2]) for packet in packets] == [
+            packet.is_keyframe for packet in packets
+        ]
 
 
 def test_a_damaged_picture_costs_those_that_build_on_it_and_no_others(tmp_path: Path) -> None:
@@ -89,7 +109,9 @@ def test_a_damaged_picture_costs_those_that_build_on_it_and_no_others(tmp_path: 
         for _ in range(2):
             for frame in recording:
                 lost = 13 <= frame.index < 20
-                np.testing.assert_array_equal(frame.depth, np.zeros((48, 64)) if lost else STORED[frame.index])
+                np.testing.assert_array_equal(
+                    frame.depth, np.zeros((48, 64)) if lost else STORED[frame.index]
+                )
         assert len(recording.problems) == 7
 
 
@@ -101,14 +123,18 @@ def test_a_cut_video_gives_its_whole_pictures(tmp_path: Path, video: str, share:
     with open_recording(folder) as recording:
         assert recording.truncated
         assert share * 30 - 7 < len(recording) < share * 30 + 1
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED[: len(recording)])
+        np.testing.assert_array_equal(
+            [frame.depth for frame in recording], STORED[: len(recording)]
+        )
         assert any("cut or damaged" in problem for problem in recording.problems)
     assert "cut short" in refusal(folder, strict=True)
 
 
 def test_a_recorder_that_was_stopped_leaves_a_file_that_reads(tmp_path: Path) -> None:
     folder = write_video_session(tmp_path / "mkv", STORED, "depth.mkv", live=True, groups=True)
-    with open_recording(folder, strict=True) as recording:  # of open size: nothing says that anything is missing
+    with open_recording(
+        folder, strict=True
+    ) as recording:  # of open size: nothing says that anything is missing
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
     content = bytearray(write_avi(tmp_path / "a.avi", STORED).read_bytes())
     for name in (b"RIFF", b"movi"):  # the lengths that are filled in at the end, and the index
@@ -165,12 +191,21 @@ def test_azure_says_its_intrinsics_itself(tmp_path: Path, mode: Mode) -> None:
     width, height = mode.width, mode.height
     frames = np.full((2, height, width), 700, np.uint16)
     attached = {"calibration.json": factory_calibration()}
-    path = write_mkv(tmp_path / "a.mkv", frames, titles=("DEPTH",), tags={"K4A_DEPTH_MODE": "X"}, attachments=attached)
+    path = write_mkv(
+        tmp_path / "a.mkv",
+        frames,
+        titles=("DEPTH",),
+        tags={"K4A_DEPTH_MODE": "X"},
+        attachments=attached,
+    )
     with open_recording(path) as recording:
         camera = recording.camera
         assert "factory calibration" in camera.source
         assert recording.problems == []
-    if (width, height) == (640, 576):  # as the camera's own software gives them for these factory numbers
+    if (width, height) == (
+        640,
+        576,
+    ):  # as the camera's own software gives them for these factory numbers
         np.testing.assert_allclose([camera.cx, camera.cy], [332.064270, 325.880615], atol=1e-4)
         np.testing.assert_allclose([camera.fx, camera.fy], [503.927643, 503.978729], atol=1e-4)
     binned = 2 if width in (320, 512) else 1
@@ -183,9 +218,17 @@ def test_azure_says_its_intrinsics_itself(tmp_path: Path, mode: Mode) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"{", b"[]", b'{"CalibrationInformation": {"Cameras": [3]}}', b"\xff\xfe", b"[" * 100_000,
-     factory_calibration().replace(b"0.5122697949409485", b"NaN"), factory_calibration().replace(b"0.492", b"-0.492")],
-)  # fmt: skip
+    [
+        b"",
+        b"{",
+        b"[]",
+        b'{"CalibrationInformation": {"Cameras": [3]}}',
+        b"\xff\xfe",
+        b"[" * 100_000,
+        factory_calibration().replace(b"0.5122697949409485", b"NaN"),
+        factory_calibration().replace(b"0.492", b"-0.492"),
+    ],
+)
 def test_a_calibration_that_makes_no_sense_is_none(data: bytes) -> None:
     assert read_calibration(data) is None
 
@@ -197,10 +240,14 @@ def test_metadata_name_the_camera(tmp_path: Path) -> None:
     size = [640, 576]
     (folder / "metadata.json").write_text(json.dumps({"DepthResolution": size}))
     assert "a camera that is not known" in refusal(folder)
-    (folder / "metadata.json").write_text(json.dumps({"DepthResolution": size, "CameraType": "k4a"}))
+    (folder / "metadata.json").write_text(
+        json.dumps({"DepthResolution": size, "CameraType": "k4a"})
+    )
     with open_recording(folder) as recording:
         assert recording.camera.source == "typical Azure Kinect, NFOV_UNBINNED"
-    (folder / "metadata.json").write_text(json.dumps({"DepthResolution": [64, 48], "camera": "RealSense D435"}))
+    (folder / "metadata.json").write_text(
+        json.dumps({"DepthResolution": [64, 48], "camera": "RealSense D435"})
+    )
     sentence = refusal(folder)
     assert "'RealSense D435'" in sentence
     assert "camera.toml" in sentence
@@ -232,7 +279,9 @@ def test_a_day_in_the_file_is_the_day_of_the_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("video", ["depth.avi", "depth.mkv"])
 def test_a_video_may_lie_in_an_archive(tmp_path: Path, video: str) -> None:
-    archive = write_archive(write_video_session(tmp_path / "s", STORED, video), tmp_path / "s.tar.gz")
+    archive = write_archive(
+        write_video_session(tmp_path / "s", STORED, video), tmp_path / "s.tar.gz"
+    )
     with open_recording(archive, strict=True) as recording:
         np.testing.assert_array_equal(recording.frame(17).depth, STORED[17])
 
@@ -240,7 +289,9 @@ def test_a_video_may_lie_in_an_archive(tmp_path: Path, video: str) -> None:
 def test_videos_for_people_are_refused(tmp_path: Path) -> None:
     grey = write_avi(tmp_path / "grey.avi", (STORED >> 2).astype(np.uint8), pixels="gray")
     assert "got an 8-bit gray image of 64 x 48" in refusal(grey, camera=SMALL)
-    writer = cv2.VideoWriter(str(tmp_path / "colour.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 48))
+    writer = cv2.VideoWriter(
+        str(tmp_path / "colour.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 48)
+    )
     writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
     assert "packed with 'MJPG'" in refusal(tmp_path / "colour.avi", camera=SMALL)
@@ -253,4 +304,6 @@ def test_the_depth_is_the_track_that_says_so(tmp_path: Path) -> None:
     path = write_mkv(tmp_path / "b.mkv", STORED, titles=("first", "second"))
     with open_recording(path, camera=SMALL) as recording:
         np.testing.assert_array_equal(recording.frame(3).depth, STORED[3] // 2)
-    assert "no video track" in refusal(write_mkv(tmp_path / "c.mkv", STORED, titles=()), camera=SMALL)
+    assert "no video track" in refusal(
+        write_mkv(tmp_path / "c.mkv", STORED, titles=()), camera=SMALL
+    )

@@ -22,8 +22,11 @@ from liex_lab.recordings.timestamps import Settled, from_rate, match_counts, set
 from liex_lab.runtime.progress import Progress, silent
 
 KINDS: dict[str, tuple[str, ...]] = {  # of pictures: how their files' names end
-    "PNG": (".png",), "TIFF": (".tif", ".tiff"), "PGM": (".pgm",), "PCLZF": (".pclzf",),
-}  # fmt: skip
+    "PNG": (".png",),
+    "TIFF": (".tif", ".tiff"),
+    "PGM": (".pgm",),
+    "PCLZF": (".pclzf",),
+}
 SUFFIXES = tuple(suffix for kind in KINDS.values() for suffix in kind)
 _EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".gif", ".webp")
 _COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one beside every depth picture
@@ -32,7 +35,9 @@ _COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one beside every depth pict
 class Pictures:
     """Pictures as depth: a cut or damaged one is wholly unread, and `problems` says so once."""
 
-    def __init__(self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]) -> None:
+    def __init__(
+        self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]
+    ) -> None:
         """decode: stored values of one picture -> depth (H, W) float32 mm."""
         self.stack, self.problems = stack, problems
         self._decode = decode
@@ -45,14 +50,20 @@ class Pictures:
             return self._decode(stored)
         if index not in self._bad:
             self._bad.add(index)
-            self.problems.append(f"frame {index} ({self.stack.label(index)}) is damaged and was taken as wholly unread")
+            self.problems.append(
+                f"frame {index} ({self.stack.label(index)}) is damaged and was taken as wholly unread"
+            )
         return np.zeros((self.stack.height, self.stack.width), np.float32)
 
 
 def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     """The kind of the depth pictures of a folder, and they in natural order: frame_2 before frame_10."""
     inside = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    chosen = [path for path in inside if fnmatch(path.name, pattern) and not path.name.endswith(_COLOUR_PCLZF)]
+    chosen = [
+        path
+        for path in inside
+        if fnmatch(path.name, pattern) and not path.name.endswith(_COLOUR_PCLZF)
+    ]
     kinds = {kind: [p for p in chosen if p.suffix.lower() in ends] for kind, ends in KINDS.items()}
     found = [kind for kind, files in kinds.items() if files]
     if len(found) > 1:
@@ -67,7 +78,9 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
             f"in {folder}; give the folder of the camera's depth pictures"
         )
     if not found:
-        raise RecordingError(f"no picture in {folder} fits pattern = {pattern!r}; correct it in camera.toml")
+        raise RecordingError(
+            f"no picture in {folder} fits pattern = {pattern!r}; correct it in camera.toml"
+        )
     return found[0], sorted(kinds[found[0]], key=lambda path: natural_key(path.name))
 
 
@@ -123,13 +136,19 @@ class Folder:
         _refuse_negative(stack, self.decode, told)
         stated_in = [self.folder / CAMERA_FILE, self.folder / told.timestamps, *self.beside]
         return Recording(
-            name=path.resolve().stem if path.is_file() else path.resolve().name, format=format, camera=the_camera,
-            times_ns=settled.times_ns, read=Pictures(stack, self.decode, problems).read,
-            sources=[*self.files, *(file for file in stated_in if file.is_file())], problems=problems,
-            truncated=stack.truncated, n_whole=sum(stack.whole[: len(settled.times_ns)]),
+            name=path.resolve().stem if path.is_file() else path.resolve().name,
+            format=format,
+            camera=the_camera,
+            times_ns=settled.times_ns,
+            read=Pictures(stack, self.decode, problems).read,
+            sources=[*self.files, *(file for file in stated_in if file.is_file())],
+            problems=problems,
+            truncated=stack.truncated,
+            n_whole=sum(stack.whole[: len(settled.times_ns)]),
             metadata=({"session_start_time": start} if start else {}) | told.metadata,
-            close=stack.close, faults=settled.faults,
-        )  # fmt: skip
+            close=stack.close,
+            faults=settled.faults,
+        )
 
     @property
     def folder(self) -> Path:
@@ -151,7 +170,10 @@ class Folder:
                 )
             problems += [counts] if counts else []
             moment = True
-        elif len(self.files) == n and (named := name_times([file.name for file in self.files])) is not None:
+        elif (
+            len(self.files) == n
+            and (named := name_times([file.name for file in self.files])) is not None
+        ):
             times, moment = named
         else:
             hz = rate(fps, "the call") or self.told.fps
@@ -185,9 +207,11 @@ def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
     unit_mm = found.pop("unit_mm")
     stated = camera_file.path.is_file()
     return replace(
-        camera_file, intrinsics=found, unit_mm=camera_file.unit_mm if stated else unit_mm,
+        camera_file,
+        intrinsics=found,
+        unit_mm=camera_file.unit_mm if stated else unit_mm,
         source="the XML files beside the pictures",
-    )  # fmt: skip
+    )
 
 
 def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: Progress) -> Stack:
@@ -224,7 +248,9 @@ def _say_cut(stack: Stack) -> list[str]:
     ]
 
 
-def _refuse_negative(stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile) -> None:
+def _refuse_negative(
+    stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile
+) -> None:
     """Float pictures may count away from the camera with a minus sign; nothing would be left of them unread."""
     stored = stack.read(stack.whole.index(True))
     if stored is None or stored.dtype.kind != "f" or decode(stored).any():

@@ -52,7 +52,11 @@ def looks_like_nyu(folder: Path, names: list[str]) -> bool:
 
 
 def open_nyu(
-    path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent, view: int = VIEW
+    path: Path,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    progress: Progress = silent,
+    view: int = VIEW,
 ) -> Recording:
     """A folder of `depth_K_NNNNNNN.png` (K is the view), or one such picture, as a recording."""
     folder = path if path.is_dir() else path.parent
@@ -60,10 +64,13 @@ def open_nyu(
     files = _pictures(folder, view) if path.is_dir() else [path]
     stack = open_pngs(files, progress, colour=True)
     told = replace(
-        told, encoding=COLOUR, fps=told.fps or _NOMINAL_HZ,
-        intrinsics=told.intrinsics or {name: getattr(NYU_CAMERA, name) for name in ("fx", "fy", "cx", "cy")},
+        told,
+        encoding=COLOUR,
+        fps=told.fps or _NOMINAL_HZ,
+        intrinsics=told.intrinsics
+        or {name: getattr(NYU_CAMERA, name) for name in ("fx", "fy", "cx", "cy")},
         source=told.source if told.intrinsics else NYU_CAMERA.source,
-    )  # fmt: skip
+    )
     return Folder(path, files, told, stack, told.decode).recording("nyu", camera, fps)
 
 
@@ -91,20 +98,43 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
     path = folder / JOINT_FILE if folder.is_dir() else folder
     wanted = ["joint_uvd", "joint_xyz", "joint_names"]
     if not path.is_file():
-        raise RecordingError(f"there is no {JOINT_FILE} in {folder}; copy it there from the data set")
+        raise RecordingError(
+            f"there is no {JOINT_FILE} in {folder}; copy it there from the data set"
+        )
     try:
         found: dict[str, Any] = loadmat(path, variable_names=wanted)
-    except (MatReadError, NotImplementedError, ValueError, TypeError, OSError, EOFError, MemoryError) as error:
-        raise RecordingError(f"{path} should be the NYU data set's MATLAB file, but: {error}; copy it again") from None
+    except (
+        MatReadError,
+        NotImplementedError,
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        MemoryError,
+    ) as error:
+        raise RecordingError(
+            f"{path} should be the NYU data set's MATLAB file, but: {error}; copy it again"
+        ) from None
     missing = [name for name in wanted if name not in found]
     if missing:
-        raise RecordingError(f"{path} does not hold {', '.join(missing)}; give the data set's own {JOINT_FILE}")
+        raise RecordingError(
+            f"{path} does not hold {', '.join(missing)}; give the data set's own {JOINT_FILE}"
+        )
     uvd, xyz = (np.asarray(found[name]) for name in wanted[:2])
-    if uvd.ndim != 4 or uvd.shape != xyz.shape or uvd.shape[2:] != (N_JOINTS, 3) or uvd.shape[0] < view:
+    if (
+        uvd.ndim != 4
+        or uvd.shape != xyz.shape
+        or uvd.shape[2:] != (N_JOINTS, 3)
+        or uvd.shape[0] < view
+    ):
         raise RecordingError(
             f"{path} should hold joints of the shape (views, frames, {N_JOINTS}, 3), but they have {uvd.shape} and "
             f"{xyz.shape}; give the data set's own {JOINT_FILE}"
         )
-    names = tuple(str(np.asarray(name).ravel()[0]) for name in np.asarray(found["joint_names"]).ravel())
+    names = tuple(
+        str(np.asarray(name).ravel()[0]) for name in np.asarray(found["joint_names"]).ravel()
+    )
     upright = np.array([1.0, -1.0, 1.0])
-    return NyuJoints(names, uvd[view - 1].astype(np.float64), xyz[view - 1].astype(np.float64) * upright)
+    return NyuJoints(
+        names, uvd[view - 1].astype(np.float64), xyz[view - 1].astype(np.float64) * upright
+    )

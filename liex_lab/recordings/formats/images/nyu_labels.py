@@ -41,7 +41,22 @@ POINTS: dict[str, dict[str, float]] = {
     "wrist_b": {"wrist_left": 1.0},
     "palm": {"palm": 1.0},
 }
-NYU_IDS = (0, 3, 6, 9, 12, 15, 18, 21, 24, 25, 27, 30, 31, 32)  # of the data set's 36 points, from 0
+NYU_IDS = (
+    0,
+    3,
+    6,
+    9,
+    12,
+    15,
+    18,
+    21,
+    24,
+    25,
+    27,
+    30,
+    31,
+    32,
+)  # of the data set's 36 points, from 0
 _LITTLE_WRIST, _THUMB_WRIST = 11, 12
 _START_BEND = 0.3  # rad: a straight finger does not know which way to bend
 
@@ -83,13 +98,23 @@ class NyuReference:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as table:
                 truth = uvd_to_mm(table["groundtruth_uvd"])
-                found = {name.removesuffix("_uvd"): uvd_to_mm(table[name]) for name in table.files if "_uvd" in name}
+                found = {
+                    name.removesuffix("_uvd"): uvd_to_mm(table[name])
+                    for name in table.files
+                    if "_uvd" in name
+                }
                 names = [str(name) for name in table["joint_names"]]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise LiexError(f"{path} is not a whole file of NYU labels ({error}); copy it anew") from None
+            raise LiexError(
+                f"{path} is not a whole file of NYU labels ({error}); copy it anew"
+            ) from None
         if names != list(POINTS) or truth.shape[1:] != (len(POINTS), 3):
-            raise LiexError(f"{path} should label {', '.join(POINTS)}, in this order, but labels {', '.join(names)}")
-        return NyuReference(truth, {name: points for name, points in found.items() if name != "groundtruth"})
+            raise LiexError(
+                f"{path} should label {', '.join(POINTS)}, in this order, but labels {', '.join(names)}"
+            )
+        return NyuReference(
+            truth, {name: points for name, points in found.items() if name != "groundtruth"}
+        )
 
 
 def fit_hands(skeleton: Skeleton, points: Array) -> Fit:

@@ -27,8 +27,11 @@ _HEADER = struct.Struct("<5sII16sII")  # magic, width, height, type, bytes packe
 _DEPTH = "depth16"
 _XML_BYTES = 1 << 16
 _INTRINSICS = {  # element of <depth>: our name
-    "focal_length_x": "fx", "focal_length_y": "fy", "principal_point_x": "cx", "principal_point_y": "cy",
-}  # fmt: skip
+    "focal_length_x": "fx",
+    "focal_length_y": "fy",
+    "principal_point_x": "cx",
+    "principal_point_y": "cy",
+}
 
 
 class _Header(NamedTuple):
@@ -80,7 +83,9 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
     PCL writes `frame_T.xml` beside `frame_T_depth.pclzf`, with two elements at the top, <rgb> and <depth>, which is why
     it is no XML until something stands around them.
     """
-    path = picture.with_name(picture.name.removesuffix(picture.suffix).removesuffix("_depth") + ".xml")
+    path = picture.with_name(
+        picture.name.removesuffix(picture.suffix).removesuffix("_depth") + ".xml"
+    )
     if not path.is_file():
         return None
     with path.open("rb") as file:
@@ -94,5 +99,8 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
         numbers["unit_mm"] = 1000.0 * float(depth.findtext("z_multiplication_factor", "0.001"))
     except (ET.ParseError, ValueError):
         return None
-    good = np.isfinite(list(numbers.values())).all() and min(numbers["fx"], numbers["fy"], numbers["unit_mm"]) > 0
+    good = (
+        np.isfinite(list(numbers.values())).all()
+        and min(numbers["fx"], numbers["fy"], numbers["unit_mm"]) > 0
+    )
     return numbers if good else None

@@ -42,7 +42,9 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     byte_order: "big", as the format's definition has it, or "little"; None: big, unless most pictures are plainly the
     other way round, which is told.
     """
-    stack = open_files(files, "PGM", _look, partial(_decode, dtype=_DTYPES[byte_order or "big"]), progress)
+    stack = open_files(
+        files, "PGM", _look, partial(_decode, dtype=_DTYPES[byte_order or "big"]), progress
+    )
     if byte_order is not None:
         return stack
     whole = [path for path, good in zip(files, stack.whole, strict=True) if good]

@@ -27,7 +27,13 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _END = struct.pack(">I", 0) + b"IEND\xaeB`\x82"  # the last chunk: no data, its name, its CRC
 _HEAD_BYTES = 33  # signature and the whole header chunk with its CRC
 _SIZE_BYTES = 26  # what of it says size and kind
-_COLOURS = {0: "grey", 2: "colour", 3: "palette colour", 4: "grey with transparency", 6: "colour with transparency"}
+_COLOURS = {
+    0: "grey",
+    2: "colour",
+    3: "palette colour",
+    4: "grey with transparency",
+    6: "colour with transparency",
+}
 
 
 def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | None:
@@ -53,7 +59,9 @@ def _sums_agree(data: NDArray[np.uint8]) -> bool:
     while at + 12 <= len(view):
         (length,) = struct.unpack_from(">I", view, at)
         end = at + 12 + length
-        if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+        if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(
+            view[end - 4 : end], "big"
+        ):
             return False
         if bytes(view[at + 4 : at + 8]) == b"IEND":
             return True
@@ -63,7 +71,9 @@ def _sums_agree(data: NDArray[np.uint8]) -> bool:
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:
     """Look at the head and the tail of every file, without decoding any. colour: 8-bit colour is expected."""
-    return open_files(files, "PNG", partial(_look, colour=colour), partial(_decode, colour=colour), progress)
+    return open_files(
+        files, "PNG", partial(_look, colour=colour), partial(_decode, colour=colour), progress
+    )
 
 
 def _decode(path: Path, colour: bool) -> NDArray[Any] | None:
@@ -77,7 +87,9 @@ def _look(path: Path, colour: bool) -> Look:
         tail = file.read(len(_END))
     if not head.startswith(_SIGNATURE[: len(head)]):
         return something_else(path, "PNG")
-    damaged = len(head) < _HEAD_BYTES or zlib.crc32(head[12:29]) != int.from_bytes(head[29:33], "big")
+    damaged = len(head) < _HEAD_BYTES or zlib.crc32(head[12:29]) != int.from_bytes(
+        head[29:33], "big"
+    )
     if damaged or tail != _END:
         # a header that is whole still says whether this was depth at all
         if not damaged:
@@ -95,7 +107,12 @@ def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] |
     if len(head) < _SIZE_BYTES:
         return None
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
-    if head[12:16] != b"IHDR" or kind not in _COLOURS or not (width and height) or too_large((width, height)):
+    if (
+        head[12:16] != b"IHDR"
+        or kind not in _COLOURS
+        or not (width and height)
+        or too_large((width, height))
+    ):
         raise RecordingError(
             f"{where} begins like a PNG picture but its header makes no sense; remove it or copy it again"
         )

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.formats.images.stack import DAMAGED, FileStack, Look, Size, open_files, something_else
+from liex_lab.recordings.formats.images.stack import (
+    DAMAGED,
+    FileStack,
+    Look,
+    Size,
+    open_files,
+    something_else,
+)
 from liex_lab.runtime.progress import Progress
 
 Points = NDArray[np.float64]
@@ -20,10 +27,23 @@ TEXTS, PLY = (".xyz", ".txt", ".csv", ".asc"), ".ply"
 SUFFIXES = (*TEXTS, PLY)
 _HEAD_BYTES = 1 << 16
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -69,7 +89,11 @@ def _look(path: Path, size: Size) -> Look:
         head = file.read(_HEAD_BYTES)
     if path.suffix.lower() != PLY:
         lines = head.decode("utf-8", "replace").splitlines()[:3]
-        return Look(size) if any(_numbers(line) for line in lines) else something_else(path, "point cloud")
+        return (
+            Look(size)
+            if any(_numbers(line) for line in lines)
+            else something_else(path, "point cloud")
+        )
     if not head.startswith(b"ply"[: len(head)]):
         return something_else(path, "PLY")
     header = _ply_header(head)
@@ -81,7 +105,9 @@ def _numbers(line: str) -> list[str]:
     """The cells of a line if at least three and all of them are numbers."""
     cells = line.replace(",", " ").replace(";", " ").split()
     try:
-        return cells if len(cells) >= 3 and np.isfinite([float(cell) for cell in cells]).any() else []
+        return (
+            cells if len(cells) >= 3 and np.isfinite([float(cell) for cell in cells]).any() else []
+        )
     except ValueError:
         return []
 
@@ -93,7 +119,9 @@ def _read_text(path: Path, columns: tuple[int, int, int]) -> Points:
     delimiter = next((mark for mark in ";," if mark in first[n_header]), None)
     with warnings.catch_warnings():  # an empty file is told as no points
         warnings.simplefilter("ignore", UserWarning)
-        return np.loadtxt(path, delimiter=delimiter, skiprows=n_header, usecols=columns, ndmin=2, encoding="utf-8")
+        return np.loadtxt(
+            path, delimiter=delimiter, skiprows=n_header, usecols=columns, ndmin=2, encoding="utf-8"
+        )
 
 
 class _PlyHeader(NamedTuple):
@@ -143,11 +171,15 @@ def _read_ply(path: Path) -> Points | None:
             places = [[name for name, _ in header.fields].index(axis) for axis in "xyz"]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
-                return np.loadtxt(file, max_rows=max(header.n, 1), usecols=places, ndmin=2, encoding="latin-1")
+                return np.loadtxt(
+                    file, max_rows=max(header.n, 1), usecols=places, ndmin=2, encoding="latin-1"
+                )
         row = np.dtype([(name, header.order + kind) for name, kind in header.fields])
         raw = file.read(header.n * row.itemsize)
     if len(raw) < header.n * row.itemsize:
         return None
     vertices = np.frombuffer(raw, row)
-    with np.errstate(invalid="ignore"):  # damage may hold any bits, also those of a NaN that signals
+    with np.errstate(
+        invalid="ignore"
+    ):  # damage may hold any bits, also those of a NaN that signals
         return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)

@@ -16,7 +16,12 @@ from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.depth_units import Stored
 from liex_lab.recordings.formats.images import point_clouds as _clouds
 from liex_lab.recordings.formats.images.folder import Folder, list_pictures, natural_key, open_stack
-from liex_lab.recordings.formats.images.raytrix_profile import PROFILE_FILE, Profile, read_profile, shipped_profiles
+from liex_lab.recordings.formats.images.raytrix_profile import (
+    PROFILE_FILE,
+    Profile,
+    read_profile,
+    shipped_profiles,
+)
 from liex_lab.recordings.formats.images.stack import Stack
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
@@ -52,7 +57,9 @@ def open_raytrix(
         except BaseException:
             stack.close()
             raise
-    recording = Folder(folder, files, told, stack, decode, (path,)).recording("raytrix", camera, fps)
+    recording = Folder(folder, files, told, stack, decode, (path,)).recording(
+        "raytrix", camera, fps
+    )
     recording.metadata["profile"] = profile.facts()
     return recording
 
@@ -89,7 +96,10 @@ def _with_lens(told: CameraFile, profile: Profile, stack: Stack, path: Path) -> 
         "close up has a longer one, so measure a ruler at a known distance and state fx and fy in camera.toml"
     )
     return replace(
-        told, intrinsics={"fx": f_px, "fy": f_px, **centre}, source=path.name, problems=(*told.problems, told_once)
+        told,
+        intrinsics={"fx": f_px, "fy": f_px, **centre},
+        source=path.name,
+        problems=(*told.problems, told_once),
     )
 
 
@@ -124,7 +134,9 @@ def _check(stack: Stack, profile: Profile, path: Path) -> None:
 def _open_clouds(
     folder: Path, profile: Profile, told: CameraFile, stated: Lens | None, progress: Progress
 ) -> tuple[list[Path], Stack]:
-    inside = [path for path in folder.iterdir() if path.is_file() and fnmatch(path.name, profile.pattern)]
+    inside = [
+        path for path in folder.iterdir() if path.is_file() and fnmatch(path.name, profile.pattern)
+    ]
     beside = (told.timestamps, CAMERA_FILE, PROFILE_FILE)
     files = [p for p in inside if p.suffix.lower() in _clouds.SUFFIXES and p.name not in beside]
     if not files:
@@ -141,7 +153,9 @@ def _open_clouds(
             "with fx, fy, cx, cy, width and height in pixels"
         )
     camera = told.camera(width, height, stated)
-    return files, _clouds.open_clouds(files, camera, profile.columns, profile_points(profile), progress)
+    return files, _clouds.open_clouds(
+        files, camera, profile.columns, profile_points(profile), progress
+    )
 
 
 def profile_points(profile: Profile) -> Callable[[_clouds.Points], _clouds.Points]:
@@ -183,9 +197,13 @@ def read_ray_calibration(path: Path) -> RayCalibration:
             (float(found.findtext("min", "")), float(found.findtext("max", "")))
             for found in root.findall("lens_type/depth_range")
         )
-        diameter, rotation, tcp = (float(root.findtext(name, "")) for name in ("diameter", "rotation", "tcp"))
+        diameter, rotation, tcp = (
+            float(root.findtext(name, "")) for name in ("diameter", "rotation", "tcp")
+        )
     except (ET.ParseError, ValueError) as error:
-        raise RecordingError(f"{path} should be a Raytrix calibration ({_CALIBRATION}), but: {error}") from None
+        raise RecordingError(
+            f"{path} should be a Raytrix calibration ({_CALIBRATION}), but: {error}"
+        ) from None
     return RayCalibration(diameter, rotation, tcp, ranges)
 
 

@@ -77,11 +77,16 @@ class Profile(BaseModel):
 
     def facts(self) -> dict[str, Any]:
         """The profile in JSON's own types, for session.json."""
-        return {**self.model_dump(mode="json", exclude_none=True), "invalid": [str(value) for value in self.invalid]}
+        return {
+            **self.model_dump(mode="json", exclude_none=True),
+            "invalid": [str(value) for value in self.invalid],
+        }
 
     def read(self, stored: NDArray[Any]) -> NDArray[np.float64]:
         """Signed mm (H, W) of stored values, NaN where they are invalid, before `valid_mm` is looked at."""
-        with np.errstate(invalid="ignore"):  # damage may hold any bits, also those of a NaN that signals
+        with np.errstate(
+            invalid="ignore"
+        ):  # damage may hold any bits, also those of a NaN that signals
             values = stored.astype(np.float64)
         for value in self.invalid:
             values[stored == value] = np.nan
@@ -119,11 +124,15 @@ def read_profile(path: Path) -> Profile:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RecordingError(f"{path} should be a TOML file, but it does not parse ({error}); correct it") from None
+        raise RecordingError(
+            f"{path} should be a TOML file, but it does not parse ({error}); correct it"
+        ) from None
     shipped = shipped_profiles()
     name = table.pop("profile", None)
     if name is not None and name not in shipped:
-        raise RecordingError(f"{path} names the profile {name!r}, but there are {', '.join(shipped)}; choose one")
+        raise RecordingError(
+            f"{path} names the profile {name!r}, but there are {', '.join(shipped)}; choose one"
+        )
     known = tuple(key for key in Profile.model_fields if key != "name")
     for key in table:
         if key not in known:
@@ -134,7 +143,10 @@ def read_profile(path: Path) -> Profile:
         return Profile(**{"name": name or path.name, **shipped.get(str(name), {}), **table})
     except ValidationError as error:
         first = error.errors()[0]
-        key, why = ".".join(str(part) for part in first["loc"]), str(first["msg"]).removeprefix("Value error, ")
+        key, why = (
+            ".".join(str(part) for part in first["loc"]),
+            str(first["msg"]).removeprefix("Value error, "),
+        )
         if first["type"] == "missing":
             why = f'is not stated; name a profile that has it, as in profile = "{next(iter(shipped))}"'
         raise RecordingError(f"{path}: {f'{key} {why}' if key else why}") from None

@@ -84,7 +84,11 @@ class FileStack:
     def read(self, index: int) -> NDArray[Any] | None:
         """Stored values (H, W); None where the picture is cut or damaged."""
         picture = self.decode(self.files[index]) if self.whole[index] else None
-        return picture if picture is not None and picture.shape[:2] == (self.height, self.width) else None
+        return (
+            picture
+            if picture is not None and picture.shape[:2] == (self.height, self.width)
+            else None
+        )
 
     def label(self, index: int) -> str:
         """The file of a picture, for a sentence."""
@@ -111,7 +115,9 @@ def open_files(
         if found.size is not None:
             sizes.setdefault(found.size, path)
     if not sizes:
-        raise next((found.why for found in looks if found.why is not None), None) or none_whole_error(files, kind)
+        raise next(
+            (found.why for found in looks if found.why is not None), None
+        ) or none_whole_error(files, kind)
     if len(sizes) > 1:
         raise one_size_error([(path.name, *size) for size, path in sizes.items()])
     ((width, height),) = sizes

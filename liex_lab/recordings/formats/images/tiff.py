@@ -13,7 +13,12 @@ import tifffile
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.recordings.formats.images.stack import none_whole_error, not_depth_error, one_size_error, too_large
+from liex_lab.recordings.formats.images.stack import (
+    none_whole_error,
+    not_depth_error,
+    one_size_error,
+    too_large,
+)
 from liex_lab.runtime.progress import Progress
 
 # tifffile reports damage twice, as an exception and in the log; the log would come out between our sentences
@@ -64,10 +69,14 @@ class TiffStack:
             return None
         if page.offset >= 0:
             count = self.width * self.height
-            return np.fromfile(page.path, page.dtype, count, offset=page.offset).reshape(self.height, self.width)
+            return np.fromfile(page.path, page.dtype, count, offset=page.offset).reshape(
+                self.height, self.width
+            )
         with self._lock:
             picture = self._decode(page)
-        return picture if picture is not None and picture.shape == (self.height, self.width) else None
+        return (
+            picture if picture is not None and picture.shape == (self.height, self.width) else None
+        )
 
     def _decode(self, page: _Page) -> NDArray[Any] | None:
         if self._open_path != page.path:
@@ -112,7 +121,9 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
         n_whole = next((i for i, page in enumerate(found) if not page.whole), len(found))
         if n_whole and (n_whole < len(found) or not ends):
             # a stack ends at its first bad page: what follows cannot be told from noise
-            problems.append(f"{path.name} is cut short: only its first {n_whole} pictures are whole")
+            problems.append(
+                f"{path.name} is cut short: only its first {n_whole} pictures are whole"
+            )
             found = found[:n_whole]
         pages += found or [_Page(path, 0, -1, "<u2", False)]
         if size is not None:
@@ -135,7 +146,9 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
     with path.open("rb") as file:
         head = file.read(4)
     if len(head) == 4 and head not in _SIGNATURES:
-        raise RecordingError(f"{path} is named like a TIFF picture but holds something else; remove it")
+        raise RecordingError(
+            f"{path} is named like a TIFF picture but holds something else; remove it"
+        )
     listed: list[_Page] = []
     size: tuple[int, int] | None = None
     try:
@@ -145,13 +158,19 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
                 listed.append(_describe(path, len(listed), page, size_bytes))
                 size = size or (int(page.imagewidth), int(page.imagelength))
             ends = _list_ends(tif)
-            return (_imagej_stack(tif, listed[0], size_bytes) if len(listed) == 1 else listed), size, ends
+            return (
+                (_imagej_stack(tif, listed[0], size_bytes) if len(listed) == 1 else listed),
+                size,
+                ends,
+            )
     except RecordingError:
         if not any(page.whole for page in listed):
             raise
         # damage inside a directory, or a picture of another kind behind the depth: the stack ends before it
         return listed, size, False
-    except Exception:  # the directory of a cut file is garbage, and comes out as almost any exception
+    except (
+        Exception
+    ):  # the directory of a cut file is garbage, and comes out as almost any exception
         return listed, size, False
 
 
@@ -160,18 +179,28 @@ def _list_ends(tif: tifffile.TiffFile) -> bool:
     layout, last = tif.tiff, tif.pages[len(tif.pages) - 1]
     file = tif.filehandle
     file.seek(last.offset)
-    n_tags = int.from_bytes(file.read(layout.tagnosize), "little" if tif.byteorder == "<" else "big")
+    n_tags = int.from_bytes(
+        file.read(layout.tagnosize), "little" if tif.byteorder == "<" else "big"
+    )
     file.seek(last.offset + layout.tagnosize + n_tags * layout.tagsize)
     return file.read(layout.offsetsize) == bytes(layout.offsetsize)
 
 
 def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
     width, height, dtype = int(page.imagewidth), int(page.imagelength), np.dtype(page.dtype or "V1")
-    if page.samplesperpixel != 1 or dtype.kind + str(dtype.itemsize) not in ("u2", "f4") or not (width and height):
+    if (
+        page.samplesperpixel != 1
+        or dtype.kind + str(dtype.itemsize) not in ("u2", "f4")
+        or not (width and height)
+    ):
         colour = "grey" if page.samplesperpixel == 1 else "colour"
         raise not_depth_error(str(path), f"{page.bitspersample}-bit {colour}", width, height)
-    ends = [offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)]
-    plain = page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
+    ends = [
+        offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+    ]
+    plain = (
+        page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
+    )
     # without compression the size follows from the bytes; a directory that contradicts itself is damaged
     agrees = page.compression != 1 or sum(page.databytecounts) == width * height * dtype.itemsize
     return _Page(
@@ -191,4 +220,7 @@ def _imagej_stack(tif: tifffile.TiffFile, first: _Page, size_bytes: int) -> list
         return [first]
     n_bytes = shape[-1] * shape[-2] * int(first.dtype[-1])
     offsets = [first.offset + k * n_bytes for k in range(n_pictures)]
-    return [first._replace(page=k, offset=o, whole=o + n_bytes <= size_bytes) for k, o in enumerate(offsets)]
+    return [
+        first._replace(page=k, offset=o, whole=o + n_bytes <= size_bytes)
+        for k, o in enumerate(offsets)
+    ]

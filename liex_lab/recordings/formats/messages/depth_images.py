@@ -21,11 +21,19 @@ from liex_lab.recordings.formats.messages.messages import (
 )
 from liex_lab.recordings.frame import Depth, depth_mm
 
-LARGEST_PICTURE = 1 << 24  # pixels; no depth camera has as many, and a damaged size would ask for all the memory
+LARGEST_PICTURE = (
+    1 << 24
+)  # pixels; no depth camera has as many, and a damaged size would ask for all the memory
 _LARGEST_CLOUD = 1 << 22  # points
 _METRE = 1000.0
-_ENCODINGS = {"16UC1": ("u2", 1.0), "mono16": ("u2", 1.0), "32FC1": ("f4", _METRE)}  # stored type, mm per step
-_CONFIG = struct.Struct("<iff")  # before a compressedDepth picture: format, and a and b of quantised depth
+_ENCODINGS = {
+    "16UC1": ("u2", 1.0),
+    "mono16": ("u2", 1.0),
+    "32FC1": ("f4", _METRE),
+}  # stored type, mm per step
+_CONFIG = struct.Struct(
+    "<iff"
+)  # before a compressedDepth picture: format, and a and b of quantised depth
 _RVL_SIZE = struct.Struct("<II")
 _PNG_HEAD = 26
 
@@ -33,7 +41,9 @@ _PNG_HEAD = 26
 def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     """Width and height of a depth picture; None for a picture of another kind, and (0, 0) for points without rows."""
     if isinstance(message, PointCloud):
-        known = {"x", "y", "z"} <= set(message.columns) and 0 < message.width * message.height <= _LARGEST_CLOUD
+        known = {"x", "y", "z"} <= set(
+            message.columns
+        ) and 0 < message.width * message.height <= _LARGEST_CLOUD
         size = (message.width, message.height) if message.height > 1 else (0, 0)
         return size if known else None
     if isinstance(message, RawPicture):
@@ -69,7 +79,11 @@ def _body(message: PackedPicture) -> memoryview:
 
 
 def decode(
-    message: DepthMessage, camera: Camera, step_mm: float, scale: float, unread: Sequence[float] = (0.0,)
+    message: DepthMessage,
+    camera: Camera,
+    step_mm: float,
+    scale: float,
+    unread: Sequence[float] = (0.0,),
 ) -> Depth | None:
     """Depth (H, W) float32 mm of the camera's size; None where the message holds no such picture.
 
@@ -93,11 +107,15 @@ def decode(
 
 
 def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
-    dtype = np.dtype(_ENCODINGS[message.encoding][0]).newbyteorder(">" if message.big_endian else "<")
+    dtype = np.dtype(_ENCODINGS[message.encoding][0]).newbyteorder(
+        ">" if message.big_endian else "<"
+    )
     width, height = message.width, message.height
     step = message.step or width * dtype.itemsize
     # some writers leave out the padding of the last row
-    if step < width * dtype.itemsize or step * (height - 1) + width * dtype.itemsize > len(message.data):
+    if step < width * dtype.itemsize or step * (height - 1) + width * dtype.itemsize > len(
+        message.data
+    ):
         return None
     return np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
 
@@ -112,7 +130,11 @@ def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
         pixels = unpack_rvl(body[_RVL_SIZE.size :], width, height)
     else:
         pixels = decode_png(np.frombuffer(body, np.uint8))
-    if pixels is None or "compressedDepth" not in message.packing or not message.packing.startswith("32FC1"):
+    if (
+        pixels is None
+        or "compressedDepth" not in message.packing
+        or not message.packing.startswith("32FC1")
+    ):
         return pixels
     # metres, quantised so that the steps grow with the distance as the sensor's own do
     _, a, b = _CONFIG.unpack_from(message.data)
@@ -137,9 +159,13 @@ def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | Non
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         column = np.floor(camera.fx * x / z + camera.cx + 0.5)
         row = np.floor(camera.fy * y / z + camera.cy + 0.5)
-        seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        seen = (
+            (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        )
     depth = np.full(camera.width * camera.height, np.inf)
-    np.minimum.at(depth, (row[seen] * camera.width + column[seen]).astype(np.int64), z[seen] * _METRE)
+    np.minimum.at(
+        depth, (row[seen] * camera.width + column[seen]).astype(np.int64), z[seen] * _METRE
+    )
     return depth.reshape(camera.height, camera.width)
 
 
@@ -148,7 +174,12 @@ def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
     offset, kind = cloud.columns[name]
     dtype = np.dtype(kind)
     row_step = cloud.row_step if cloud.height > 1 else 0
-    last = (cloud.height - 1) * row_step + (cloud.width - 1) * cloud.point_step + offset + dtype.itemsize
+    last = (
+        (cloud.height - 1) * row_step
+        + (cloud.width - 1) * cloud.point_step
+        + offset
+        + dtype.itemsize
+    )
     if not cloud.width or offset + dtype.itemsize > cloud.point_step or last > len(cloud.data):
         return None
     shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)

@@ -18,7 +18,13 @@ from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting
 from liex_lab.recordings.formats.messages.depth_images import decode, picture_size
-from liex_lab.recordings.formats.messages.message_file import Channel, Envelope, MessageFile, Place, printable
+from liex_lab.recordings.formats.messages.message_file import (
+    Channel,
+    Envelope,
+    MessageFile,
+    Place,
+    printable,
+)
 from liex_lab.recordings.formats.messages.messages import (
     CALIBRATION_SCHEMAS,
     CLOUD_SCHEMAS,
@@ -91,9 +97,15 @@ class _Frames:
     """Pictures of one topic, fetched from the file one at a time."""
 
     def __init__(
-        self, file: MessageFile, topic: _Topic, order: NDArray[np.int64], camera: Camera, step_mm: float,
-        camera_file: CameraFile, problems: list[str],
-    ) -> None:  # fmt: skip
+        self,
+        file: MessageFile,
+        topic: _Topic,
+        order: NDArray[np.int64],
+        camera: Camera,
+        step_mm: float,
+        camera_file: CameraFile,
+        problems: list[str],
+    ) -> None:
         self._file, self._topic, self._camera, self._step_mm = file, topic, camera, step_mm
         self._places = np.array(topic.places, np.int64).reshape(-1, 3)[order]
         self._scale, self._unread = camera_file.unit_mm, camera_file.unread
@@ -124,7 +136,9 @@ class _Frames:
             return None
 
 
-def open_topic(file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress) -> Recording:
+def open_topic(
+    file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress
+) -> Recording:
     """One depth topic of an open file as a recording, which closes the file."""
     try:
         return _open(file, kind, camera, topic, progress, _Found())
@@ -134,7 +148,12 @@ def open_topic(file: MessageFile, kind: str, camera: Lens | None, topic: str | N
 
 
 def _open(
-    file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress, found: _Found
+    file: MessageFile,
+    kind: str,
+    camera: Lens | None,
+    topic: str | None,
+    progress: Progress,
+    found: _Found,
 ) -> Recording:
     """`open_topic` of a file in which this much was found before."""
     path = file.path
@@ -152,8 +171,12 @@ def _open(
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems: list[str] = list(camera_file.problems)
     if not file.whole:
-        problems.append(f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read from it")
-    the_camera = _camera(path, chosen, found.calibrations, camera_file, camera, file.notes, problems)
+        problems.append(
+            f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read from it"
+        )
+    the_camera = _camera(
+        path, chosen, found.calibrations, camera_file, camera, file.notes, problems
+    )
     # A writer may flush its topics out of turn; the order of logging is the file's own order.
     order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
     settled = settle(_stamps(chosen, order, problems))
@@ -161,17 +184,31 @@ def _open(
     start = start_of_clock(int(settled.times_ns[0]))
     stated = {name: file.notes[name] for name in _FACTS if name in file.notes}
     metadata = ({"session_start_time": start} if start else {}) | stated | camera_file.metadata
-    frames = _Frames(file, chosen, order, the_camera, _step_mm(chosen, found.units), camera_file, problems)
+    frames = _Frames(
+        file, chosen, order, the_camera, _step_mm(chosen, found.units), camera_file, problems
+    )
     return Recording(
-        name=path.resolve().stem, format=kind, camera=the_camera, times_ns=settled.times_ns, read=frames.read,
-        sources=[path], problems=problems, truncated=not file.whole, metadata=metadata, close=file.close,
-        faults=settled.faults, grow=grow,
-    )  # fmt: skip
+        name=path.resolve().stem,
+        format=kind,
+        camera=the_camera,
+        times_ns=settled.times_ns,
+        read=frames.read,
+        sources=[path],
+        problems=problems,
+        truncated=not file.whole,
+        metadata=metadata,
+        close=file.close,
+        faults=settled.faults,
+        grow=grow,
+    )
 
 
 def _stamps(topic: _Topic, order: NDArray[np.int64], problems: list[str]) -> NDArray[np.int64]:
     """The sensor's stamps; the times of logging instead when pictures have none (zero), for two clocks do not mix."""
-    stamps, logged = np.array(topic.stamp_ns, np.int64)[order], np.array(topic.log_ns, np.int64)[order]
+    stamps, logged = (
+        np.array(topic.stamp_ns, np.int64)[order],
+        np.array(topic.log_ns, np.int64)[order],
+    )
     unstamped = int(((stamps == 0) & (logged != 0)).sum())
     if unstamped == 1 and len(stamps) > 1 and np.all(np.diff(stamps) > 0):
         unstamped = 0  # a clock that begins at zero with the first picture
@@ -189,7 +226,9 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
     def wanted(channel: Channel) -> bool:
         if channel not in parsers:
             parsers[channel] = parser_of(channel)
-        calibrated = plain_schema(channel) in CALIBRATION_SCHEMAS and channel.topic in found.calibrations
+        calibrated = (
+            plain_schema(channel) in CALIBRATION_SCHEMAS and channel.topic in found.calibrations
+        )
         return parsers[channel] is not None and not calibrated
 
     for message in file.walk(wanted, progress):
@@ -245,10 +284,15 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
 
 
 def _no_depth(file: MessageFile) -> RecordingError:
-    described = {f"{printable(c.topic)} ({printable(c.schema)}, {printable(c.encoding)})" for c in file.channels}
+    described = {
+        f"{printable(c.topic)} ({printable(c.schema)}, {printable(c.encoding)})"
+        for c in file.channels
+    }
     listed = ", ".join(sorted(described)[:8]) + (", ..." if len(described) > 8 else "")
     cut = "the file is cut or damaged, and " if not file.whole else ""
-    return RecordingError(f"{file.path} holds no depth pictures: {cut}its topics are {listed or 'none'}; {_EXPECTED}")
+    return RecordingError(
+        f"{file.path} holds no depth pictures: {cut}its topics are {listed or 'none'}; {_EXPECTED}"
+    )
 
 
 def _step_mm(topic: _Topic, units: dict[str, DepthUnit]) -> float:
@@ -273,12 +317,20 @@ def _camera(
     if stated is None and found is not None:
         return _calibrated(topic, *found, notes, problems)
     if stated is None and not camera_file.intrinsics:
-        several = f", which has {len(calibrations)} calibrations, none of them for" if calibrations else " for"
+        several = (
+            f", which has {len(calibrations)} calibrations, none of them for"
+            if calibrations
+            else " for"
+        )
         raise RecordingError(
             f"{path} holds no CameraCalibration or CameraInfo{several} {printable(topic.name)}; write a camera.toml "
             "beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in pixels"
         )
-    known = (stated.width, stated.height) if isinstance(stated, Camera) else (camera_file.width, camera_file.height)
+    known = (
+        (stated.width, stated.height)
+        if isinstance(stated, Camera)
+        else (camera_file.width, camera_file.height)
+    )
     size = _size(topic, (known[0] or 0, known[1] or 0))
     if not min(size):
         raise RecordingError(
@@ -305,12 +357,20 @@ def _calibrated(
             "not undone"
         )
     kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
-    source = notes.get("camera_source", f"{kind} on {where}")  # a converted file keeps where the numbers came from
+    source = notes.get(
+        "camera_source", f"{kind} on {where}"
+    )  # a converted file keeps where the numbers came from
     size = _size(topic, (calibration.width, calibration.height))
     camera = Camera(
-        fx=k[0], fy=k[4], cx=k[2], cy=k[5], width=calibration.width or size[0], height=calibration.height or size[1],
-        source=printable(source), distortion=bent,
-    )  # fmt: skip
+        fx=k[0],
+        fy=k[4],
+        cx=k[2],
+        cy=k[5],
+        width=calibration.width or size[0],
+        height=calibration.height or size[1],
+        source=printable(source),
+        distortion=bent,
+    )
     return fitting(camera, *size, f"the {kind} on {printable(where)}")
 
 
@@ -319,25 +379,42 @@ def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:
     return topic.size if min(topic.size) else of_camera
 
 
-def _calibration_of(topic: _Topic, calibrations: dict[str, Calibration]) -> tuple[str, Calibration] | None:
+def _calibration_of(
+    topic: _Topic, calibrations: dict[str, Calibration]
+) -> tuple[str, Calibration] | None:
     """The calibration of the same camera: of the same frame, and among those on the topic nearest by its name."""
     # K[0] = 0 means "not calibrated" in these messages
-    usable = {name: c for name, c in calibrations.items() if len(c.k) == 9 and np.isfinite(c.k).all() and c.k[0] > 0}
-    same_frame = {name: c for name, c in usable.items() if topic.frame_id and c.frame_id == topic.frame_id}
+    usable = {
+        name: c
+        for name, c in calibrations.items()
+        if len(c.k) == 9 and np.isfinite(c.k).all() and c.k[0] > 0
+    }
+    same_frame = {
+        name: c for name, c in usable.items() if topic.frame_id and c.frame_id == topic.frame_id
+    }
     for some in (same_frame, usable):
         near = {name: _shared(topic.name, name) for name in some}
         nearest = [name for name in some if near[name] == max(near.values())]
-        if nearest and (len(some) == 1 or near[nearest[0]] > 0) and _alike([some[name] for name in nearest]):
+        if (
+            nearest
+            and (len(some) == 1 or near[nearest[0]] > 0)
+            and _alike([some[name] for name in nearest])
+        ):
             return nearest[0], some[nearest[0]]
     return None
 
 
 def _shared(one: str, other: str) -> int:
     """How many words of two topics are the same from the beginning on."""
-    pairs = list(zip(one.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False))
+    pairs = list(
+        zip(one.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False)
+    )
     return next((n for n, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def _alike(calibrations: Sequence[Calibration]) -> bool:
     first = calibrations[0]
-    return all((c.k, c.d, c.width, c.height) == (first.k, first.d, first.width, first.height) for c in calibrations)
+    return all(
+        (c.k, c.d, c.width, c.height) == (first.k, first.d, first.width, first.height)
+        for c in calibrations
+    )

@@ -32,7 +32,9 @@ _SECOND = 10**9
 
 def _raw_image(message: Any) -> RawPicture:
     m = message
-    return RawPicture(_stamp(m), m.frame_id, int(m.width), int(m.height), m.encoding, int(m.step), False, m.data)
+    return RawPicture(
+        _stamp(m), m.frame_id, int(m.width), int(m.height), m.encoding, int(m.step), False, m.data
+    )
 
 
 def _packed_image(message: Any) -> PackedPicture:
@@ -46,13 +48,27 @@ def _calibration(message: Any) -> Calibration:
 
 
 def _cloud(message: Any) -> PointCloud:
-    columns = {f.name: (int(f.offset), _FIELD_TYPES[f.type]) for f in message.fields if f.type in _FIELD_TYPES}
+    columns = {
+        f.name: (int(f.offset), _FIELD_TYPES[f.type])
+        for f in message.fields
+        if f.type in _FIELD_TYPES
+    }
     step, data = int(message.point_stride), message.data
     n = len(data) // max(step, 1)
     at, turn = message.pose.position, message.pose.orientation
     pose = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
     moved = any(pose[:6])
-    return PointCloud(_stamp(message), message.frame_id, n, 1, columns, step, n * step, data, pose if moved else None)
+    return PointCloud(
+        _stamp(message),
+        message.frame_id,
+        n,
+        1,
+        columns,
+        step,
+        n * step,
+        data,
+        pose if moved else None,
+    )
 
 
 def _stamp(message: Any) -> int:

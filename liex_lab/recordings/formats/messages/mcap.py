@@ -37,13 +37,29 @@ MAGIC = b"\x89MCAP0\r\n"
 NOTES = "liex_lab"  # the name of the metadata record in files of our own making
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_FOOTER = struct.Struct("<BQQQI")  # its record: opcode, length, where the summary and its offsets begin, CRC
-_CHUNK = struct.Struct("<QQQII")  # first and last log time, unpacked size, its CRC, length of the packing's name
+_FOOTER = struct.Struct(
+    "<BQQQI"
+)  # its record: opcode, length, where the summary and its offsets begin, CRC
+_CHUNK = struct.Struct(
+    "<QQQII"
+)  # first and last log time, unpacked size, its CRC, length of the packing's name
 _BLOCK = 1 << 20
-_THREADS, _SMALL_CHUNK = 2, 1 << 23  # chunks of so many bytes at most are unpacked before it is their turn
+_THREADS, _SMALL_CHUNK = (
+    2,
+    1 << 23,
+)  # chunks of so many bytes at most are unpacked before it is their turn
 _FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _LARGEST_FACT = 1 << 24  # bytes of one of them
-_DAMAGE = (McapError, KeyError, ValueError, OverflowError, MemoryError, RuntimeError, struct.error, EOFError)
+_DAMAGE = (
+    McapError,
+    KeyError,
+    ValueError,
+    OverflowError,
+    MemoryError,
+    RuntimeError,
+    struct.error,
+    EOFError,
+)
 
 Wanted = Callable[[Channel], bool]
 
@@ -59,7 +75,9 @@ def open_mcap(
     file = path.open("rb")
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
-        raise RecordingError(f"{path} is named like an MCAP file but holds something else; give another file")
+        raise RecordingError(
+            f"{path} is named like an MCAP file but holds something else; give another file"
+        )
     return open_topic(McapFile(path, file), "mcap", camera, topic, progress)
 
 
@@ -70,8 +88,14 @@ class McapFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
-        self._coming: dict[int, Future[bytes]] = {}  # chunks that are being unpacked, by where their content begins
-        self._sure = (len(MAGIC), 0, True)  # behind the last whole record: where, chunks until there, `whole`
+        self._coming: dict[
+            int, Future[bytes]
+        ] = {}  # chunks that are being unpacked, by where their content begins
+        self._sure = (
+            len(MAGIC),
+            0,
+            True,
+        )  # behind the last whole record: where, chunks until there, `whole`
 
     def go_on(self) -> int | None:
         """See `MessageFile`."""
@@ -93,13 +117,17 @@ class McapFile(MessageFile):
                 unpackers.shutdown(wait=False, cancel_futures=True)
                 self._coming.clear()
 
-    def _walk(self, wanted: Wanted, progress: Progress, unpackers: ThreadPoolExecutor) -> Iterator[Envelope]:
+    def _walk(
+        self, wanted: Wanted, progress: Progress, unpackers: ThreadPoolExecutor
+    ) -> Iterator[Envelope]:
         at, footer = self._sure[0], False
         while at + _RECORD.size <= self.size and not footer:
             opcode, start, end = self._record(at)
             whole = end <= self.size and opcode != 0
             if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
-                end = self.resume(at)  # a size that cannot be; and no record has the opcode 0: these are zeros
+                end = self.resume(
+                    at
+                )  # a size that cannot be; and no record has the opcode 0: these are zeros
             elif opcode == Opcode.CHUNK:
                 self._look_ahead(at, unpackers)
                 yield from self._walk_chunk(start, end - start, wanted)
@@ -109,7 +137,11 @@ class McapFile(MessageFile):
             at, footer = end, opcode == Opcode.FOOTER
             if whole and not footer:
                 self._sure = (at, len(self.chunks), self.whole)
-            progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+            progress(
+                min(at, self.size) >> 20,
+                (self.size >> 20) + 1,
+                "looking through the recording (MB)",
+            )
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
 
     def _look_ahead(self, at: int, unpackers: ThreadPoolExecutor) -> None:
@@ -127,7 +159,9 @@ class McapFile(MessageFile):
                 return  # the walk says so when it is there
             if chunk.size <= _SMALL_CHUNK:
                 self.file.seek(chunk.offset)
-                self._coming[start] = unpackers.submit(unpacked, self.file.read(chunk.length), chunk)
+                self._coming[start] = unpackers.submit(
+                    unpacked, self.file.read(chunk.length), chunk
+                )
 
     def _record(self, at: int) -> tuple[int, int, int]:
         """What kind of record begins at `at`, and where its content begins and ends."""
@@ -203,7 +237,9 @@ class McapFile(MessageFile):
             raise DamagedChunk("its parts do not fit into it")
         return Chunk(offset, min(n_packed, end - offset), packing, size, crc, cut)
 
-    def _take(self, opcode: int, payload: memoryview, place: Place, wanted: Wanted) -> Iterator[Envelope]:
+    def _take(
+        self, opcode: int, payload: memoryview, place: Place, wanted: Wanted
+    ) -> Iterator[Envelope]:
         try:
             if opcode == Opcode.MESSAGE:
                 number, _, log_time_ns, _ = _MESSAGE.unpack_from(payload)
@@ -224,7 +260,11 @@ class McapFile(MessageFile):
             self._schemas[schema.id] = schema.name
         elif opcode == Opcode.CHANNEL:
             record = ChannelRecord.read(stream)
-            known = Channel(record.topic, self._schemas.get(record.schema_id, "no schema"), record.message_encoding)
+            known = Channel(
+                record.topic,
+                self._schemas.get(record.schema_id, "no schema"),
+                record.message_encoding,
+            )
             if self._by_id.setdefault(record.id, known) == known and known not in self.channels:
                 self.channels.append(known)
         elif opcode == Opcode.METADATA:

@@ -75,13 +75,18 @@ class FoxgloveMessages(Messages):
         from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
         self._raw, self._packed, self._lens = RawImage, CompressedImage, CameraCalibration
-        self.raw, self.packed, self.lens = map(_protobuf_schema, (RawImage, CompressedImage, CameraCalibration))
+        self.raw, self.packed, self.lens = map(
+            _protobuf_schema, (RawImage, CompressedImage, CameraCalibration)
+        )
 
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """Pixels of a picture of (width, height), row by row without padding."""
         width, height = size
         return _stamped(
-            self._raw(width=width, height=height, encoding=encoding, step=len(data) // height, data=data), time_ns
+            self._raw(
+                width=width, height=height, encoding=encoding, step=len(data) // height, data=data
+            ),
+            time_ns,
         )
 
     def packed_picture(self, time_ns: int, png: bytes) -> bytes:
@@ -94,7 +99,7 @@ class FoxgloveMessages(Messages):
         model, d = _distortion(camera)
         lens = self._lens(
             width=camera.width, height=camera.height, distortion_model=model, D=d, K=k, R=r, P=p
-        )  # fmt: skip
+        )
         return _stamped(lens, time_ns)
 
 
@@ -164,7 +169,9 @@ class RosMessages(Messages):
     profile, encoding = "ros2", "cdr"
     raw = _ros_schema("sensor_msgs/msg/Image", _IMAGE, _HEADER)
     packed = _ros_schema("sensor_msgs/msg/CompressedImage", _COMPRESSED, _HEADER)
-    lens = _ros_schema("sensor_msgs/msg/CameraInfo", _CAMERA_INFO, _HEADER, _REGION, "bool do_rectify\n")
+    lens = _ros_schema(
+        "sensor_msgs/msg/CameraInfo", _CAMERA_INFO, _HEADER, _REGION, "bool do_rectify\n"
+    )
 
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """Pixels of a picture of (width, height), row by row without padding."""

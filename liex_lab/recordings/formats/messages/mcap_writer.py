@@ -10,14 +10,21 @@ from mcap.writer import Writer
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.depth_units import metres, whole_steps
 from liex_lab.recordings.formats.messages.mcap import NOTES
-from liex_lab.recordings.formats.messages.mcap_encoding import FoxgloveMessages, Messages, RosMessages, Schema
+from liex_lab.recordings.formats.messages.mcap_encoding import (
+    FoxgloveMessages,
+    Messages,
+    RosMessages,
+    Schema,
+)
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.writer import RecordingWriter, png_of, steps_of
 
 DEPTH_TOPIC = "/camera/depth"
 CALIBRATION_TOPICS = {"foxglove": "/camera/calibration", "ros": "/camera/camera_info"}
 _SECOND = 10**9
-_CHUNK_BYTES = 128 * 1024  # a picture closes its chunk, so that one frame is unpacked to read one frame
+_CHUNK_BYTES = (
+    128 * 1024
+)  # a picture closes its chunk, so that one frame is unpacked to read one frame
 
 
 class McapDepthWriter(RecordingWriter):
@@ -46,7 +53,9 @@ class McapDepthWriter(RecordingWriter):
         facts = {key: str(value) for key, value in (metadata or {}).items()}
         self._writer.add_metadata(NOTES, facts | {"camera_source": camera.source})
         self._lens = self._channel(CALIBRATION_TOPICS[messages], self._messages.lens)
-        self._depth = self._channel(DEPTH_TOPIC, self._messages.raw if packing == "raw" else self._messages.packed)
+        self._depth = self._channel(
+            DEPTH_TOPIC, self._messages.raw if packing == "raw" else self._messages.packed
+        )
 
     def _channel(self, topic: str, schema: Schema) -> int:
         number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -66,7 +75,9 @@ class McapDepthWriter(RecordingWriter):
 
     def _picture(self, frame: DepthFrame) -> bytes:
         if self._packing == "png":
-            return self._messages.packed_picture(frame.time_ns, png_of(steps_of(frame, 1.0, exact=True)))
+            return self._messages.packed_picture(
+                frame.time_ns, png_of(steps_of(frame, 1.0, exact=True))
+            )
         steps = None if self._float else whole_steps(frame.depth, 1.0)
         if steps is not None:
             data, encoding = steps.astype("<u2", copy=False).tobytes(), "16UC1"
@@ -84,7 +95,9 @@ class McapDepthWriter(RecordingWriter):
         if self._float:
             self.notes.append("depth is not in whole millimetres and was written as 32-bit metres")
         if self._n_off:
-            self.notes.append(f"{self._n_off} depths differ in the last of their 24 bits, which metres do not hold")
+            self.notes.append(
+                f"{self._n_off} depths differ in the last of their 24 bits, which metres do not hold"
+            )
 
     def release(self) -> None:
         """Close the file."""

@@ -77,7 +77,9 @@ class MessageFile(ABC):
         self.channels: list[Channel] = []
         self.notes: dict[str, str] = {}
         self.chunks: list[Chunk] = []
-        self.starts: list[int] = []  # where the records of chunks begin, as the file's own index says, in order
+        self.starts: list[
+            int
+        ] = []  # where the records of chunks begin, as the file's own index says, in order
         self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
 
     @abstractmethod
@@ -102,7 +104,9 @@ class MessageFile(ABC):
             try:
                 return self.unpack(place.chunk)[place.offset : place.offset + place.length]
             except DamagedChunk as error:
-                raise RecordingError(f"{self.path} changed while it was read ({error}); copy it again") from None
+                raise RecordingError(
+                    f"{self.path} changed while it was read ({error}); copy it again"
+                ) from None
         self.file.seek(place.offset)
         return memoryview(self.file.read(place.length))
 
@@ -161,4 +165,6 @@ def _inflate(packed: bytes, packing: str, size: int) -> bytes:
 
 def printable(text: str, length: int = 80) -> str:
     """A name out of a file, fit for a sentence: a damaged one may hold anything."""
-    return "".join(c if c.isprintable() else "?" for c in text[:length]) + ("..." if len(text) > length else "")
+    return "".join(c if c.isprintable() else "?" for c in text[:length]) + (
+        "..." if len(text) > length else ""
+    )

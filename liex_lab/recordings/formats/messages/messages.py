@@ -13,7 +13,9 @@ PICTURE_SCHEMAS = (
 )
 CLOUD_SCHEMAS = ("foxglove.PointCloud", "sensor_msgs/PointCloud2")
 CALIBRATION_SCHEMAS = ("foxglove.CameraCalibration", "sensor_msgs/CameraInfo")
-UNIT_TOPIC = "/option/Depth Units/value"  # where the RealSense program writes the metres of a stored step
+UNIT_TOPIC = (
+    "/option/Depth Units/value"  # where the RealSense program writes the metres of a stored step
+)
 UNIT_SCHEMA = "std_msgs/Float32"
 
 

@@ -92,7 +92,9 @@ def _image(fields: _Fields) -> RawPicture:
     stamp_ns, frame_id = fields.header()
     height, width = fields.whole(), fields.whole()
     encoding, big_endian, step = fields.text(), fields.whole("B"), fields.whole()
-    return RawPicture(stamp_ns, frame_id, width, height, encoding, step, bool(big_endian), fields.blob())
+    return RawPicture(
+        stamp_ns, frame_id, width, height, encoding, step, bool(big_endian), fields.blob()
+    )
 
 
 def _packed_image(fields: _Fields) -> PackedPicture:
@@ -118,7 +120,9 @@ def _cloud(fields: _Fields) -> PointCloud:
         found.append((fields.text(), fields.whole(), fields.whole("B")))
         fields.whole()  # how many numbers the field has: one
     order = ">" if fields.whole("B") else "<"
-    columns = {name: (at, order + _FIELD_TYPES[kind]) for name, at, kind in found if kind in _FIELD_TYPES}
+    columns = {
+        name: (at, order + _FIELD_TYPES[kind]) for name, at, kind in found if kind in _FIELD_TYPES
+    }
     point_step, row_step, data = fields.whole(), fields.whole(), fields.blob()
     return PointCloud(stamp_ns, frame_id, width, height, columns, point_step, row_step, data)
 

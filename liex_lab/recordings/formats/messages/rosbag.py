@@ -15,7 +15,14 @@ from typing import IO
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.formats.messages.depth_topics import open_topic
-from liex_lab.recordings.formats.messages.message_file import Channel, Chunk, DamagedChunk, Envelope, MessageFile, Place
+from liex_lab.recordings.formats.messages.message_file import (
+    Channel,
+    Chunk,
+    DamagedChunk,
+    Envelope,
+    MessageFile,
+    Place,
+)
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
@@ -47,8 +54,12 @@ def open_bag(
         return open_topic(Db3File(path, file), "rosbag2", camera, topic, progress)
     file.close()
     if magic.startswith(_MAGIC):
-        raise RecordingError(f"{path} is a bag of an old ROS; bring it to version 2.0 with `rosbag fix` and give that")
-    raise RecordingError(f"{path} is named like a ROS bag but holds something else; give another file")
+        raise RecordingError(
+            f"{path} is a bag of an old ROS; bring it to version 2.0 with `rosbag fix` and give that"
+        )
+    raise RecordingError(
+        f"{path} is named like a ROS bag but holds something else; give another file"
+    )
 
 
 class BagFile(MessageFile):
@@ -74,13 +85,19 @@ class BagFile(MessageFile):
                 elif opcode in (_CONNECTION, _MESSAGE):
                     self.file.seek(begin)
                     data = memoryview(self.file.read(end - begin))
-                    yield from self._take(opcode, header, data, Place(-1, begin, end - begin), wanted)
+                    yield from self._take(
+                        opcode, header, data, Place(-1, begin, end - begin), wanted
+                    )
                 at = end
             except DamagedChunk:
                 self.whole, at = False, end
             except (*_DAMAGE, IndexError):
                 at = self.resume(at)
-            progress(min(at, self.size) >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+            progress(
+                min(at, self.size) >> 20,
+                (self.size >> 20) + 1,
+                "looking through the recording (MB)",
+            )
         # A recording that broke off has no index yet, and every other one ends with it.
         self.whole = self.whole and at == self.size and indexed
 
@@ -98,7 +115,9 @@ class BagFile(MessageFile):
     def _learn_ending(self, header: dict[str, bytes]) -> bool:
         """The connections and places of chunks that the index at the end repeats; False where there is no index."""
         if header.get("encryptor"):
-            raise RecordingError(f"{self.path} is an encrypted bag, which cannot be read; give it without encryption")
+            raise RecordingError(
+                f"{self.path} is an encrypted bag, which cannot be read; give it without encryption"
+            )
         (at,) = struct.unpack("<Q", header["index_pos"])
         indexed = at > 0
         try:
@@ -106,7 +125,9 @@ class BagFile(MessageFile):
                 facts, begin, end = self._record(at)
                 if facts["op"][0] == _CHUNK_INFO:
                     self.starts += struct.unpack("<Q", facts["chunk_pos"])
-                elif facts["op"][0] == _CONNECTION and end <= self.size:  # else it would be read into nothing
+                elif (
+                    facts["op"][0] == _CONNECTION and end <= self.size
+                ):  # else it would be read into nothing
                     self.file.seek(begin)
                     self._connect(facts, memoryview(self.file.read(end - begin)))
                 else:
@@ -117,7 +138,9 @@ class BagFile(MessageFile):
         self.starts.sort()
         return indexed
 
-    def _walk_chunk(self, header: dict[str, bytes], begin: int, end: int, wanted: Wanted) -> Iterator[Envelope]:
+    def _walk_chunk(
+        self, header: dict[str, bytes], begin: int, end: int, wanted: Wanted
+    ) -> Iterator[Envelope]:
         cut = end > self.size
         (size,) = _U32.unpack(header["size"])
         packing = header["compression"].decode()
@@ -135,7 +158,9 @@ class BagFile(MessageFile):
             at = start + length
             if at > len(data):
                 break
-            yield from self._take(inner["op"][0], inner, data[start:at], Place(number, start, length), wanted)
+            yield from self._take(
+                inner["op"][0], inner, data[start:at], Place(number, start, length), wanted
+            )
         self.whole = self.whole and at == len(data) and not cut
 
     def _take(
@@ -186,11 +211,15 @@ class Db3File(MessageFile):
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
         """Every message of the wanted channels, in the order in which they were stored."""
         try:
-            rows = self._base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            rows = self._base.execute(
+                "SELECT id, name, type, serialization_format FROM topics"
+            ).fetchall()
             by_id = {int(row[0]): Channel(*map(str, row[1:])) for row in rows}
             self.channels = list(by_id.values())
             (last,) = self._base.execute("SELECT max(id) FROM messages").fetchone()
-            messages = self._base.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id")
+            messages = self._base.execute(
+                "SELECT id, topic_id, timestamp FROM messages ORDER BY id"
+            )
             for number, topic, log_time_ns in messages:
                 channel = by_id[topic]
                 if wanted(channel):

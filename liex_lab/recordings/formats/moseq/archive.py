@@ -19,7 +19,9 @@ _BLOCK = 1 << 16
 _PACKED = 1 << 16  # bytes read at once
 _UNPACKED = 1 << 20  # and unpacked at once: an empty picture is a thousand times its packed size
 _PIECE = 256  # packed bytes tried at once where there is damage
-_ENOUGH_ZEROS = 1 << 22  # far more than the end of any tar; a walk that asks for more skips over what is missing
+_ENOUGH_ZEROS = (
+    1 << 22
+)  # far more than the end of any tar; a walk that asks for more skips over what is missing
 _GZIP_MAGIC = b"\x1f\x8b"
 
 
@@ -71,7 +73,9 @@ class _Patient:
         """Some more bytes into the buffer, or the end."""
         if not self._pending:
             self._pending = self._file.read(_PACKED)
-            self._progress(self._file.tell() >> 20, (self._size >> 20) + 1, "unpacking the recording (MB)")
+            self._progress(
+                self._file.tell() >> 20, (self._size >> 20) + 1, "unpacking the recording (MB)"
+            )
         if not self._pending:
             self.ended = True
             self._buffer += b"" if self.whole else self._inflate.flush()
@@ -82,7 +86,9 @@ class _Patient:
             self._pending = b""
 
     def _unzip(self) -> None:
-        if self._inflate.eof:  # a gzip file may be several, one after the other; anything else behind it is padding
+        if (
+            self._inflate.eof
+        ):  # a gzip file may be several, one after the other; anything else behind it is padding
             if len(self._pending) < len(_GZIP_MAGIC):
                 self._pending += self._file.read(_PACKED)
             if not self._pending.startswith(_GZIP_MAGIC):
@@ -92,7 +98,9 @@ class _Patient:
         spare = self._inflate.copy()
         try:
             self._buffer += self._inflate.decompress(self._pending, _UNPACKED)
-            self._pending = self._inflate.unused_data if self._inflate.eof else self._inflate.unconsumed_tail
+            self._pending = (
+                self._inflate.unused_data if self._inflate.eof else self._inflate.unconsumed_tail
+            )
             self.whole = self._inflate.eof
         except zlib.error:
             self._salvage(spare)

@@ -30,7 +30,12 @@ MODES = (  # of the Azure Kinect sensor SDK
     Mode("WFOV_2X2BINNED", 512, 512, 512, 0, 0),
     Mode("WFOV_UNBINNED", 1024, 1024, 1024, 0, 0),
 )
-_TYPICAL = (0.5, 0.5, 0.492, 0.492)  # cx, cy, fx, fy as shares of the sensor's side; units differ by about 1 %
+_TYPICAL = (
+    0.5,
+    0.5,
+    0.492,
+    0.492,
+)  # cx, cy, fx, fy as shares of the sensor's side; units differ by about 1 %
 _DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth")
 
 
@@ -51,7 +56,9 @@ def read_calibration(data: bytes) -> FactoryLens | None:
     try:
         cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
         depth = next(
-            c for c in cameras if c.get("Location") == _DEPTH_CAMERA[0] or c.get("Purpose") == _DEPTH_CAMERA[1]
+            c
+            for c in cameras
+            if c.get("Location") == _DEPTH_CAMERA[0] or c.get("Purpose") == _DEPTH_CAMERA[1]
         )
         values = [float(value) for value in depth["Intrinsics"]["ModelParameters"]]
     except (ValueError, KeyError, TypeError, AttributeError, StopIteration, RecursionError):
@@ -66,11 +73,16 @@ def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
     """The camera of a depth mode; pixel (0, 0) is the centre of the top-left pixel, hence the half."""
     cx, cy, fx, fy = _TYPICAL if lens is None else lens.shares
     facts: dict[str, Any] = {
-        "fx": fx * mode.side, "fy": fy * mode.side,
-        "cx": cx * mode.side - mode.left - 0.5, "cy": cy * mode.side - mode.top - 0.5,
-        "width": mode.width, "height": mode.height,
-    }  # fmt: skip
+        "fx": fx * mode.side,
+        "fy": fy * mode.side,
+        "cx": cx * mode.side - mode.left - 0.5,
+        "cy": cy * mode.side - mode.top - 0.5,
+        "width": mode.width,
+        "height": mode.height,
+    }
     if lens is None:
         return Camera(**facts, source=f"typical Azure Kinect, {mode.name}")
     distortion = Distortion.of("rational_polynomial", lens.distortion)
-    return Camera(**facts, source="the camera's factory calibration in the file", distortion=distortion)
+    return Camera(
+        **facts, source="the camera's factory calibration in the file", distortion=distortion
+    )

@@ -13,13 +13,30 @@ from liex_lab.recordings.timestamps import Times, median_step, start_of_day
 
 STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
 METADATA = "metadata.json"
-AZURE, KINECT, OTHER = "Azure Kinect", "Kinect v2", "other"  # cameras, as far as they are told apart
+AZURE, KINECT, OTHER = (
+    "Azure Kinect",
+    "Kinect v2",
+    "other",
+)  # cameras, as far as they are told apart
 
-_CAMERA_KEYS = ("camera", "cameratype", "cameramodel", "device", "devicename", "devicemodel", "sensor")
+_CAMERA_KEYS = (
+    "camera",
+    "cameratype",
+    "cameramodel",
+    "device",
+    "devicename",
+    "devicemodel",
+    "sensor",
+)
 _CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is found counts
-    "azure": AZURE, "k4a": AZURE, "femto": AZURE, "kinectv2": KINECT, "kinect2": KINECT, "kinectone": KINECT,
+    "azure": AZURE,
+    "k4a": AZURE,
+    "femto": AZURE,
+    "kinectv2": KINECT,
+    "kinect2": KINECT,
+    "kinectone": KINECT,
     "kinectforwindowsv2": KINECT,
-}  # fmt: skip
+}
 _PLAUSIBLE_HZ = (0.5, 2000.0)
 
 
@@ -50,10 +67,17 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         document = json.loads(path.read_text(encoding="utf-8-sig"))
         if not isinstance(document, dict):
             raise ValueError("it is not an object in braces")
-    except (ValueError, RecursionError) as error:  # broken JSON and broken UTF-8 are both ValueErrors
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # broken JSON and broken UTF-8 are both ValueErrors
         if cut:
-            return Metadata(None, "<u2", None, "", {}, [f"{METADATA} is cut short and was not used"])
-        raise RecordingError(f"{METADATA} of the session is not JSON ({error}); correct or remove it") from None
+            return Metadata(
+                None, "<u2", None, "", {}, [f"{METADATA} is cut short and was not used"]
+            )
+        raise RecordingError(
+            f"{METADATA} of the session is not JSON ({error}); correct or remove it"
+        ) from None
     facts, problems = {}, []
     for key, ours in (("SubjectName", "subject_id"), ("SessionName", "session_name")):
         if isinstance(document.get(key), str) and document[key].strip():
@@ -62,7 +86,9 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         if (start := start_of_day(stated if isinstance(stated, str) else None)) is not None:
             facts["session_start_time"] = start
         else:
-            problems.append(f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used")
+            problems.append(
+                f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used"
+            )
     little = document.get("IsLittleEndian", True) is not False
     size = _stated_size(document.get("DepthResolution"))
     return Metadata(size, "<u2" if little else ">u2", *_stated_camera(document), facts, problems)
@@ -71,19 +97,30 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
 def _stated_size(value: Any) -> tuple[int, int] | None:
     if value is None:
         return None
-    if isinstance(value, list) and len(value) == 2 and all(type(v) is int and 0 < v < 20_000 for v in value):
+    if (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(type(v) is int and 0 < v < 20_000 for v in value)
+    ):
         return value[0], value[1]
-    raise RecordingError(f"{METADATA} states DepthResolution = {value!r}; it is [width, height] in pixels")
+    raise RecordingError(
+        f"{METADATA} states DepthResolution = {value!r}; it is [width, height] in pixels"
+    )
 
 
 def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
     """Which camera the metadata name, and in which words: programs that record for MoSeq have no common key for it."""
     told = {key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()}
-    name = next((told[key] for key in _CAMERA_KEYS if isinstance(told.get(key), str) and told[key].strip()), None)
+    name = next(
+        (told[key] for key in _CAMERA_KEYS if isinstance(told.get(key), str) and told[key].strip()),
+        None,
+    )
     if name is None:
         return None, ""
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
-    return next((camera for word, camera in _CAMERA_WORDS.items() if word in plain), OTHER), name.strip()
+    return next(
+        (camera for word, camera in _CAMERA_WORDS.items() if word in plain), OTHER
+    ), name.strip()
 
 
 def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple[str, Times] | None:

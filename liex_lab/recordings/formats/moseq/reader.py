@@ -38,7 +38,15 @@ VIDEOS = ("depth.avi", "depth.mkv")
 DEPTHS = (DEPTH, *VIDEOS)
 _NOMINAL_HZ = 30.0  # what every camera that MoSeq records from delivers when nothing is lost
 _KINECT_V2_SIZE = (512, 424)
-_OTHER_SIZES = ((640, 480), (640, 576), (320, 288), (512, 512), (1024, 1024), (848, 480), (1280, 720))
+_OTHER_SIZES = (
+    (640, 480),
+    (640, 576),
+    (320, 288),
+    (512, 512),
+    (1024, 1024),
+    (848, 480),
+    (1280, 720),
+)
 
 
 @dataclass
@@ -74,7 +82,9 @@ class RawFrames:
             self._file.seek(index * n_bytes)
             raw = self._file.read(n_bytes)
         if len(raw) < n_bytes:
-            raise RecordingError(f"{self.path} became shorter while it was read; frame {index} is no longer there")
+            raise RecordingError(
+                f"{self.path} became shorter while it was read; frame {index} is no longer there"
+            )
         return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
 
     def label(self, index: int) -> str:
@@ -93,8 +103,14 @@ def open_moseq(
     names = (*STAMPS, METADATA, CAMERA_FILE)
     if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
         folder = path if path.is_dir() else path.parent
-        depth = next((folder / name for name in DEPTHS if (folder / name).is_file()), path) if path.is_dir() else path
-        files = {depth.name: depth} | {name: folder / name for name in names if (folder / name).is_file()}
+        depth = (
+            next((folder / name for name in DEPTHS if (folder / name).is_file()), path)
+            if path.is_dir()
+            else path
+        )
+        files = {depth.name: depth} | {
+            name: folder / name for name in names if (folder / name).is_file()
+        }
         found = Unpacked(files, frozenset(), False)
         name = folder.resolve().name if depth.name in DEPTHS else depth.stem
         return _Session(path, depth, found, camera, fps, progress).open(name, list(files.values()))
@@ -105,7 +121,9 @@ def open_moseq(
         inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
         if inside is None:
             raise _no_depth(path, found)
-        return _Session(path, inside, found, camera, fps, progress).open(_archive_name(path), [path], folder)
+        return _Session(path, inside, found, camera, fps, progress).open(
+            _archive_name(path), [path], folder
+        )
     except BaseException:
         remove_tree(folder)
         raise
@@ -113,8 +131,12 @@ def open_moseq(
 
 def _no_depth(path: Path, found: Unpacked) -> RecordingError:
     if found.cut:
-        return RecordingError(f"{path} is cut short before its {DEPTH}, so no frame can be read; copy it again")
-    return RecordingError(f"{path} should hold a MoSeq session, but there is no {DEPTH} in it; give another archive")
+        return RecordingError(
+            f"{path} is cut short before its {DEPTH}, so no frame can be read; copy it again"
+        )
+    return RecordingError(
+        f"{path} should hold a MoSeq session, but there is no {DEPTH} in it; give another archive"
+    )
 
 
 def _archive_name(path: Path) -> str:
@@ -129,7 +151,13 @@ class _Session:
     """A session while it is opened: its depth file, what lies beside it, and what was odd so far."""
 
     def __init__(
-        self, path: Path, depth: Path, found: Unpacked, camera: Lens | None, fps: float | None, progress: Progress
+        self,
+        path: Path,
+        depth: Path,
+        found: Unpacked,
+        camera: Lens | None,
+        fps: float | None,
+        progress: Progress,
     ) -> None:
         self.path, self.depth, self.cut, self.progress = path, depth, found.cut, progress
         self.stated_camera, self.fps = camera, fps
@@ -165,7 +193,9 @@ class _Session:
                 f"{video.width} x {video.height} pixels, which was used"
             )
         if video.truncated or self.cut:
-            self.problems.append(f"{self.depth.name} is cut or damaged; its {len(video)} whole frames can be read")
+            self.problems.append(
+                f"{self.depth.name} is cut or damaged; its {len(video)} whole frames can be read"
+            )
         return video, video.track
 
     def _open_raw(self) -> RawFrames:
@@ -184,7 +214,9 @@ class _Session:
                 else f"holds {n} frames, but its archive is cut or damaged"
             )
             self.problems.append(f"{DEPTH} {where}; its {n} whole frames can be read")
-        return RawFrames(self.depth, width, height, self.metadata.dtype, n, bool(left_over) or self.cut)
+        return RawFrames(
+            self.depth, width, height, self.metadata.dtype, n, bool(left_over) or self.cut
+        )
 
     def _size_of_camera(self) -> tuple[int, int] | None:
         if isinstance(self.stated_camera, Camera):
@@ -206,19 +238,35 @@ class _Session:
         return _KINECT_V2_SIZE
 
     def _recording(
-        self, name: str, sources: list[Path], stack: Stack, track: DepthTrack | None, close: Callable[[], None]
+        self,
+        name: str,
+        sources: list[Path],
+        stack: Stack,
+        track: DepthTrack | None,
+        close: Callable[[], None],
     ) -> Recording:
         camera = self._camera(stack, track)
         times = self._times(len(stack), track)
         settled = settle(times)
         self.problems += [settled.problem] if settled.problem else []
-        start = {"session_start_time": track.session_start} if track is not None and track.session_start else {}
+        start = (
+            {"session_start_time": track.session_start}
+            if track is not None and track.session_start
+            else {}
+        )
         return Recording(
-            name=name, format="moseq", camera=camera, times_ns=settled.times_ns,
-            read=Pictures(stack, self.camera_file.decode, self.problems).read, sources=sources, problems=self.problems,
-            truncated=stack.truncated or self.cut, close=close, faults=settled.faults,
+            name=name,
+            format="moseq",
+            camera=camera,
+            times_ns=settled.times_ns,
+            read=Pictures(stack, self.camera_file.decode, self.problems).read,
+            sources=sources,
+            problems=self.problems,
+            truncated=stack.truncated or self.cut,
+            close=close,
+            faults=settled.faults,
             metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
-        )  # fmt: skip
+        )
 
     def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
         """Stated, or else from the factory's calibration in the file, or else typical of the camera that recorded."""
@@ -226,7 +274,11 @@ class _Session:
         if self.stated_camera is not None or self.camera_file.intrinsics:
             return self.camera_file.camera(width, height, self.stated_camera)
         mode = mode_of(width, height)
-        lenses = [read_calibration(data) for data in track.attachments.values()] if track is not None else []
+        lenses = (
+            [read_calibration(data) for data in track.attachments.values()]
+            if track is not None
+            else []
+        )
         lens = next((lens for lens in lenses if lens is not None), None)
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
@@ -238,7 +290,9 @@ class _Session:
             self._say_typical(f"Azure Kinect in the mode {mode.name}")
             return azure_camera(mode, None)
         whose = (
-            f"the camera {self.metadata.camera_name!r}" if self.metadata.camera_name else "a camera that is not known"
+            f"the camera {self.metadata.camera_name!r}"
+            if self.metadata.camera_name
+            else "a camera that is not known"
         )
         raise RecordingError(
             f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a camera.toml beside it with "

@@ -117,7 +117,14 @@ class DepthNode:
         cropped, *crop = self.numbers(CROPPING, "<IHHHH") or (0,)
         part = (crop[0], crop[1], crop[2], crop[3]) if cropped else (0, 0, mode[0], mode[1])
         unit = self.number(UNIT)
-        return Look(mode[0], mode[1], part, bool(self.number(MIRROR)), _MILLIMETRES if unit is None else unit, mode[2])
+        return Look(
+            mode[0],
+            mode[1],
+            part,
+            bool(self.number(MIRROR)),
+            _MILLIMETRES if unit is None else unit,
+            mode[2],
+        )
 
 
 @dataclass

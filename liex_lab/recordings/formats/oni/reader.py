@@ -47,7 +47,9 @@ _FIELDS_OF_VIEW = (math.radians(5.0), math.radians(170.0))
 class OniFrames:
     """Frames of one depth node, fetched from the file one at a time."""
 
-    def __init__(self, file: OniFile, node: DepthNode, look: Look, how: CameraFile, problems: list[str]) -> None:
+    def __init__(
+        self, file: OniFile, node: DepthNode, look: Look, how: CameraFile, problems: list[str]
+    ) -> None:
         """look: what frames must agree with to be of this recording; how: a camera.toml beside it."""
         self._file, self._node, self._look, self._problems = file, node, look, problems
         self._looks = list(node.looks)
@@ -120,33 +122,50 @@ def open_oni(
         raise
 
 
-def _open(path: Path, file: OniFile, camera: Lens | None, fps: float | None, progress: Progress) -> Recording:
+def _open(
+    path: Path, file: OniFile, camera: Lens | None, fps: float | None, progress: Progress
+) -> Recording:
     index = index_file(file, progress)
     problems: list[str] = []
     node = _choose(path, file, index, problems)
     look = _look(path, node, problems)
     n, whole = len(node), file.whole and (node.n_stated is None or node.n_stated <= len(node))
     if node.n_stated not in (None, n):
-        problems.append(f"{path.name} promises {node.n_stated} frames of {node.name}, and {n} are in it")
+        problems.append(
+            f"{path.name} promises {node.n_stated} frames of {node.name}, and {n} are in it"
+        )
     if not whole:
-        problems.append(f"{path.name} is cut or damaged; {n} whole frame{'' if n == 1 else 's'} can be read from it")
+        problems.append(
+            f"{path.name} is cut or damaged; {n} whole frame{'' if n == 1 else 's'} can be read from it"
+        )
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems += camera_file.problems
     the_camera = _camera(path, node, look, camera_file, camera, problems)
     settled = _times(node, look, fps, problems)
     times = settled.times_ns
     frames = OniFrames(file, node, look, camera_file, problems)
-    if not any(frames.decode(i) is not None for i in np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()):
+    if not any(
+        frames.decode(i) is not None
+        for i in np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()
+    ):
         raise RecordingError(
             f"{path} states pictures of {look.width} x {look.height} pixels, but its frames do not unpack to that; it "
             "is damaged, so copy it again"
         )
     start = start_of_clock(int(times[0]))
     return Recording(
-        name=path.resolve().stem, format="oni", camera=the_camera, times_ns=times, read=frames.read, sources=[path],
-        problems=problems, truncated=not whole, close=file.close, faults=settled.faults,
+        name=path.resolve().stem,
+        format="oni",
+        camera=the_camera,
+        times_ns=times,
+        read=frames.read,
+        sources=[path],
+        problems=problems,
+        truncated=not whole,
+        close=file.close,
+        faults=settled.faults,
         metadata=({"session_start_time": start} if start else {}) | camera_file.metadata,
-    )  # fmt: skip
+    )
 
 
 def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> DepthNode:
@@ -156,7 +175,9 @@ def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> 
     if not nodes:
         named = sorted({node.name for node in index.depth.values()} | index.others)
         what = f"its nodes are {', '.join(named)}" if named else "it holds no node of any kind"
-        raise RecordingError(f"{path} holds no depth frames: {cut}{what}; give a recording of the depth camera")
+        raise RecordingError(
+            f"{path} holds no depth frames: {cut}{what}; give a recording of the depth camera"
+        )
     node = nodes[0]
     if len(nodes) > 1:
         problems.append(
@@ -172,29 +193,43 @@ def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> 
 
 def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
     """The look that most frames have; those with another size or unit will be unread."""
-    count = np.bincount(np.frombuffer(node.look_of, node.look_of.typecode), minlength=len(node.looks))
+    count = np.bincount(
+        np.frombuffer(node.look_of, node.look_of.typecode), minlength=len(node.looks)
+    )
     look = list(node.looks)[int(count.argmax())]
     if look is None:
-        raise RecordingError(f"{path} does not state the size of its pictures (xnMapOutputMode); copy it again")
+        raise RecordingError(
+            f"{path} does not state the size of its pictures (xnMapOutputMode); copy it again"
+        )
     if not 0 < look.width * look.height <= _MOST_PIXELS:
         raise RecordingError(
             f"{path} states pictures of {look.width} x {look.height} pixels, which no depth camera has; it is damaged, "
             "so copy it again"
         )
     if look.pixel_format not in _UNIT_MM:
-        what = "the sensor's raw shifts" if look.pixel_format in _SHIFTS else f"the unit {look.pixel_format}"
+        what = (
+            "the sensor's raw shifts"
+            if look.pixel_format in _SHIFTS
+            else f"the unit {look.pixel_format}"
+        )
         raise RecordingError(
             f"{path} holds {what} (oniPixelFormat), and depth in steps of 1 mm or 0.1 mm can be read; record it again "
             "as depth"
         )
-    others = sum(int(n) for each, n in zip(node.looks, count, strict=True) if not each or each.picture != look.picture)
+    others = sum(
+        int(n)
+        for each, n in zip(node.looks, count, strict=True)
+        if not each or each.picture != look.picture
+    )
     if others:
         problems.append(
             f"{others} of {len(node)} frames have another size or unit than {look.width} x {look.height} pixels, and "
             "are taken as wholly unread"
         )
     if look.mirrored:
-        problems.append("the camera delivered mirror images (xnMirror); left and right were put back in their places")
+        problems.append(
+            "the camera delivered mirror images (xnMirror); left and right were put back in their places"
+        )
     if look.part[2:] != (look.width, look.height):
         x, y, width, height = look.part
         problems.append(
@@ -211,8 +246,14 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
     if n > 1 and np.all(stamps == stamps[0]):
         stated = rate(fps, "the call")
         hz = stated or float(look.fps if 0 < look.fps <= 1000 else _NOMINAL_HZ)
-        origin = "as stated" if stated else "which the file names as its rate; state fps if yours differs"
-        problems.append(f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, {origin}")
+        origin = (
+            "as stated"
+            if stated
+            else "which the file names as its rate; state fps if yours differs"
+        )
+        problems.append(
+            f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, {origin}"
+        )
         return settle(from_rate(n, hz))
     order = np.arange(n)
     sane = np.maximum.accumulate(np.where(stamps <= _LATEST_US, order, 0))
@@ -228,14 +269,23 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
 
 
 def _camera(
-    path: Path, node: DepthNode, look: Look, camera_file: CameraFile, stated: Lens | None, problems: list[str]
+    path: Path,
+    node: DepthNode,
+    look: Look,
+    camera_file: CameraFile,
+    stated: Lens | None,
+    problems: list[str],
 ) -> Camera:
     """Stated by the caller, or else in a camera.toml beside the file, or else what the camera said of itself."""
     # a camera.toml comes first here: what is in the file is the design of the make and no calibration of this camera
     if stated is not None or camera_file.intrinsics:
         return camera_file.camera(look.width, look.height, stated)
     ours = node.numbers(INTRINSICS, "<dddd")
-    if ours is not None and np.isfinite(ours).all() and _can_be((ours[0], ours[1]), (look.width, look.height)):
+    if (
+        ours is not None
+        and np.isfinite(ours).all()
+        and _can_be((ours[0], ours[1]), (look.width, look.height))
+    ):
         source = f"intrinsics in the .oni file ({INTRINSICS})"
         return Camera(ours[0], ours[1], ours[2], ours[3], look.width, look.height, source=source)
     focal, source = _stated_focal(node, look, problems)
@@ -255,11 +305,15 @@ def _camera(
     return Camera(*focal, cx, look.height / 2, look.width, look.height, source=source)
 
 
-def _stated_focal(node: DepthNode, look: Look, problems: list[str]) -> tuple[tuple[float, float] | None, str]:
+def _stated_focal(
+    node: DepthNode, look: Look, problems: list[str]
+) -> tuple[tuple[float, float] | None, str]:
     """Focal lengths (fx, fy) px and where they come from; (None, "") where the file states none that can be."""
     size = look.width, look.height
     found: list[tuple[tuple[float, float], str]] = []
-    if (view := node.numbers(FIELD_OF_VIEW, "<dd")) is not None and all(0 < angle < math.pi for angle in view):
+    if (view := node.numbers(FIELD_OF_VIEW, "<dd")) is not None and all(
+        0 < angle < math.pi for angle in view
+    ):
         fx, fy = (n / 2 / math.tan(angle / 2) for n, angle in zip(size, view, strict=True))
         found.append(((fx, fy), "field of view in the .oni file (xnFOV)"))
     if (plane := node.numbers(OLD_LENS, "<ddd")) is not None and plane[1] * plane[2] > 0:
@@ -272,7 +326,9 @@ def _stated_focal(node: DepthNode, look: Look, problems: list[str]) -> tuple[tup
     for focal_lengths, source in found:
         if _can_be(focal_lengths, size):
             return focal_lengths, source
-        problems.append(f"the {source} cannot be: focal lengths of {focal_lengths[0]:g} and {focal_lengths[1]:g} px")
+        problems.append(
+            f"the {source} cannot be: focal lengths of {focal_lengths[0]:g} and {focal_lengths[1]:g} px"
+        )
     return None, ""
 
 

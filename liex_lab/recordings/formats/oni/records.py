@@ -12,12 +12,19 @@ from liex_lab.errors import RecordingError
 from liex_lab.runtime.progress import Progress
 
 FILE_MAGIC: Final = b"NI10"
-FILE_HEADER: Final = struct.Struct("<4sBBHIQI")  # magic, major, minor, maintenance, build, last time, highest node id
+FILE_HEADER: Final = struct.Struct(
+    "<4sBBHIQI"
+)  # magic, major, minor, maintenance, build, last time, highest node id
 VERSION: Final = (1, 0, 1, 0)
-_OLDEST, _FIRST_WIDE = (1, 0, 0, 4), (1, 0, 1, 0)  # before 1.0.1.0, positions in the file have 32 bits
+_OLDEST, _FIRST_WIDE = (
+    (1, 0, 0, 4),
+    (1, 0, 1, 0),
+)  # before 1.0.1.0, positions in the file have 32 bits
 
 RECORD_MAGIC: Final = 0x0052494E  # "NIR" and a zero byte
-HEADER: Final = struct.Struct("<IIIIIQ")  # magic, kind, node, size of header and fields, of payload, position it undoes
+HEADER: Final = struct.Struct(
+    "<IIIIIQ"
+)  # magic, kind, node, size of header and fields, of payload, position it undoes
 _OLD_HEADER = struct.Struct("<IIIIII")
 _OLD_NODE, _NODE_5, NODE = 0x02, 0x0C, 0x0D
 INTEGER, REAL, TEXT, BYTES = 0x03, 0x04, 0x05, 0x06
@@ -27,7 +34,11 @@ PROPERTIES: Final = (INTEGER, REAL, TEXT, BYTES)
 
 DEPTH_NODE: Final = 2  # 1 is the device, 3 colour, 4 infrared
 FRAME_FIELDS: Final = struct.Struct("<QI")  # time in µs, number of the frame, counted from 1
-SEEK_ENTRY: Final = [("time_us", "<u8"), ("configuration", "<u4"), ("at", "<u8")]  # of every frame, after an empty one
+SEEK_ENTRY: Final = [
+    ("time_us", "<u8"),
+    ("configuration", "<u4"),
+    ("at", "<u8"),
+]  # of every frame, after an empty one
 OLD_SEEK_ENTRY: Final = [("time_us", "<u8"), ("configuration", "<u4"), ("at", "<u4")]
 _NODE_FIELDS = struct.Struct("<i4s")  # kind, codec
 _NODE_COUNTS = struct.Struct("<IQQ")  # frames, first and last time
@@ -61,7 +72,9 @@ class _Head(NamedTuple):
 
     @property
     def record(self) -> Record:
-        return Record(self.kind, self.node, self.fields, self.at + self.fields_size, self.payload_size)
+        return Record(
+            self.kind, self.node, self.fields, self.at + self.fields_size, self.payload_size
+        )
 
 
 @dataclass
@@ -81,7 +94,9 @@ class OniFile:
         try:
             head = file.read(FILE_HEADER.size)
             if len(head) < FILE_HEADER.size or not head.startswith(FILE_MAGIC):
-                raise RecordingError(f"{path} is named like an .oni file but holds something else; give another file")
+                raise RecordingError(
+                    f"{path} is named like an .oni file but holds something else; give another file"
+                )
             version = FILE_HEADER.unpack(head)[1:5]
             if not _OLDEST <= version <= VERSION:
                 raise RecordingError(
@@ -114,8 +129,12 @@ class OniFile:
                 if nearest is None and (ended or head.end > self.size):
                     break  # some bytes after the end, or the record that was cut
                 self.whole = False
-                if nearest is not None and nearest.at < head.end:  # its own size is damaged, not its neighbour
-                    head = head._replace(payload_size=max(0, nearest.at - head.at - head.fields_size))
+                if (
+                    nearest is not None and nearest.at < head.end
+                ):  # its own size is damaged, not its neighbour
+                    head = head._replace(
+                        payload_size=max(0, nearest.at - head.at - head.fields_size)
+                    )
             yield head.record
             if head.end >> 20 != told:
                 told = head.end >> 20
@@ -144,11 +163,18 @@ class OniFile:
             return None
         magic, kind, node, fields_size, payload_size, _ = header.unpack_from(raw)
         size = fields_size - header.size
-        if magic != RECORD_MAGIC or kind not in _KINDS or size < 0 or (kind == FRAME and size != FRAME_FIELDS.size):
+        if (
+            magic != RECORD_MAGIC
+            or kind not in _KINDS
+            or size < 0
+            or (kind == FRAME and size != FRAME_FIELDS.size)
+        ):
             return None
         if size > len(raw) - header.size:
             raw = self.read(at, header.size + min(size, _MOST_FIELDS))
-        return _Head(at, kind, node, fields_size, payload_size, raw[header.size : header.size + size])
+        return _Head(
+            at, kind, node, fields_size, payload_size, raw[header.size : header.size + size]
+        )
 
     def _search(self, start: int) -> _Head | None:
         """The first record from a position on that lies within the file."""

@@ -30,7 +30,9 @@ _LARGEST = {"16zT": 0xFFFF, "16zP": 0x7FFF, "NONE": 0xFFFF}  # stored value
 _PIXEL_FORMATS = {1.0: 100, 0.1: 101}  # mm in a stored step: OpenNI's number for it
 _UNKNOWN_COUNT, _UNKNOWN_TIME = 0xFFFFFFFF, 2**64 - 1  # what stands in a file until it is closed
 _NOMINAL_FPS = 30.0
-_MOST_IN_SEEK_TABLE = 288_000  # OpenNI2 cannot open a file with a longer table, but one without a table
+_MOST_IN_SEEK_TABLE = (
+    288_000  # OpenNI2 cannot open a file with a longer table, but one without a table
+)
 
 
 def write_oni(
@@ -52,14 +54,23 @@ def write_oni(
     """
     path = Path(path)
     if path.exists() and not overwrite:
-        raise RecordingError(f"{path} is there already; give another name, or allow it to be overwritten")
+        raise RecordingError(
+            f"{path} is there already; give another name, or allow it to be overwritten"
+        )
     if not path.parent.is_dir():
-        raise RecordingError(f"there is no folder {path.parent} to write {path.name} into; make it first")
+        raise RecordingError(
+            f"there is no folder {path.parent} to write {path.name} into; make it first"
+        )
     if unit_mm not in _PIXEL_FORMATS:
         raise ValueError(f"a step of an .oni file is 1 mm or 0.1 mm, got {unit_mm}")
-    start_us = min(0, _microseconds(int(recording.times_ns[0])))  # the format has no time before zero
+    start_us = min(
+        0, _microseconds(int(recording.times_ns[0]))
+    )  # the format has no time before zero
     rate_hz = float(np.nan_to_num(recording.rate_hz, nan=_NOMINAL_FPS))
-    with _in_place(path) as part, OniWriter(part, recording.camera, codec, unit_mm, rate_hz, exact=exact) as out:
+    with (
+        _in_place(path) as part,
+        OniWriter(part, recording.camera, codec, unit_mm, rate_hz, exact=exact) as out,
+    ):
         for frame in recording:
             out.add(_microseconds(frame.time_ns) - start_us, frame.depth)
             progress(frame.index + 1, len(recording), f"writing {path.name}")
@@ -94,7 +105,9 @@ class OniWriter:
             raise
 
     def _begin(self, camera: Camera, rate_hz: float) -> None:
-        self._file.write(records.FILE_HEADER.pack(records.FILE_MAGIC, *records.VERSION, _UNKNOWN_TIME, _NODE))
+        self._file.write(
+            records.FILE_HEADER.pack(records.FILE_MAGIC, *records.VERSION, _UNKNOWN_TIME, _NODE)
+        )
         self._node_at = self._file.tell()
         self._write(records.NODE, self._node_fields(_UNKNOWN_COUNT, _UNKNOWN_TIME, 0))
         for kind, name, value in _properties(camera, _PIXEL_FORMATS[self._unit_mm], rate_hz):
@@ -105,7 +118,11 @@ class OniWriter:
     def add(self, time_us: int, depth: Depth) -> None:
         """Append a frame: its time in µs, and its depth (H, W) mm."""
         stored = self._stored(depth)
-        payload = stored.tobytes() if self._codec == "NONE" else pack_16z(stored.ravel(), self._codec == "16zT")
+        payload = (
+            stored.tobytes()
+            if self._codec == "NONE"
+            else pack_16z(stored.ravel(), self._codec == "16zT")
+        )
         if payload is None:
             raise RecordingError(
                 f"frame {len(self._entries)} holds more different depths than the code {self._codec} can tell apart; "
@@ -113,7 +130,9 @@ class OniWriter:
             )
         before = self._entries[-1][1] if self._entries else 0
         self._entries.append((time_us, self._file.tell()))
-        self._write(records.FRAME, records.FRAME_FIELDS.pack(time_us, len(self._entries)), payload, before)
+        self._write(
+            records.FRAME, records.FRAME_FIELDS.pack(time_us, len(self._entries)), payload, before
+        )
 
     def close(self) -> None:
         """Write what belongs at the end, and the counts at the beginning."""
@@ -123,7 +142,9 @@ class OniWriter:
         if n <= _MOST_IN_SEEK_TABLE:
             table_at = self._file.tell()
             table = np.zeros(n + 1, records.SEEK_ENTRY)
-            table["time_us"][1:], table["at"][1:] = np.array(self._entries, np.uint64).reshape(n, 2).T
+            table["time_us"][1:], table["at"][1:] = (
+                np.array(self._entries, np.uint64).reshape(n, 2).T
+            )
             self._write(records.SEEK_TABLE, payload=table.tobytes())
         self._write(records.END, node=0)
         self._file.seek(self._node_at)
@@ -133,7 +154,12 @@ class OniWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         try:
             if kind is None:
                 self.close()
@@ -144,7 +170,14 @@ class OniWriter:
         """Let go of the file as it is."""
         self._file.close()
 
-    def _write(self, kind: int, fields: bytes = b"", payload: bytes = b"", undoes: int = 0, node: int = _NODE) -> None:
+    def _write(
+        self,
+        kind: int,
+        fields: bytes = b"",
+        payload: bytes = b"",
+        undoes: int = 0,
+        node: int = _NODE,
+    ) -> None:
         size = records.HEADER.size + len(fields)
         head = records.HEADER.pack(records.RECORD_MAGIC, kind, node, size, len(payload), undoes)
         self._file.write(head + fields)
@@ -175,17 +208,28 @@ class OniWriter:
 def _properties(camera: Camera, pixel_format: int, rate_hz: float) -> list[tuple[int, str, bytes]]:
     """Kind, name and value of what a node says of itself; OpenNI2's player wants all but the last, in this form."""
     mode = struct.pack("<III", camera.width, camera.height, round(min(max(rate_hz, 1.0), 1000.0)))
-    view = [2 * math.atan(n / 2 / f) for n, f in ((camera.width, camera.fx), (camera.height, camera.fy))]
+    view = [
+        2 * math.atan(n / 2 / f) for n, f in ((camera.width, camera.fx), (camera.height, camera.fy))
+    ]
     integers = {
-        "oniRequiredFrameSize": 2 * camera.width * camera.height, "xnIsGenerating": 1, "xnDeviceMaxDepth": 0xFFFF,
-        "xnSupportedMapOutputModesCount": 1, "xnPixelFormat": 4, properties.UNIT: pixel_format, "Cropping": 1,
-        "Mirror": 1, properties.MIRROR: 0,
-    }  # fmt: skip
+        "oniRequiredFrameSize": 2 * camera.width * camera.height,
+        "xnIsGenerating": 1,
+        "xnDeviceMaxDepth": 0xFFFF,
+        "xnSupportedMapOutputModesCount": 1,
+        "xnPixelFormat": 4,
+        properties.UNIT: pixel_format,
+        "Cropping": 1,
+        "Mirror": 1,
+        properties.MIRROR: 0,
+    }
     values = {
-        "xnSupportedMapOutputModes": mode, properties.MODE: mode, "xnSupportedPixelFormats": struct.pack("<I", 8),
-        properties.FIELD_OF_VIEW: struct.pack("<dd", *view), properties.CROPPING: bytes(12),
+        "xnSupportedMapOutputModes": mode,
+        properties.MODE: mode,
+        "xnSupportedPixelFormats": struct.pack("<I", 8),
+        properties.FIELD_OF_VIEW: struct.pack("<dd", *view),
+        properties.CROPPING: bytes(12),
         properties.INTRINSICS: struct.pack("<dddd", camera.fx, camera.fy, camera.cx, camera.cy),
-    }  # fmt: skip
+    }
     # the player takes the size before the unit
     return [
         *((records.BYTES, name, value) for name, value in values.items()),
@@ -201,6 +245,8 @@ def _in_place(path: Path) -> Iterator[Path]:
         yield part
         part.replace(path)
     except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror or error}); check the place") from None
+        raise RecordingError(
+            f"{path} cannot be written ({error.strerror or error}); check the place"
+        ) from None
     finally:
         part.unlink(missing_ok=True)

@@ -12,8 +12,17 @@ from liex_lab.recordings.formats.video.index import DepthTrack, even_times
 from liex_lab.runtime.progress import Progress
 
 _CHUNK = struct.Struct("<4sI")  # name, length of what follows
-_LISTS = (b"AVI ", b"AVIX", b"hdrl", b"strl", b"movi", b"rec ")  # what is stepped into; other lists are passed over
-_STREAM = struct.Struct("<4s4sIHHIIIII")  # strh: kind, codec, flags, priority, language, initial, scale, rate, start, n
+_LISTS = (
+    b"AVI ",
+    b"AVIX",
+    b"hdrl",
+    b"strl",
+    b"movi",
+    b"rec ",
+)  # what is stepped into; other lists are passed over
+_STREAM = struct.Struct(
+    "<4s4sIHHIIIII"
+)  # strh: kind, codec, flags, priority, language, initial, scale, rate, start, n
 _HEADER_BYTES = 1 << 16
 
 
@@ -32,7 +41,9 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
     number = b""
     with path.open("rb", buffering=0) as file:
         if file.read(4) != b"RIFF":
-            raise RecordingError(f"{path} is named like an AVI video but holds something else; give another file")
+            raise RecordingError(
+                f"{path} is named like an AVI video but holds something else; give another file"
+            )
         for chunk in _walk(file, size, track):
             if chunk.name == b"strh" and chunk.size >= _STREAM.size:
                 kind, *_, a, b, _, n = _STREAM.unpack(_read(file, chunk)[: _STREAM.size])
@@ -61,7 +72,9 @@ def _walk(file: IO[bytes], size: int, track: DepthTrack) -> Iterator[_Chunk]:
         file.seek(at)
         name, length = _CHUNK.unpack(file.read(_CHUNK.size))
         start = at + _CHUNK.size
-        if not all(32 <= byte < 127 for byte in name):  # no chunk's name: what follows cannot be told from noise
+        if not all(
+            32 <= byte < 127 for byte in name
+        ):  # no chunk's name: what follows cannot be told from noise
             track.whole = False
             return
         if name in (b"RIFF", b"LIST") and file.read(4) in _LISTS:

@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 FFV1 = "ffv1"
-RAW = {"b16g": ">u2", "Y16 ": "<u2", "Y16": "<u2"}  # code of uncompressed 16-bit grey: how its numbers are stored
-BITMAP_HEADER = struct.Struct("<IiiHH4s5I")  # Windows' BITMAPINFOHEADER, in AVI and in Matroska alike
+RAW = {
+    "b16g": ">u2",
+    "Y16 ": "<u2",
+    "Y16": "<u2",
+}  # code of uncompressed 16-bit grey: how its numbers are stored
+BITMAP_HEADER = struct.Struct(
+    "<IiiHH4s5I"
+)  # Windows' BITMAPINFOHEADER, in AVI and in Matroska alike
 
 
 @dataclass
@@ -42,7 +48,10 @@ class DepthTrack:
         if len(data) < BITMAP_HEADER.size:
             return
         _, width, height, _, bits, code, *_ = BITMAP_HEADER.unpack_from(data)
-        self.width, self.height = max(width, 0), abs(height)  # negative: rows from the top, as ours are
+        self.width, self.height = (
+            max(width, 0),
+            abs(height),
+        )  # negative: rows from the top, as ours are
         name = code.decode("ascii", "replace")
         self.codec = FFV1 if name.upper() == "FFV1" else name.strip("\0") or f"{bits}-bit bitmaps"
         self.private = data[BITMAP_HEADER.size :]

@@ -19,13 +19,31 @@ from liex_lab.runtime.progress import Progress
 
 _MAGIC = b"\x1aE\xdf\xa3"
 _SEGMENT, _CLUSTER, _GROUP = 0x18538067, 0x1F43B675, 0xA0
-_STEPPED_INTO = (_SEGMENT, _CLUSTER, _GROUP)  # a live recording leaves their sizes open, so none is relied on
+_STEPPED_INTO = (
+    _SEGMENT,
+    _CLUSTER,
+    _GROUP,
+)  # a live recording leaves their sizes open, so none is relied on
 _INFO, _TRACKS, _TAGS, _ATTACHMENTS = 0x1549A966, 0x1654AE6B, 0x1254C367, 0x1941A469
 _CLUSTER_TIME, _SIMPLE_BLOCK, _BLOCK = 0xE7, 0xA3, 0xA1
 _PASSED_OVER = (
-    0x1A45DFA3, 0x114D9B74, 0x1C53BB6B, 0x1043A770, 0xEC, 0xBF,  # file head, seek head, cues, chapters, void, CRC
-    0xA7, 0xAB, 0x5854, 0x9B, 0xFB, 0xFA, 0xA4, 0x75A1, 0x75A2, 0x8E,  # within clusters and block groups
-)  # fmt: skip
+    0x1A45DFA3,
+    0x114D9B74,
+    0x1C53BB6B,
+    0x1043A770,
+    0xEC,
+    0xBF,  # file head, seek head, cues, chapters, void, CRC
+    0xA7,
+    0xAB,
+    0x5854,
+    0x9B,
+    0xFB,
+    0xFA,
+    0xA4,
+    0x75A1,
+    0x75A2,
+    0x8E,  # within clusters and block groups
+)
 _NUMBER, _UID, _TYPE, _NAME, _CODEC, _PRIVATE, _VIDEO, _ENCODINGS = (
     0xD7,
     0x73C5,
@@ -66,7 +84,9 @@ def index_mkv(path: Path, progress: Progress) -> DepthTrack:
     found = _Walk()
     with path.open("rb", buffering=0) as file:
         if file.read(4) != _MAGIC:
-            raise RecordingError(f"{path} is named like a Matroska video but holds something else; give another file")
+            raise RecordingError(
+                f"{path} is named like a Matroska video but holds something else; give another file"
+            )
         for element in _elements(file, 0, size, found):
             found.take(file, element)
             progress(element.start >> 20, (size >> 20) + 1, "looking through the video (MB)")
@@ -81,7 +101,11 @@ def index_mkv(path: Path, progress: Progress) -> DepthTrack:
     limit = LIMIT_NS // found.scale_ns
     depth.times_ns = np.clip(pictures[:, 2], -limit, limit) * found.scale_ns
     depth.tags = {name: value for (uid, name), value in found.tags.items() if uid in (0, track.uid)}
-    depth.attachments, depth.whole, depth.session_start = found.attachments, found.whole, found.start
+    depth.attachments, depth.whole, depth.session_start = (
+        found.attachments,
+        found.whole,
+        found.start,
+    )
     return depth
 
 
@@ -176,7 +200,15 @@ def _elements(file: IO[bytes], at: int, size: int, found: _Walk) -> Iterator[_El
         length, start = _vint(head, after)
         element = _Element(id, at + start, length)
         known = id in _STEPPED_INTO or id in _PASSED_OVER
-        known = known or id in (_CLUSTER_TIME, _SIMPLE_BLOCK, _BLOCK, _INFO, _TRACKS, _TAGS, _ATTACHMENTS)
+        known = known or id in (
+            _CLUSTER_TIME,
+            _SIMPLE_BLOCK,
+            _BLOCK,
+            _INFO,
+            _TRACKS,
+            _TAGS,
+            _ATTACHMENTS,
+        )
         if not known or (length < 0 and id not in _STEPPED_INTO):
             found.whole = False
             return
@@ -232,7 +264,12 @@ def _text(table: dict[int, list[bytes]], id: int) -> str:
 
 def _read_track(entry: bytes) -> _Track:
     table = _table(entry)
-    track = _Track(_number(table, _NUMBER), _number(table, _UID), _number(table, _TYPE) == 1, _text(table, _NAME))
+    track = _Track(
+        _number(table, _NUMBER),
+        _number(table, _UID),
+        _number(table, _TYPE) == 1,
+        _text(table, _NAME),
+    )
     depth, codec, private = track.depth, _text(table, _CODEC), table.get(_PRIVATE, [b""])[0]
     if codec == "V_MS/VFW/FOURCC":
         depth.take_bitmap_header(private)

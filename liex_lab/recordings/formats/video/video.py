@@ -48,7 +48,9 @@ class DepthVideo:
         heads = (self._bytes(k, 2) for k in range(len(self)))
         self._keys = np.array([k for k, head in enumerate(heads) if is_key(head)], np.int64)
         self._ffv1 = Ffv1(track.width, track.height, track.private)
-        require_depth(self._ffv1, (self._bytes(int(k)) for k in self._keys[:_N_ASKED]), str(self._path))
+        require_depth(
+            self._ffv1, (self._bytes(int(k)) for k in self._keys[:_N_ASKED]), str(self._path)
+        )
 
     def __len__(self) -> int:
         return len(self.track.offsets)
@@ -113,6 +115,12 @@ def open_video(path: Path, progress: Progress) -> DepthVideo:
         raise RecordingError(
             f"expected 16-bit depth in FFV1 or uncompressed, but {path} {named}; give the video of the depth itself"
         )
-    if not track.offsets or not (track.width and track.height) or too_large((track.width, track.height)):
-        raise RecordingError(f"{path} is cut short or damaged and holds no whole picture; copy it again")
+    if (
+        not track.offsets
+        or not (track.width and track.height)
+        or too_large((track.width, track.height))
+    ):
+        raise RecordingError(
+            f"{path} is cut short or damaged and holds no whole picture; copy it again"
+        )
     return DepthVideo(path, track)
