@@ -1,4 +1,5 @@
-"""The picture in README.md: some of the report's own figures on one small page, photographed by a browser.
+"""The picture in README.md: some of the report's own figures on one small page, photographed by a
+browser.
 
 After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again.
 """
@@ -15,7 +16,8 @@ from liex_lab.sessions import Session
 from .report.charts import charts, curves, pictures
 from .report.report import TEMPLATES
 
-WIDTH, HEIGHT = 860, 690
+WIDTH = 860
+HEIGHT = 690
 _SHOWN = 4  # of the contact sheet
 _STYLE = f"""
 :root {{ color-scheme: light; }}
@@ -30,7 +32,9 @@ svg image {{ image-rendering: pixelated; }}
 
 
 def page(session: Session) -> str:
-    """A page of four fitted frames, the way over the floor, and actions, speed and nose height over time."""
+    """A page of four fitted frames, the way over the floor, and actions, speed and nose height over
+    time.
+    """
     template = (TEMPLATES / "report.html.j2").read_text(encoding="utf-8")
     style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
     drawn = charts(session, list(session.metadata["actions"]))
@@ -39,7 +43,8 @@ def page(session: Session) -> str:
         {round(k * (len(sheet) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)} if sheet else ()
     )
     strip = "".join(
-        f"<figure>{svg}<figcaption><b>{word.replace('_', ' ') or '–'}</b> · {when}</figcaption></figure>"
+        f"<figure>{svg}<figcaption><b>{word.replace('_', ' ') or '–'}</b> · "
+        f"{when}</figcaption></figure>"
         for svg, when, word, _ in (sheet[k] for k in some)
     )
     titled = [

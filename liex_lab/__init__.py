@@ -3,7 +3,8 @@
     session_folder = liex_lab.run_session("recording.mcap", plan=liex_lab.Plan.load("mouse"))
     poses = liex_lab.Session.open(session_folder).poses
 
-Importing the package does nothing and costs little: each public name brings its own module along when it is asked for.
+Importing the package does nothing and costs little: each public name brings its own module along
+when it is asked for.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Where jobs and views meet: what `liex run` and `liex demo` do, for Python as for the command line.
+"""Where jobs and views meet: what `liex run` and `liex demo` do, for Python as for the command
+line.
 
-`pipelines` and `dashboards` do not know each other; this module hands the views to the job that writes a session.
+`pipelines` and `dashboards` do not know each other; this module hands the views to the job that
+writes a session.
 """
 
 from __future__ import annotations
@@ -37,12 +39,14 @@ def run_session(
     crew: Crew | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording and write the session folder `out/<recording's name>.liex`; returns it.
+    """Measure every frame of a recording and write the session folder `out/<recording's
+    name>.liex`; returns it.
 
-    recording: a path, or a recording that is open already; plan: None takes the mouse's; folder: the session folder
-    itself, where it should have another name; notes: what session.json is to hold besides; workers: processes that look
-    at stretches of a long recording side by side, or a crew of others; the tables are the same. Raises a LiexError that
-    says what to do, and leaves nothing half-written, where the recording, the plan or the animal in it cannot be used.
+    recording: a path, or a recording that is open already; plan: None takes the mouse's; folder:
+    the session folder itself, where it should have another name; notes: what session.json is to
+    hold besides; workers: processes that look at stretches of a long recording side by side, or a
+    crew of others; the tables are the same. Raises a LiexError that says what to do, and leaves
+    nothing half-written, where the recording, the plan or the animal in it cannot be used.
     """
     from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
     from liex_lab.dashboards.report.views import write_views
@@ -77,8 +81,9 @@ def correct_session(
 ) -> Path:
     """Add corrections to a session, or take some back by their numbers; tables and report follow.
 
-    what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`, everything is made
-    again. author: "" takes who is logged in. What was measured stays as it is; see `liex_lab.sessions.corrections`.
+    what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`,
+    everything is made again. author: "" takes who is logged in. What was measured stays as it is;
+    see `liex_lab.sessions.corrections`.
     """
     from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
     from liex_lab.dashboards.report.views import write_views
@@ -104,7 +109,9 @@ def follow_live(
     patience_s: float = 3.0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured latencies."""
+    """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured
+    latencies.
+    """
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
     from liex_lab.sessions.live import LiveView
@@ -148,9 +155,10 @@ def run_study(
 ) -> list[Standing]:
     """Measure what is to be done of a study; returns where every session stands then.
 
-    workers: processes on this machine, 0 one for every two cores; scheduler: the address of a Dask scheduler; slurm: a
-    file that says how to ask Slurm; retry: try failed sessions again; again: all sessions; only: ids of sessions;
-    dry_run: only look. A session that fails leaves failed.json and stops no other.
+    workers: processes on this machine, 0 one for every two cores; scheduler: the address of a Dask
+    scheduler; slurm: a file that says how to ask Slurm; retry: try failed sessions again; again:
+    all sessions; only: ids of sessions; dry_run: only look. A session that fails leaves failed.json
+    and stops no other.
     """
     from liex_lab.pipelines.study.run import run_study as job
 
@@ -176,10 +184,11 @@ def serve_dashboard(
     told: Callable[[str], None] = print,
     progress: Progress = silent,
 ) -> None:
-    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears the address.
+    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears
+    the address.
 
-    On a host other than this machine alone, every visitor has to know a token, which is part of the address. Raises
-    MissingPackageError where the extra `dashboard` is not installed.
+    On a host other than this machine alone, every visitor has to know a token, which is part of the
+    address. Raises MissingPackageError where the extra `dashboard` is not installed.
     """
     import secrets
 
@@ -189,7 +198,8 @@ def serve_dashboard(
         from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
     except ModuleNotFoundError as error:
         raise MissingPackageError(
-            f"the dashboard needs {error.name}, which is not installed; pip install 'liex_lab[dashboard]'"
+            f"the dashboard needs {error.name}, which is not installed; pip install "
+            "'liex_lab[dashboard]'"
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.sessions.viewer import show_replay
@@ -210,14 +220,18 @@ def serve_dashboard(
 def verify_session(
     session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
-    """Whether a session is what it was when it was written; with its recording, whether that gives the same again."""
+    """Whether a session is what it was when it was written; with its recording, whether that gives
+    the same again.
+    """
     from liex_lab.pipelines.verify import verify_session as job
 
     return job(session, run_session, None if recording is None else str(recording), progress)
 
 
 def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
-    """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it cost in memory."""
+    """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it
+    cost in memory.
+    """
     from liex_lab.dashboards.report.report import write_report
     from liex_lab.pipelines.evaluation.long_sessions import write_long as job
 
@@ -227,7 +241,9 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
 def run_scale(
     n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
-    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes."""
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where
+    the time goes.
+    """
     from liex_lab.pipelines.evaluation.scale import evaluate_scale
 
     return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
@@ -242,7 +258,9 @@ def evaluate_tracking(
     figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error over time."""
+    """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error
+    over time.
+    """
     from functools import partial
 
     from liex_lab.dashboards.paper.tracking import draw_tracking
@@ -261,7 +279,9 @@ def evaluate_actions(
     figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion matrices."""
+    """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion
+    matrices.
+    """
     from functools import partial
 
     from liex_lab.dashboards.paper.confusion import draw_confusions
@@ -282,10 +302,12 @@ def run_tables(
     fresh: bool = False,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Every row of the paper's Tables 1-3 and its figures, written into `out`; returns what was written.
+    """Every row of the paper's Tables 1-3 and its figures, written into `out`; returns what was
+    written.
 
-    animals: () takes those with a bundled model. n_frames: only so many of each split. quick: a few minutes' run whose
-    numbers say only that everything runs. fresh: nothing kept is used, which takes hours.
+    animals: () takes those with a bundled model. n_frames: only so many of each split. quick: a few
+    minutes' run whose numbers say only that everything runs. fresh: nothing kept is used, which
+    takes hours.
     """
     from liex_lab.catalog import bundled_models
     from liex_lab.dashboards.paper.plates import draw_figures

@@ -1,4 +1,6 @@
-"""What comes with the package: the bundled models with their cards, and the data sets with their samples."""
+"""What comes with the package: the bundled models with their cards, and the data sets with their
+samples.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,15 @@ MODELS = _HERE / "models"
 def datasets_folder() -> Path:
     """The folder `datasets`: inside the package once installed, beside it in a clone.
 
-    importlib.resources does not find a folder without code in an editable install, so the two places are tried.
+    importlib.resources does not find a folder without code in an editable install, so the two
+    places are tried.
     """
     for folder in (_HERE / "datasets", _HERE.parent / "datasets"):
         if folder.is_dir():
             return folder
     raise LiexError(
-        f"the folder datasets should be in {_HERE} or beside it, but is in neither; install liex_lab again"
+        f"the folder datasets should be in {_HERE} or beside it, but is in neither; install "
+        "liex_lab again"
     )
 
 
@@ -37,7 +41,8 @@ def find_sample(name: str) -> Path:
     folder = datasets_folder()
     if name and (folder / name).exists():
         return folder / name
-    not_samples, kept = {".toml", ".md"}, kept_results_folder()
+    not_samples = {".toml", ".md"}
+    kept = kept_results_folder()
     known = sorted(
         p.name
         for p in folder.iterdir()
@@ -47,16 +52,20 @@ def find_sample(name: str) -> Path:
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
-    """The cards of the bundled models by name, in alphabetical order; the hashes are not checked here."""
+    """The cards of the bundled models by name, in alphabetical order; the hashes are not checked
+    here.
+    """
     return {
         path.stem: _read_card(path.with_suffix(".json")) for path in sorted(folder.glob("*.npz"))
     }
 
 
 def find_model(model: str | Path, folder: Path = MODELS) -> Path:
-    """The model file of a bundled name ('mouse') or of a path, once its SHA-256 agrees with its card.
+    """The model file of a bundled name ('mouse') or of a path, once its SHA-256 agrees with its
+    card.
 
-    The card is the .json of the same name beside the .npz. A bundled model has one; a model of the user's own may.
+    The card is the .json of the same name beside the .npz. A bundled model has one; a model of the
+    user's own may.
     """
     bundled = folder / f"{model}.npz"
     path = bundled if bundled.is_file() else Path(model)
@@ -69,11 +78,13 @@ def find_model(model: str | Path, folder: Path = MODELS) -> Path:
         )
     card_path = path.with_suffix(".json")
     if path == bundled or card_path.is_file():
-        stated, found = _read_card(card_path)["sha256"], sha256(path)
+        stated = _read_card(card_path)["sha256"]
+        found = sha256(path)
         if stated != found:
             raise ModelError(
-                f"the model {path} is damaged or was changed: its card states SHA-256 {stated[:12]}..., the file has "
-                f"{found[:12]}...; install liex_lab again or make the model again with `liex train`"
+                f"the model {path} is damaged or was changed: its card states SHA-256 "
+                f"{stated[:12]}..., the file has {found[:12]}...; install liex_lab again or make "
+                "the model again with `liex train`"
             )
     return path
 
@@ -97,6 +108,7 @@ def _read_card(path: Path) -> dict[str, Any]:
         ) from None
     if not isinstance(card, dict) or not isinstance(card.get("sha256"), str):
         raise ModelError(
-            f"the model card {path} should state the model's sha256; make it again with `liex train`"
+            f"the model card {path} should state the model's sha256; make it again with `liex "
+            "train`"
         )
     return card

@@ -1,10 +1,14 @@
-"""The errors a user can put right. Each message is one sentence: what was expected, what came, what to do."""
+"""The errors a user can put right. Each message is one sentence: what was expected, what came, what
+to do.
+"""
 
 from __future__ import annotations
 
 
 class LiexError(Exception):
-    """Something the user can put right; the command line prints its message alone, without a traceback."""
+    """Something the user can put right; the command line prints its message alone, without a
+    traceback.
+    """
 
     def __str__(self) -> str:
         """The message on one line, whatever it quotes of the user's own."""

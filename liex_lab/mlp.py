@@ -1,5 +1,5 @@
-"""A small network as arrays: what scikit-learn has trained, run by numpy alone, with the same bits on any number of
-cores.
+"""A small network as arrays: what scikit-learn has trained, run by numpy alone, with the same bits
+on any number of cores.
 """
 
 from __future__ import annotations
@@ -20,14 +20,18 @@ LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
 
 @dataclass(frozen=True)
 class Network:
-    """Layers (weights, bias) on standardised features, rectified between: weights as they are multiplied, no code."""
+    """Layers (weights, bias) on standardised features, rectified between: weights as they are
+    multiplied, no code.
+    """
 
     centre: NDArray[np.float32]
     scale: NDArray[np.float32]
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
 
     def logits(self, features: NDArray[np.floating]) -> Array:
-        """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's threads are not."""
+        """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's
+        threads are not.
+        """
         x = np.clip((features - self.centre) / self.scale, -LIMIT, LIMIT)
         with serial_products():
             for k, (weights, bias) in enumerate(self.layers):
@@ -49,9 +53,9 @@ def descend(
     weight_decay: float,
     seed: int,
 ) -> list[tuple[Array, Array]]:
-    """Layers (weights, bias) that tell the labels (m,) of inputs (m, F), by scikit-learn's stochastic gradient descent
-    (Adam), whose rate falls with a cosine; the last gives one number where there are two labels, else one for each. The
-    same bits on any number of cores.
+    """Layers (weights, bias) that tell the labels (m,) of inputs (m, F), by scikit-learn's
+    stochastic gradient descent (Adam), whose rate falls with a cosine; the last gives one number
+    where there are two labels, else one for each. The same bits on any number of cores.
     """
     from sklearn.neural_network import MLPClassifier
 

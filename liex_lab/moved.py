@@ -1,7 +1,7 @@
 """Modules that have moved: their old dotted paths still import, and say once where they live now.
 
-The table holds every public module of version 0.1 that has another place since. An old path is the very module at the
-new one, not a copy of it.
+The table holds every public module of version 0.1 that has another place since. An old path is the
+very module at the new one, not a copy of it.
 """
 
 from __future__ import annotations

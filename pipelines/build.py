@@ -1,4 +1,6 @@
-"""From a plan to objects: the one place where names and numbers of a plan become a recording, a tracker, rules."""
+"""From a plan to objects: the one place where names and numbers of a plan become a recording, a
+tracker, rules.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ _SPANS = (
 def build_recording(
     recording: str | Path | Recording, plan: Plan, progress: Progress = silent
 ) -> Recording:
-    """The recording at a path, or one that is open already, as an ideal camera in air would have made it.
+    """The recording at a path, or one that is open already, as an ideal camera in air would have
+    made it.
 
     Lens distortion, the water's refraction and a mirror are undone whenever a frame is read.
     """
@@ -53,7 +56,8 @@ def build_recording(
 def open_planned(
     recording: str | Path | Recording, plan: Plan, progress: Progress = silent
 ) -> Recording:
-    """The recording at a path, opened as the plan says, or one that is open already; the plan's camera overrules.
+    """The recording at a path, opened as the plan says, or one that is open already; the plan's
+    camera overrules.
 
     A plan that states all four intrinsics opens a recording that has none, too.
     """
@@ -128,7 +132,9 @@ def plan_of(animal: str) -> Plan:
 
 
 def build_estimator(plan: Plan) -> PoseEstimator:
-    """The estimator of the plan's animal; the last one is kept, for a study's next session mostly wants the same."""
+    """The estimator of the plan's animal; the last one is kept, for a study's next session mostly
+    wants the same.
+    """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.catalog import find_model, sha256
 
@@ -139,8 +145,9 @@ def build_estimator(plan: Plan) -> PoseEstimator:
         wanted = Skeleton.load(wanted).name
     if estimator.skeleton.name != wanted:
         raise PlanError(
-            f"the model '{plan.estimation.model}' was made for the skeleton {estimator.skeleton.name}, but the plan "
-            f"says {plan.animal.skeleton}; set estimation.model to a model of the {wanted}"
+            f"the model '{plan.estimation.model}' was made for the skeleton "
+            f"{estimator.skeleton.name}, but the plan says {plan.animal.skeleton}; set "
+            f"estimation.model to a model of the {wanted}"
         )
     return estimator
 
@@ -157,8 +164,8 @@ def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
 def build_tracker(
     recording: Recording, plan: Plan, estimator_of: Callable[[], PoseEstimator] | None = None
 ) -> FrameTracker:
-    """The tracker of a recording: its scene learned, the animal's size and girth found. estimator_of: waits for the
-    plan's, where that is being made already.
+    """The tracker of a recording: its scene learned, the animal's size and girth found.
+    estimator_of: waits for the plan's, where that is being made already.
     """
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -167,19 +174,23 @@ def build_tracker(
     scene, sample = build_scene(
         recording, plan, estimator.skeleton, plan.foreground.n_background_frames
     )
-    limit, bridge_s = plan.estimation.doubtful_above_mm, plan.tracking.bridge_s
+    limit = plan.estimation.doubtful_above_mm
+    bridge_s = plan.tracking.bridge_s
     return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)
 
 
 def build_scene(
     recording: Recording, plan: Plan, skeleton: Skeleton, n_frames: int
 ) -> tuple[Foreground, NDArray[np.float32]]:
-    """What tells the animal from the rest of the pictures, and the sample (n, H, W) mm that it was learned from."""
+    """What tells the animal from the rest of the pictures, and the sample (n, H, W) mm that it was
+    learned from.
+    """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.foreground.background_segmenter import Scene
     from liex_lab.foreground.hand_segmenter import NearestScene
 
-    animal, foreground = plan.animal, plan.foreground
+    animal = plan.animal
+    foreground = plan.foreground
     if skeleton.view.foreground == FOREGROUNDS[1]:
         return NearestScene.learn(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
@@ -254,7 +265,9 @@ def build_rules(plan: Plan) -> MouseRules:
 
 
 def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
-    """The recogniser of the plan: the named one, or the animal's bundled one; None where the rules name actions."""
+    """The recogniser of the plan: the named one, or the animal's bundled one; None where the rules
+    name actions.
+    """
     from liex_lab.actions.storage import bundled_action_models, load_action_model
 
     name = plan.actions.model
@@ -263,7 +276,7 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
     model = load_action_model(name or skeleton.name)
     if model.skeleton != skeleton.name:
         raise PlanError(
-            f"the action model '{name}' was made for the skeleton {model.skeleton}, but the plan says {skeleton.name}; "
-            "set actions.model to another one, or to 'rules'"
+            f"the action model '{name}' was made for the skeleton {model.skeleton}, but the plan "
+            f"says {skeleton.name}; set actions.model to another one, or to 'rules'"
         )
     return model

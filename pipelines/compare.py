@@ -26,11 +26,13 @@ def compare_sessions(
     engine: str = "auto",
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Compare the groups of all sessions in the given folders; writes stats, sessions, columns.json and methods.txt.
+    """Compare the groups of all sessions in the given folders; writes stats, sessions, columns.json
+    and methods.txt.
 
-    places: session folders, or folders with sessions anywhere in them. measures: columns of the summary; () takes the
-    usual ones and every action's share. reference: compare with this group only. animals: a CSV with subject_id and any
-    of group, cage, sex, batch, which overrules what the sessions say. Returns the table's rows and the files.
+    places: session folders, or folders with sessions anywhere in them. measures: columns of the
+    summary; () takes the usual ones and every action's share. reference: compare with this group
+    only. animals: a CSV with subject_id and any of group, cage, sex, batch, which overrules what
+    the sessions say. Returns the table's rows and the files.
     """
     from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods, usual_measures
     from liex_lab.sessions import Session
@@ -50,14 +52,15 @@ def compare_sessions(
     absent = [name for name in wanted if name not in table]
     if absent:
         raise SessionError(
-            f"no session's summary has the column '{absent[0]}'; see columns.json in a session's folder"
+            f"no session's summary has the column '{absent[0]}'; see columns.json in a session's "
+            "folder"
         )
     groups = sorted({str(group) for group in table["group"].fillna("")} - {""})
     if len(groups) < 2 or (reference is not None and reference not in groups):
         raise SessionError(
-            f"a comparison needs two groups{f', one of them {reference!r}' if reference else ''}, and these "
-            f"{len(table)} sessions have {', '.join(groups) or 'none'}; state session.group, or name a CSV with "
-            "--animals"
+            f"a comparison needs two groups{f', one of them {reference!r}' if reference else ''}, "
+            f"and these {len(table)} sessions have {', '.join(groups) or 'none'}; state "
+            "session.group, or name a CSV with --animals"
         )
     stats = compare(table, wanted, reference, engine=engine)
     target = Path(out)
@@ -111,8 +114,8 @@ def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
         or stated["subject_id"].duplicated().any()
     ):
         raise SessionError(
-            f"{path} should have a column subject_id, each animal once, and any of {', '.join(_WHO)}; it has "
-            f"{', '.join(map(str, stated.columns))}"
+            f"{path} should have a column subject_id, each animal once, and any of "
+            f"{', '.join(_WHO)}; it has {', '.join(map(str, stated.columns))}"
         )
     known = stated.set_index("subject_id")
     unknown = sorted(set(table["subject_id"].astype(str)) - set(known.index))

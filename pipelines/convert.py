@@ -1,4 +1,6 @@
-"""The job behind `liex convert`: any recording that opens, written as MCAP, as .oni or as a folder of PNG pictures."""
+"""The job behind `liex convert`: any recording that opens, written as MCAP, as .oni or as a folder
+of PNG pictures.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ _PICTURE = re.compile(r"frame_\d+\.png")
 
 @dataclass(frozen=True)
 class Converted:
-    """What was written. notes: sentences about what is not as it was; problems: of the recording that was read."""
+    """What was written. notes: sentences about what is not as it was; problems: of the recording
+    that was read.
+    """
 
     path: Path
     n_frames: int
@@ -62,10 +66,11 @@ def convert(
 ) -> Converted:
     """Write a recording as `to`: NAME.mcap, NAME.oni, or else a folder of PNG pictures.
 
-    MCAP keeps every depth; 16-bit pictures keep whole steps of a size that is found, or, where `step_mm` is stated,
-    the nearest steps. ros: ROS 2's messages in the MCAP file instead of Foxglove's. `camera`, `fps` and `topic` are
-    those of `open_recording`. The target has its name only when it is whole. Raises RecordingError where something is
-    in its place or the depth does not fit.
+    MCAP keeps every depth; 16-bit pictures keep whole steps of a size that is found, or, where
+    `step_mm` is stated, the nearest steps. ros: ROS 2's messages in the MCAP file instead of
+    Foxglove's. `camera`, `fps` and `topic` are those of `open_recording`. The target has its name
+    only when it is whole. Raises RecordingError where something is in its place or the depth does
+    not fit.
     """
     target = Path(to)
     _check_target(target, overwrite)
@@ -94,10 +99,12 @@ def _convert(
 def _writer(
     recording: Recording, target: Path, part: Path, step_mm: float | None, ros: bool
 ) -> RecordingWriter:
-    kind, camera = _kind(target), recording.camera
+    kind = _kind(target)
+    camera = recording.camera
     if ros and kind != ".mcap":
         raise RecordingError(
-            f"ROS's messages are written into an .mcap file, not into {target.name}; leave out --ros"
+            f"ROS's messages are written into an .mcap file, not into {target.name}; leave out "
+            "--ros"
         )
     if kind == ".mcap":
         from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
@@ -149,9 +156,9 @@ def _step(recording: Recording, kind: str, target: Path) -> float:
     if max(float(depth.max()) for depth in depths) > 65535.0:
         return 1.0
     raise RecordingError(
-        f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and {target.name} would "
-        "hold 16-bit pictures, which do not keep them; write an .mcap file, which does, or let them be rounded with "
-        "--step-mm 0.1"
+        f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and "
+        f"{target.name} would hold 16-bit pictures, which do not keep them; write an .mcap file, "
+        "which does, or let them be rounded with --step-mm 0.1"
     )
 
 
@@ -159,8 +166,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     """Refuse to write over what is there, and over anything but a recording at all."""
     if _OTHER_KINDS.search(target.name):
         raise RecordingError(
-            f"{target.name} is no name of what can be written; give NAME.mcap, NAME.oni, or a folder's name for PNG "
-            "pictures"
+            f"{target.name} is no name of what can be written; give NAME.mcap, NAME.oni, or a "
+            "folder's name for PNG pictures"
         )
     if not target.parent.is_dir():
         raise RecordingError(
@@ -178,7 +185,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     )
     if others:
         raise RecordingError(
-            f"{target} holds more than a recording written by liex convert, such as {others[0]}; give another name"
+            f"{target} holds more than a recording written by liex convert, such as {others[0]}; "
+            "give another name"
         )
     if not overwrite and (is_file or any(target.iterdir())):
         raise RecordingError(f"{target} is there already; give another name, or add --overwrite")
@@ -192,7 +200,9 @@ def _written_here(path: Path) -> bool:
 
 @contextmanager
 def _in_place(target: Path) -> Iterator[Path]:
-    """A name beside `target` to write under; what was written gets its own when the block ends, and else is gone."""
+    """A name beside `target` to write under; what was written gets its own when the block ends, and
+    else is gone.
+    """
     part = target.with_name(f".{target.name}.part-{os.getpid()}")
     try:
         yield part
@@ -201,7 +211,8 @@ def _in_place(target: Path) -> Iterator[Path]:
         part.replace(target)
     except OSError as error:
         raise RecordingError(
-            f"the recording cannot be written as {target} ({error.strerror or error}); make room, or name another place"
+            f"the recording cannot be written as {target} ({error.strerror or error}); make room, "
+            "or name another place"
         ) from None
     finally:
         _remove(part)

@@ -46,26 +46,31 @@ def correct_session(
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Add corrections to a session and take others back, by their numbers; with neither, make everything again.
+    """Add corrections to a session and take others back, by their numbers; with neither, make
+    everything again.
 
-    All at once or not at all: the folder `corrected` is replaced by a rename. Corrections that were made on an earlier
-    measurement of the recording apply to this one from then on. Raises SessionError where one cannot be applied.
+    All at once or not at all: the folder `corrected` is replaced by a rename. Corrections that were
+    made on an earlier measurement of the recording apply to this one from then on. Raises
+    SessionError where one cannot be applied.
     """
     from liex_lab.sessions import Session
     from liex_lab.sessions.lock import locked
 
     raw = Session.open(session, raw=True)
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
-        made_of, log = basis(raw.path, raw.metadata), read_log(raw.path)
+        made_of = basis(raw.path, raw.metadata)
+        log = read_log(raw.path)
         if log.entries and log.made_of != made_of and (what or undo):
             raise SessionError(
-                f"the corrections of {raw.path} were made on another measurement of this recording; look at them with "
-                f"`liex correct list`, then apply them with `liex correct redo`, or remove the folder {FOLDER}"
+                f"the corrections of {raw.path} were made on another measurement of this "
+                "recording; look at them with `liex correct list`, then apply them with `liex "
+                f"correct redo`, or remove the folder {FOLDER}"
             )
         log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
         if not log.entries:
             raise SessionError(
-                f"{raw.path} has no corrections to apply; `liex correct --help` says how to make one"
+                f"{raw.path} has no corrections to apply; `liex correct --help` says how to make "
+                "one"
             )
         part = raw.path / f"{FOLDER}.part"
         shutil.rmtree(part, ignore_errors=True)
@@ -85,8 +90,8 @@ def correct_session(
 
 
 def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | None) -> Log:
-    """Write the tables that are others than the session's own, and a replay to be shown with the session's own; returns
-    the log that lists them.
+    """Write the tables that are others than the session's own, and a replay to be shown with the
+    session's own; returns the log that lists them.
     """
     from liex_lab.sessions.applying import corrected_track
     from liex_lab.sessions.evidence import provenance_of
@@ -97,7 +102,8 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     from liex_lab.tables.rows import Rows
 
     skeleton = skeleton_of(raw)
-    origin, found = provenance_of(raw, skeleton), corrected_track(raw, log, skeleton)
+    origin = provenance_of(raw, skeleton)
+    found = corrected_track(raw, log, skeleton)
     index = raw.frames["frame_index"].to_numpy()
     rows = Rows(
         found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
@@ -137,7 +143,8 @@ def _behaviour(
 ) -> tuple[Behaviour, dict[str, Any]]:
     """The behaviour of the corrected track, and facts of it for session.json.
 
-    The ethogram is the session's own; where head and tail were exchanged it is named again; then come the edits.
+    The ethogram is the session's own; where head and tail were exchanged it is named again; then
+    come the edits.
     """
     from liex_lab.behaviour.summary import measure_rows, stated_by
     from liex_lab.sessions.applying import edited_bouts, spliced_bouts
@@ -151,17 +158,18 @@ def _behaviour(
         again, facts = measure_behaviour(
             results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin
         )
-        bouts, actions = (
-            spliced_bouts(bouts, again.bouts, found.turned, frames),
-            {**again.actions, **actions},
-        )
+        bouts = spliced_bouts(bouts, again.bouts, found.turned, frames)
+        actions = {**again.actions, **actions}
     bouts = edited_bouts(bouts, log.corrections(BoutEdit), frames)
     return measure_rows(results.rows, rules, around, bouts=bouts, actions=actions), facts
 
 
 def _put(part: Path) -> None:
-    """Rename the new folder into place; until then readers find the old one (see `corrections.corrected_folder`)."""
-    folder, old = part.with_name(FOLDER), part.with_name(f"{FOLDER}.old")
+    """Rename the new folder into place; until then readers find the old one (see
+    `corrections.corrected_folder`).
+    """
+    folder = part.with_name(FOLDER)
+    old = part.with_name(f"{FOLDER}.old")
     if folder.is_dir():
         shutil.rmtree(old, ignore_errors=True)
         os.rename(folder, old)

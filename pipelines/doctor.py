@@ -1,4 +1,6 @@
-"""The job `liex doctor`: what is in a recording, and what a lab should know before it trusts it. Needs no model."""
+"""The job `liex doctor`: what is in a recording, and what a lab should know before it trusts it.
+Needs no model.
+"""
 
 from __future__ import annotations
 
@@ -46,16 +48,17 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "floor_tilt_rad": "angle between the optical axis and the floor's perpendicular",
     "water_depth_mm": "of the water over the floor, below the lens",
     "arena": "shape of the floor, mm in the arena frame: see session.json",
-    "animal_length_mm": "of its outline from above, four standard deviations along the long axis; median",
+    "animal_length_mm": (
+        "of its outline from above, four standard deviations along the long axis; median"
+    ),
     "animal_area_mm2": "seen from above",
     "animal_share": "of the frames looked at, in which it was found",
     "animal_sits_still": "whether it had become a part of the background",
     "problems": "what is wrong, and what to do about it",
 }
-_N_SAMPLED, _N_RAW = (
-    96,
-    16,
-)  # frames looked at, spread over the recording; as many as a run learns its scene from
+# frames looked at, spread over the recording; as many as a run learns its scene from
+_N_SAMPLED = 96
+_N_RAW = 16
 _PLAUSIBLE_MM = (
     100.0,
     10_000.0,
@@ -70,10 +73,11 @@ def examine(
     topic: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Look at a recording as the plan says; the result has the keys of `FINDINGS`, and only JSON's own types.
+    """Look at a recording as the plan says; the result has the keys of `FINDINGS`, and only JSON's
+    own types.
 
-    fps, topic: come before the plan's. A recording that is cut short is looked at as far as it goes; one that cannot be
-    opened at all raises a RecordingError.
+    fps, topic: come before the plan's. A recording that is cut short is looked at as far as it
+    goes; one that cannot be opened at all raises a RecordingError.
     """
     from liex_lab.foreground.background import sample_frames, stride_for
     from liex_lab.recordings.rectify import rectified
@@ -110,7 +114,9 @@ def examine(
 
 
 def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
-    """The plan with what was asked for on the command line; what is cut short is wanted as far as it goes."""
+    """The plan with what was asked for on the command line; what is cut short is wanted as far as
+    it goes.
+    """
     settings = ["recording.accept_truncated=true"]
     settings += [f"recording.fps={fps!r}"] if fps is not None else []
     settings += [f"recording.topic={topic}"] if topic is not None else []
@@ -143,8 +149,8 @@ def _time_problems(recording: Recording) -> list[str]:
     gaps = _dropped(recording)
     if jumps := [gap for gap in recording.gaps if gap not in gaps]:
         found.append(
-            f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before frame "
-            f"{jumps[0].start_frame}; nothing is measured across them"
+            f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before "
+            f"frame {jumps[0].start_frame}; nothing is measured across them"
         )
     if gaps:
         missing = sum(gap.n_frames_missing for gap in gaps)
@@ -152,9 +158,10 @@ def _time_problems(recording: Recording) -> list[str]:
         longest_s = max(gap.stop_ns - recording.times_ns[gap.start_frame - 1] for gap in gaps) / 1e9
         places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         found.append(
-            f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest time between two "
-            f"frames is {longest_s:.2f} s; nothing is measured across a gap, but if there are many, record to a "
-            "faster disk or with fewer cameras on one USB controller"
+            f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest "
+            f"time between two frames is {longest_s:.2f} s; nothing is measured across a gap, but "
+            "if there are many, record to a faster disk or with fewer cameras on one USB "
+            "controller"
         )
     if len(recording) == 1:
         found.append("a single frame has no rate and no duration; give the whole recording")
@@ -166,19 +173,22 @@ class _Depths:
 
     def __init__(self, frames: NDArray[np.float32]) -> None:
         """Frames (n, H, W) mm as the camera gave them."""
-        self.n_frames, self.n_empty = len(frames), 0
-        self.low, self.high, n_unread, n_pixels = math.inf, 0.0, 0, 0
+        self.n_frames = len(frames)
+        self.n_empty = 0
+        self.low = math.inf
+        self.high = 0.0
+        n_unread = 0
+        n_pixels = 0
         medians = []
         for frame in frames:
             read = frame[frame > 0]
             if not read.size:
                 self.n_empty += 1
                 continue
-            n_unread, n_pixels = n_unread + frame.size - read.size, n_pixels + frame.size
-            self.low, self.high = (
-                min(self.low, float(read.min())),
-                max(self.high, float(read.max())),
-            )
+            n_unread = n_unread + frame.size - read.size
+            n_pixels = n_pixels + frame.size
+            self.low = min(self.low, float(read.min()))
+            self.high = max(self.high, float(read.max()))
             medians.append(float(np.median(read)))
         self.median_mm = float(np.median(medians)) if medians else None
         self.unread_share = n_unread / n_pixels if n_pixels else 1.0
@@ -196,18 +206,20 @@ class _Depths:
         """Sentences about what the depths themselves say."""
         if self.median_mm is None:
             return [
-                f"none of the {self.n_frames} frames looked at holds any depth; check the camera and unit_mm"
+                f"none of the {self.n_frames} frames looked at holds any depth; check the camera "
+                "and unit_mm"
             ]
         found = []
         if self.n_empty:
             found.append(
-                f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all; check the camera's "
-                "cable and what covers its lens"
+                f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all; "
+                "check the camera's cable and what covers its lens"
             )
         if not _PLAUSIBLE_MM[0] <= self.median_mm <= _PLAUSIBLE_MM[1]:
             found.append(
-                f"the median depth is {self.median_mm:.4g} mm, which no animal is watched from; the depths are "
-                "probably not in mm, so state the true unit_mm (millimetres per stored step) in camera.toml"
+                f"the median depth is {self.median_mm:.4g} mm, which no animal is watched from; "
+                "the depths are probably not in mm, so state the true unit_mm (millimetres per "
+                "stored step) in camera.toml"
             )
         return found
 
@@ -237,7 +249,10 @@ def print_report(findings: dict[str, Any]) -> None:
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
     """The findings as (name, text)."""
     f = findings
-    arena, water, bent, tilt = f["arena"], f["water"], f["distortion"], f["floor_tilt_rad"]
+    arena = f["arena"]
+    water = f["water"]
+    bent = f["distortion"]
+    tilt = f["floor_tilt_rad"]
     shape = None
     if arena is not None:
         from liex_lab.arena.outline import Arena
@@ -277,13 +292,15 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
             "water",
             "none"
             if water is None
-            else f"{_text(f['water_depth_mm'], 'mm')} deep, n = "
-            f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')}; refraction undone on reading",
+            else (
+                f"{_text(f['water_depth_mm'], 'mm')} deep, n = {water['refractive_index']:g}, "
+                f"{water['ranging'].replace('_', ' ')}; refraction undone on reading"
+            ),
         ),
         (
             "depth",
-            f"{_text(f['depth_min_mm'], 'mm')} to {_text(f['depth_max_mm'], 'mm')}, {f['unread_share']:.1%} "
-            "of the pixels unread",
+            f"{_text(f['depth_min_mm'], 'mm')} to {_text(f['depth_max_mm'], 'mm')}, "
+            f"{f['unread_share']:.1%} of the pixels unread",
         ),
         (
             "on the floor",
@@ -302,8 +319,10 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
             "animal",
             "not found"
             if f["animal_length_mm"] is None
-            else f"{_text(f['animal_length_mm'], 'mm')} long from above, {moves}, found in {f['animal_share']:.0%} of "
-            "the frames",
+            else (
+                f"{_text(f['animal_length_mm'], 'mm')} long from above, {moves}, found in "
+                f"{f['animal_share']:.0%} of the frames"
+            ),
         ),
     ]
 

@@ -46,7 +46,9 @@ KEYS = (
 
 @dataclass
 class SceneLook:
-    """The scene and the animal in a sample (n, H, W) mm of every `stride`-th pixel; fills facts and problems."""
+    """The scene and the animal in a sample (n, H, W) mm of every `stride`-th pixel; fills facts and
+    problems.
+    """
 
     seen: Recording
     plan: Plan
@@ -88,14 +90,15 @@ class SceneLook:
             self.problems.append(str(error))
         if unread > _MUCH_UNREAD:
             self.problems.append(
-                f"{unread:.0%} of the pixels on the floor are unread, more than {_MUCH_UNREAD:.0%}; check the camera's "
-                "range, sunlight, and surfaces that shine or swallow infrared light"
+                f"{unread:.0%} of the pixels on the floor are unread, more than "
+                f"{_MUCH_UNREAD:.0%}; check the camera's range, sunlight, and surfaces that shine "
+                "or swallow infrared light"
             )
         if noise is not None and noise > _MUCH_NOISE * self.plan.foreground.min_height_mm:
             self.problems.append(
-                f"the floor's depth varies by {noise:.1f} mm from frame to frame, and a pixel counts as the animal "
-                f"from {self.plan.foreground.min_height_mm:g} mm above it; bring the camera nearer, keep sunlight out, "
-                "or raise foreground.min_height_mm"
+                f"the floor's depth varies by {noise:.1f} mm from frame to frame, and a pixel "
+                f"counts as the animal from {self.plan.foreground.min_height_mm:g} mm above it; "
+                "bring the camera nearer, keep sunlight out, or raise foreground.min_height_mm"
             )
         self._at_floor(floor)
         self._at_animal(background)
@@ -108,13 +111,13 @@ class SceneLook:
         low, high = _PLAUSIBLE_FLOOR_MM
         if not low <= distance <= high:
             self.problems.append(
-                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to {high:.0f} mm; "
-                "check the unit and the camera's height"
+                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to "
+                f"{high:.0f} mm; check the unit and the camera's height"
             )
         if tilt > _MUCH_TILT_RAD:
             self.problems.append(
-                f"the camera looks down at {math.degrees(tilt):.0f} degrees from straight, and poses are learned up to "
-                "10; turn it to look straight down"
+                f"the camera looks down at {math.degrees(tilt):.0f} degrees from straight, and "
+                "poses are learned up to 10; turn it to look straight down"
             )
         if self.water is not None:
             self._at_water(self.water, floor, distance)
@@ -125,24 +128,29 @@ class SceneLook:
         self.facts["water_depth_mm"] = deep
         if deep <= 0:
             self.problems.append(
-                f"the plan puts the water's surface {water.height_mm:.0f} mm below the lens, but the floor is not "
-                "below it; measure water.height_mm again, or leave it out if there is no water"
+                f"the plan puts the water's surface {water.height_mm:.0f} mm below the lens, but "
+                "the floor is not below it; measure water.height_mm again, or leave it out if "
+                "there is no water"
             )
         elif (angle := math.acos(min(1.0, cosine))) > _LEVEL_RAD:
             tilts = np.arctan2(-floor.normal[:2], floor.normal[2])
             self.problems.append(
-                f"the floor is tilted by {math.degrees(angle):.1f} degrees against the water's surface; if the tank's "
-                f"floor is level, the camera is tilted: set water.tilt_x_rad={tilts[0]:.3f} and "
-                f"water.tilt_y_rad={tilts[1]:.3f}, and look again"
+                f"the floor is tilted by {math.degrees(angle):.1f} degrees against the water's "
+                "surface; if the tank's floor is level, the camera is tilted: set "
+                f"water.tilt_x_rad={tilts[0]:.3f} and water.tilt_y_rad={tilts[1]:.3f}, and look "
+                "again"
             )
 
     def _at_animal(self, background: NDArray[np.float32]) -> None:
-        """Find the animal as a run would; where none of the plan's size is, look for one of another size."""
+        """Find the animal as a run would; where none of the plan's size is, look for one of another
+        size.
+        """
         from liex_lab.body.skeleton import Skeleton
         from liex_lab.foreground.background_segmenter import Scene
         from liex_lab.recordings.recording import Recording
 
-        animal, foreground = self.plan.animal, self.plan.foreground
+        animal = self.plan.animal
+        foreground = self.plan.foreground
         memory = Recording(
             name=self.seen.name,
             format="sample",
@@ -191,28 +199,32 @@ class SceneLook:
         }
         if still:
             self.problems.append(
-                "the animal hardly leaves its place, so that it is a part of the background; it was told from the bare "
-                "floor instead, so check its outline in the replay, or add some seconds of the empty arena"
+                "the animal hardly leaves its place, so that it is a part of the background; it "
+                "was told from the bare floor instead, so check its outline in the replay, or add "
+                "some seconds of the empty arena"
             )
         if share < 0.8:
             self.problems.append(
-                f"the animal was found in only {share:.0%} of the frames looked at; cut off the time before it came "
-                "and after it left, and check that the whole arena is in view"
+                f"the animal was found in only {share:.0%} of the frames looked at; cut off the "
+                "time before it came and after it left, and check that the whole arena is in view"
             )
 
     def _tell_wrong_size(self, length: float, expected: tuple[float, float]) -> None:
         self.problems.append(
-            f"what moves is about {length:.0f} mm long, but the plan expects an animal with a spine of {expected[0]:g} "
-            f"to {expected[1]:g} mm; if the animal is of that size, the millimetres are wrong by a factor of about "
-            f"{length / math.sqrt(expected[0] * expected[1]):.2g} (check unit_mm and the focal lengths), else set "
-            "animal.spine_min_mm and animal.spine_max_mm or name another --plan"
+            f"what moves is about {length:.0f} mm long, but the plan expects an animal with a "
+            f"spine of {expected[0]:g} to {expected[1]:g} mm; if the animal is of that size, the "
+            "millimetres are wrong by a factor of about "
+            f"{length / math.sqrt(expected[0] * expected[1]):.2g} (check unit_mm and the focal "
+            "lengths), else set animal.spine_min_mm and animal.spine_max_mm or name another --plan"
         )
 
 
 def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:
-    """Standard deviation mm of pixels over time, from frame to frame of the sample (n, H, W) mm; None if not known.
+    """Standard deviation mm of pixels over time, from frame to frame of the sample (n, H, W) mm;
+    None if not known.
 
-    Two thirds of the differences are smaller than one standard deviation of theirs, whatever walks through the others.
+    Two thirds of the differences are smaller than one standard deviation of theirs, whatever walks
+    through the others.
     """
     changes = [
         np.abs(after - before)[(before > 0) & (after > 0)]

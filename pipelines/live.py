@@ -1,4 +1,6 @@
-"""The job `liex live`: skeletons of a recording that goes on, frame by frame, and the whole track when it is over."""
+"""The job `liex live`: skeletons of a recording that goes on, frame by frame, and the whole track
+when it is over.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +26,16 @@ if TYPE_CHECKING:
 LEARN_FRAMES = (
     90  # that are waited for: the background, the floor and the animal's size are learned from them
 )
-_AT_ONCE, _LONG_S = 16, 0.2
+_AT_ONCE = 16
+_LONG_S = 0.2
 Viewer = Callable[["FrameTracker", "Arriving"], Any]
 
 
 def open_live(
     source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0
 ) -> Arriving:
-    """What arrives at a source: a file or folder that is being written, HOST:PORT, or (replay) a recording sent at its
-    own pace.
+    """What arrives at a source: a file or folder that is being written, HOST:PORT, or (replay) a
+    recording sent at its own pace.
     """
     from liex_lab.recordings.streaming import growing, received, replayed
 
@@ -53,10 +56,12 @@ def follow_live(
     viewer: Viewer | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], Tracked]:
-    """Skeletons as frames come, shown in a viewer; returns latencies and the track of the whole, smoothed.
+    """Skeletons as frames come, shown in a viewer; returns latencies and the track of the whole,
+    smoothed.
 
-    Latency: from when a frame was there to when its skeleton was told, of every frame from the first on that came when
-    all before it had been told: until then what was missed while learning is made up for.
+    Latency: from when a frame was there to when its skeleton was told, of every frame from the
+    first on that came when all before it had been told: until then what was missed while learning
+    is made up for.
     """
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.online import OnlineTracker
@@ -69,7 +74,10 @@ def follow_live(
     tracker = build_tracker(_as_recording(arriving, held), plan)
     online = OnlineTracker(tracker.subject)
     view = viewer(tracker, arriving) if viewer else None
-    seen, latency, worked_until, keeping_up = [], list[float](), time.perf_counter(), False
+    seen = []
+    latency = list[float]()
+    worked_until = time.perf_counter()
+    keeping_up = False
     for some in _together(_chained(held, frames)):
         keeping_up = keeping_up or some[0].at_s >= worked_until
         told = tracker.observe([arrival.frame for arrival in some])
@@ -109,7 +117,9 @@ def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival
 
 
 def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
-    """Frames that have waited for long some at a time, for together each costs half; the others one by one."""
+    """Frames that have waited for long some at a time, for together each costs half; the others one
+    by one.
+    """
     some: list[Arrival] = []
     for arrival in arrivals:
         some.append(arrival)

@@ -1,4 +1,6 @@
-"""The job that makes the bundled sample recording: a rendered mouse, written as a camera's MCAP file, and its card."""
+"""The job that makes the bundled sample recording: a rendered mouse, written as a camera's MCAP
+file, and its card.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ LEFT_OUT = (
     103,
 )  # frames that "the camera did not deliver", so that a sample has gaps as recordings have
 _START_NS = 10**9  # the clock of a camera that was switched on a second ago: no date is claimed
-_CHUNK_BYTES, _LEVEL = 1 << 20, 19  # packed once, downloaded often
+# packed once, downloaded often
+_CHUNK_BYTES = 1 << 20
+_LEVEL = 19
 
 
 def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
@@ -35,7 +39,8 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
     from liex_lab.sessions.mcap import McapWriter
     from liex_lab.sessions.provenance import Provenance
 
-    mouse, path = virtual_mouse(), Path(path)
+    mouse = virtual_mouse()
+    path = Path(path)
     path.unlink(missing_ok=True)
     origin = Provenance(
         name=path.stem,
@@ -73,10 +78,15 @@ def _card(path: Path, mouse: SyntheticSession) -> str:
     from liex_lab.sessions.provenance import package_version
 
     facts = {
-        "what": "a virtual mouse that walks, turns and rears in a round arena, seen from above by an imitated "
-        "PrimeSense camera of 320 x 240 pixels; 16-bit depth in mm, the camera's calibration and its place above the "
-        "floor as Foxglove protobuf messages",
-        "origin": "rendered from a seed by liex_lab/simulation/locomotion.py; no recording of an animal was used",
+        "what": (
+            "a virtual mouse that walks, turns and rears in a round arena, seen from above by an "
+            "imitated PrimeSense camera of 320 x 240 pixels; 16-bit depth in mm, the camera's "
+            "calibration and its place above the floor as Foxglove protobuf messages"
+        ),
+        "origin": (
+            "rendered from a seed by liex_lab/simulation/locomotion.py; no recording of an "
+            "animal was used"
+        ),
         "licence": "BSD-3-Clause, as the rest of liex_lab",
         "made_by": "liex_lab.pipelines.sample.write_sample",
         "made_with": f"foxglove-sdk {package_version('foxglove-sdk')}",

@@ -55,11 +55,12 @@ def measure_session(
     crew: Crew | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`, or `folder`.
+    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`,
+    or `folder`.
 
-    notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make the views that
-    lie in the folder, see `SessionWriter`. crew: looks at stretches of a long recording side by side, where the
-    recording is given by its path; the tables are the same.
+    notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make
+    the views that lie in the folder, see `SessionWriter`. crew: looks at stretches of a long
+    recording side by side, where the recording is given by its path; the tables are the same.
     """
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.place import check_place, part_folder
@@ -103,8 +104,8 @@ def measure_session(
 
 
 def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
-    """The frames from `first` on in chunks; while one is looked at the next is read, but for those that are rendered,
-    which takes all cores.
+    """The frames from `first` on in chunks; while one is looked at the next is read, but for those
+    that are rendered, which takes all cores.
     """
     chunks = opened.chunks(CHUNK, first)
     yield from chunks if opened.format == "synthetic" else ahead(chunks)
@@ -131,8 +132,8 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
 def measure_behaviour(
     rows: Rows, plan: Plan, origin: Provenance, room: Room = np.empty
 ) -> tuple[Behaviour, dict[str, Any]]:
-    """The behaviour of a track as the plan names it, and what session.json is to hold of the recogniser. room: for what
-    takes much of it on the way.
+    """The behaviour of a track as the plan names it, and what session.json is to hold of the
+    recogniser. room: for what takes much of it on the way.
     """
     from liex_lab.behaviour.summary import measure_rows
 
@@ -148,8 +149,8 @@ def measure_behaviour(
 def name_actions(
     recogniser: TimelineModel, rows: Rows, room: Room = np.empty
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which recogniser it was,
-    and what the frame rate cannot tell.
+    """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which
+    recogniser it was, and what the frame rate cannot tell.
     """
     from liex_lab.tables.rows import bout_rows
 

@@ -1,6 +1,8 @@
-"""A long recording looked at in stretches, side by side: what single frames say does not depend on their neighbours.
+"""A long recording looked at in stretches, side by side: what single frames say does not depend on
+their neighbours.
 
-The track is made of all frames at once afterwards, so there is no seam: the tables are those of one process.
+The track is made of all frames at once afterwards, so there is no seam: the tables are those of one
+process.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ MEASURING = "measuring poses"
 
 @dataclass(frozen=True)
 class Stretch:
-    """Frames start to stop (exclusive) of a recording, and all that a worker elsewhere has to know to look at them.
+    """Frames start to stop (exclusive) of a recording, and all that a worker elsewhere has to know
+    to look at them.
 
     folder: where the result will be.
     """
@@ -44,7 +47,9 @@ class Stretch:
     stop: int
 
     def __getstate__(self) -> dict[str, Any]:
-        """To a worker goes all but the model, which is large: it has the file, and keeps what it loaded."""
+        """To a worker goes all but the model, which is large: it has the file, and keeps what it
+        loaded.
+        """
         return {**vars(self), "tracker": replace(self.tracker, estimator=None)}  # type: ignore[arg-type]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -67,15 +72,17 @@ def look_at(stretch: Stretch) -> Stretch:
 
 @lru_cache(maxsize=1)
 def _opened(recording: str, plan_toml: str, input_sha256: str) -> Recording:
-    """The recording, open for this process's next stretches too. input_sha256: another content is another recording."""
+    """The recording, open for this process's next stretches too. input_sha256: another content is
+    another recording.
+    """
     return build_recording(recording, Plan.from_toml(plan_toml))
 
 
 def look_side_by_side(crew: Crew, whole: Stretch, path: Path, progress: Progress) -> None:
     """Look at all frames of a recording that the unfinished session of `path` does not have yet.
 
-    whole: the recording as one stretch, its folder does not matter. Afterwards the session goes on as one that was
-    interrupted after its last frame. Whatever happens, what is whole is kept.
+    whole: the recording as one stretch, its folder does not matter. Afterwards the session goes on
+    as one that was interrupted after its last frame. Whatever happens, what is whole is kept.
     """
     from liex_lab.sessions.stretches import is_whole, stretch_folder, take_over
     from liex_lab.sessions.writer import unfinished
@@ -83,12 +90,14 @@ def look_side_by_side(crew: Crew, whole: Stretch, path: Path, progress: Progress
     held = unfinished(path, whole.origin)
     try:
         held.begin_to_take()
-        began, done = time.monotonic(), held.state.n_frames
+        began = time.monotonic()
+        done = held.state.n_frames
         planned = [
             replace(whole, start=start, stop=stop, folder=stretch_folder(held.folder, start, stop))
             for start, stop in _cuts(done, whole.stop)
         ]
-        waiting, n_looked_at = list(planned), whole.stop - done
+        waiting = list(planned)
+        n_looked_at = whole.stop - done
         there = [stretch for stretch in planned if is_whole(stretch.folder)]
         for stretch in _all_of(there, crew, [one for one in planned if one not in there]):
             n_looked_at -= stretch.stop - stretch.start
@@ -107,7 +116,9 @@ def _all_of(there: list[Stretch], crew: Crew, others: list[Stretch]) -> Iterator
 
 
 def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
-    """Frames first to stop cut at multiples of `LENGTH`, so that a run that goes on finds the stretches of the last."""
+    """Frames first to stop cut at multiples of `LENGTH`, so that a run that goes on finds the
+    stretches of the last.
+    """
     while first < stop:
         last = min(stop, (first // LENGTH + 1) * LENGTH)
         yield first, last

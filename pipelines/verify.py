@@ -1,4 +1,6 @@
-"""The job `liex verify`: is a session what it was when it was written, and does its recording give it again?"""
+"""The job `liex verify`: is a session what it was when it was written, and does its recording give
+it again?
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ _TABLES = (".parquet", ".csv")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at. state: ok; wrong: the session is not what it says; note: worth knowing."""
+    """One thing that was looked at. state: ok; wrong: the session is not what it says; note: worth
+    knowing.
+    """
 
     state: str
     sentence: str
@@ -44,7 +48,8 @@ class Finding:
 def verify_session(
     path: str | Path, run: RunAgain, recording: str | None = None, progress: Progress = silent
 ) -> list[Finding]:
-    """Look at everything a session says about itself. recording: it is measured again, which takes as long as then.
+    """Look at everything a session says about itself. recording: it is measured again, which takes
+    as long as then.
 
     Raises SessionError where there is no session at all.
     """
@@ -105,7 +110,9 @@ def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
 
 
 def _corrections(session: Session) -> Iterator[Finding]:
-    """What people corrected: whether the log can be read, and its tables are those that were made with it."""
+    """What people corrected: whether the log can be read, and its tables are those that were made
+    with it.
+    """
     from liex_lab.sessions.corrections import applies, corrected_folder, read_log
 
     try:
@@ -216,7 +223,8 @@ def _again(
     if differing:
         yield Finding(
             "wrong",
-            f"measured again, it has other rows in {', '.join(differing)}{_versions(session, other)}",
+            "measured again, it has other rows in "
+            f"{', '.join(differing)}{_versions(session, other)}",
         )
     else:
         yield Finding("ok", f"measured again, all {len(_tables(session))} tables are the same")
@@ -227,7 +235,9 @@ def _tables(session: Session) -> list[Path]:
 
 
 def _same_rows(path: Path, other: Path) -> bool:
-    """Whether two tables hold the same numbers; what is said about them, such as versions, may differ."""
+    """Whether two tables hold the same numbers; what is said about them, such as versions, may
+    differ.
+    """
     import pandas as pd
 
     if not other.is_file():
@@ -240,7 +250,8 @@ def _same_rows(path: Path, other: Path) -> bool:
 
 
 def _versions(session: Session, other: Session) -> str:
-    then, now = session.metadata.get("versions", {}), other.metadata["versions"]
+    then = session.metadata.get("versions", {})
+    now = other.metadata["versions"]
     changed = [
         f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]
     ]

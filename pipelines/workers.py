@@ -1,4 +1,6 @@
-"""Workers for the stretches of one recording: processes of this machine. Those of a study are Dask's, see `cohort`."""
+"""Workers for the stretches of one recording: processes of this machine. Those of a study are
+Dask's, see `cohort`.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +46,8 @@ class Processes:
                     yield future.result()
             except BrokenProcessPool:
                 raise SessionError(
-                    "a worker process ended without a word, perhaps for want of memory; run the same command again, it "
-                    "goes on where it was, or give fewer --workers"
+                    "a worker process ended without a word, perhaps for want of memory; run the "
+                    "same command again, it goes on where it was, or give fewer --workers"
                 ) from None
             finally:
                 pool.shutdown(cancel_futures=True)

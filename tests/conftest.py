@@ -1,4 +1,6 @@
-"""What all tests share: seeded hypothesis, the reference data, and no skipping in continuous integration."""
+"""What all tests share: seeded hypothesis, the reference data, and no skipping in continuous
+integration.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def excuse(report: pytest.TestReport | pytest.CollectReport) -> str:
 
 
 def refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
-    """In CI a skip is a failure: a missing tool is for .ci/run to install, not for a test to look away from."""
+    """In CI a skip is a failure: a missing tool is for .ci/run to install, not for a test to look
+    away from.
+    """
     expected = hasattr(report, "wasxfail") or ABSENT in excuse(report)
     if os.environ.get("CI") and report.skipped and not expected:
         report.outcome = "failed"

@@ -1,4 +1,6 @@
-"""Documents with anything at all somewhere in them, for readers that promise an answer or one sentence."""
+"""Documents with anything at all somewhere in them, for readers that promise an answer or one
+sentence.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ ANYTHING = st.recursive(
 
 
 def damage(document: Any, data: st.DataObject) -> None:
-    """Put anything in the place of one value of nested dicts and lists, or take that away, or have it twice."""
+    """Put anything in the place of one value of nested dicts and lists, or take that away, or have
+    it twice.
+    """
     place = document
     while True:
         keys = list(place) if isinstance(place, dict) else list(range(len(place)))

@@ -1,4 +1,6 @@
-"""What comes with the package is found, and a model whose bytes are not what its card says is refused."""
+"""What comes with the package is found, and a model whose bytes are not what its card says is
+refused.
+"""
 
 from __future__ import annotations
 

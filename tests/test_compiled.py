@@ -29,8 +29,9 @@ def dispatchers() -> dict[int, tuple[str, Dispatcher]]:
 
 
 def test_no_two_compiled_functions_share_a_file_on_disk() -> None:
-    """Numba names a file after the Python function, not after its options, so a serial and a parallel driver made from
-    one function read one another's code: whichever was compiled first serves both.
+    """Numba names a file after the Python function, not after its options, so a serial and a
+    parallel driver made from one function read one another's code: whichever was compiled first
+    serves both.
     """
     owners = defaultdict(list)
     for name, dispatcher in dispatchers().values():

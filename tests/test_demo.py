@@ -1,4 +1,6 @@
-"""The whole line on the bundled sample with the bundled model, held against the truth the sample was rendered from."""
+"""The whole line on the bundled sample with the bundled model, held against the truth the sample
+was rendered from.
+"""
 
 from __future__ import annotations
 

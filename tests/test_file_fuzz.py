@@ -1,4 +1,6 @@
-"""Whatever is in the small files that a plan or a study names, it is read or refused in one sentence."""
+"""Whatever is in the small files that a plan or a study names, it is read or refused in one
+sentence.
+"""
 
 from __future__ import annotations
 

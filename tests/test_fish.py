@@ -1,4 +1,6 @@
-"""The whole line on a swimming fish with the bundled model, held against the truth it was rendered from."""
+"""The whole line on a swimming fish with the bundled model, held against the truth it was rendered
+from.
+"""
 
 from __future__ import annotations
 

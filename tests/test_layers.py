@@ -62,7 +62,9 @@ def test_every_module_of_the_library_has_a_layer() -> None:
     ],
 )
 def test_jobs_and_views_do_not_know_each_other(folder: str, forbidden: tuple[str, ...]) -> None:
-    """import-linter takes liex_lab.pipelines for a missing module, so this looks at the imports itself."""
+    """import-linter takes liex_lab.pipelines for a missing module, so this looks at the imports
+    itself.
+    """
     for path in files_of(folder):
         for name in imported_modules(path):
             assert not any(name == top or name.startswith(f"{top}.") for top in forbidden), (
@@ -106,8 +108,10 @@ HEAVY = {
     [
         "import liex_lab",
         "import liex_lab; liex_lab.Camera, liex_lab.SE3, liex_lab.Plan, liex_lab.LiexError",
-        "import liex_lab.cli, typer.testing; typer.testing.CliRunner().invoke(liex_lab.cli.app, ['--help'])",
-        "import liex_lab.cli, typer.testing; typer.testing.CliRunner().invoke(liex_lab.cli.app, ['run', '--help'])",
+        "import liex_lab.cli, typer.testing; typer.testing.CliRunner().invoke(liex_lab.cli.app, "
+        "['--help'])",
+        "import liex_lab.cli, typer.testing; typer.testing.CliRunner().invoke(liex_lab.cli.app, "
+        "['run', '--help'])",
     ],
 )
 def test_nothing_heavy_comes_along(code: str) -> None:
@@ -127,7 +131,9 @@ def test_every_public_name_can_be_had() -> None:
 
 
 def imports_of_files() -> dict[str, set[str]]:
-    """Every module of the repository with the modules of it that it imports anywhere, for types too."""
+    """Every module of the repository with the modules of it that it imports anywhere, for types
+    too.
+    """
     tops = {
         "liex_lab": "liex_lab",
         "pipelines": "liex_lab.pipelines",

@@ -1,4 +1,6 @@
-"""A dotted path that moved still imports, is the module at its new place, and says once where that is."""
+"""A dotted path that moved still imports, is the module at its new place, and says once where that
+is.
+"""
 
 from __future__ import annotations
 

@@ -53,7 +53,10 @@ def test_every_verb_and_every_setting_exists() -> None:
         1:
     ]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
-    known = "cohort compare convert correct dashboard demo doctor evaluate export info live report run show suggest "
+    known = (
+        "cohort compare convert correct dashboard demo doctor evaluate export info live report "
+        "run show suggest "
+    )
     known += "train verify"
     assert sorted(verbs) == sorted(known.split())
     assert all(verb in told for verb in verbs)

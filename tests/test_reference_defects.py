@@ -1,8 +1,8 @@
 """What other programs are known to get wrong about units, and what comes out here instead.
 
-The numbers are those of BEHAVIOUR's list of unit defects (MoSeq's extraction of early 2024), in its order. Its
-thirteenth, a failed flip classifier that turns every frame round, has no counterpart: nothing here is turned round
-behind the user's back, and what will be is a row of flips.parquet.
+The numbers are those of BEHAVIOUR's list of unit defects (MoSeq's extraction of early 2024), in its
+order. Its thirteenth, a failed flip classifier that turns every frame round, has no counterpart:
+nothing here is turned round behind the user's back, and what will be is a row of flips.parquet.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def plates(
 def measured(
     folder: Path, camera: Camera, shown: list[Plate], water: Water | None = None
 ) -> tuple[Array, Array, Array]:
-    """The product's own path, from pictures on disk to (area mm^2, sides mm (2,), centre mm (3,)) of each frame."""
+    """The product's own path, from pictures on disk to (area mm^2, sides mm (2,), centre mm (3,))
+    of each frame.
+    """
     pictures = np.rint(8.0 * np.stack([plate.depth(camera, water) for plate in shown])).astype(
         np.uint16
     )
@@ -84,7 +86,9 @@ def measured(
 def check_square(
     folder: Path, camera: Camera, floor_mm: float = 650.0, water: Water | None = None
 ) -> None:
-    """Area, sides, depth and place of a square within 1 %; of a single picture its sides within a pixel, too."""
+    """Area, sides, depth and place of a square within 1 %; of a single picture its sides within a
+    pixel, too.
+    """
     shown = plates(camera, floor_mm, 80.0)
     area, sides, centre = measured(folder, camera, shown, water)
     pixel = floor_mm / camera.fx
@@ -127,7 +131,9 @@ def test_and_through_water(tmp_path: Path, camera: Camera, water: Water) -> None
 
 
 def test_1_the_focal_length_comes_from_the_tangent_of_the_angle_of_view() -> None:
-    """Stated are 70.6 x 60 degrees: 361.6 and 367.2 px. The angle in place of its tangent gives 415.5 and 404.9."""
+    """Stated are 70.6 x 60 degrees: 361.6 and 367.2 px. The angle in place of its tangent gives
+    415.5 and 404.9.
+    """
     width, height = KINECT_V2.width, KINECT_V2.height
     stated = [width / 2 / np.tan(np.radians(70.6) / 2), height / 2 / np.tan(np.radians(60.0) / 2)]
     np.testing.assert_allclose([KINECT_V2.fx, KINECT_V2.fy], stated, rtol=0.01)
@@ -148,7 +154,9 @@ def test_2_and_3_lengths_follow_the_camera_that_made_the_picture(
 
 
 def test_4_a_tall_animal_is_where_it_is_and_not_where_its_shadow_is(tmp_path: Path) -> None:
-    """40 mm above a floor at 673.1 mm: at the floor's depth its way would come out 6.3 % too long."""
+    """40 mm above a floor at 673.1 mm: at the floor's depth its way would come out 6.3 %
+    too long.
+    """
     shown = [Plate(FLOOR_MM, 70.0, 40.0, (x, 30.0)) for x in (-150.0, -80.0, 0.0, 70.0, 150.0)]
     _, _, centre = measured(tmp_path / "r", KINECT_V2, shown)
     np.testing.assert_allclose(np.diff(centre[:, 0]), [70.0, 80.0, 70.0, 80.0], rtol=0.01)
@@ -163,7 +171,9 @@ def test_5_an_area_is_scaled_along_both_axes(tmp_path: Path) -> None:
 
 
 def test_6_a_length_does_not_depend_on_the_way_the_animal_faces(tmp_path: Path) -> None:
-    """Pixels that are not square: an axis has its own scale, whichever way the animal lies in it."""
+    """Pixels that are not square: an axis has its own scale, whichever way the animal lies
+    in it.
+    """
     oblong = Camera(300.0, 400.0, 159.5, 159.5, 320, 320)
     turned = [Plate(600.0, 80.0, 20.0, (10.0, 10.0), turn) for turn in np.linspace(0.1, 1.5, 7)]
     _, sides, _ = measured(tmp_path / "r", oblong, turned)
@@ -171,7 +181,9 @@ def test_6_a_length_does_not_depend_on_the_way_the_animal_faces(tmp_path: Path) 
 
 
 def test_7_a_speed_is_per_second_and_a_lost_frame_does_not_double_it() -> None:
-    """5 mm a frame at 30 frames/s with one frame lost: 150 mm/s before, across and after, not 10 mm in a frame."""
+    """5 mm a frame at 30 frames/s with one frame lost: 150 mm/s before, across and after, not 10 mm
+    in a frame.
+    """
     moved = kinematics(
         *tables_of(WalkingMouse(np.delete(steady(2.0), 30), speed_mm_s=150.0, radius_mm=1e5))
     )
@@ -204,7 +216,9 @@ def test_10_a_vertical_speed_is_of_a_named_point_in_mm_a_second() -> None:
 
 
 def test_11_times_have_one_unit_whatever_file_they_come_from(tmp_path: Path) -> None:
-    """Milliseconds in depth_ts.txt, seconds and nanoseconds in a timestamps.csv: the same duration from all three."""
+    """Milliseconds in depth_ts.txt, seconds and nanoseconds in a timestamps.csv: the same duration
+    from all three.
+    """
     stored, times = depth_frames(31), even_times(31, step_ns=33_000_000)
     milliseconds = write_moseq_folder(tmp_path / "m", stored, [f"{t / 1e6:.6f}" for t in times])
     (milliseconds / "camera.toml").write_text("fx = 60.0\nfy = 61.0\ncx = 31.5\ncy = 23.5\n")
@@ -223,7 +237,9 @@ def test_11_times_have_one_unit_whatever_file_they_come_from(tmp_path: Path) -> 
 def test_12_lost_frames_are_counted_at_any_rate(
     tmp_path: Path, rate: float, lost: tuple[int, ...], missing: int
 ) -> None:
-    """No rate is expected of a camera: 60 frames/s are not a hundred per cent lost, and 4 lost of 100 are seen."""
+    """No rate is expected of a camera: 60 frames/s are not a hundred per cent lost, and 4 lost of
+    100 are seen.
+    """
     times = [int(k * 1e9 / rate) for k in range(100) if k not in lost]
     findings = examine(write_png_folder(tmp_path / "r", depth_frames(len(times)), times_ns=times))
     assert findings["n_frames"] == 100 - len(lost)
@@ -232,7 +248,9 @@ def test_12_lost_frames_are_counted_at_any_rate(
 
 
 def test_14_the_model_sees_in_use_what_it_saw_in_training() -> None:
-    """One picture through both doors, the one for training windows and the one for recordings: the same height map."""
+    """One picture through both doors, the one for training windows and the one for recordings: the
+    same height map.
+    """
     plate = Plate(600.0, 60.0, 25.0, (20.0, -10.0))
     picture = np.rint(plate.depth(PRIMESENSE_QVGA)).astype(np.uint16)
     bare = np.full_like(picture, 600)

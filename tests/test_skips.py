@@ -1,4 +1,6 @@
-"""In CI a test may not look away: a skip for a missing tool fails, absent reference data may be skipped."""
+"""In CI a test may not look away: a skip for a missing tool fails, absent reference data may be
+skipped.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""ruff and mypy hold for the whole repository, and every function but a numba kernel states its types."""
+"""ruff and mypy hold for the whole repository, and every function but a numba kernel states its
+types.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What the dashboard shows of a study: looked up in the session folders when asked for, and kept until those change."""
+"""What the dashboard shows of a study: looked up in the session folders when asked for, and kept
+until those change.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +26,21 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DONE = ("done", "changed")  # states in which there is a session to look at
-NO_POSE, OTHER = "no pose", "other actions"
-GREY, VOID = "#dcdcd7", "#ffffff"
+NO_POSE = "no pose"
+OTHER = "other actions"
+GREY = "#dcdcd7"
+VOID = "#ffffff"
 _READERS = 4  # threads; most of the time goes into opening files
 _HELD = 6  # sessions whose tables stay in memory
 
 
 @dataclass(frozen=True)
 class Ethogram:
-    """A session's bouts as spans (n, 2) s with their words, the spans without a pose (m, 2) s, and how long it is.
+    """A session's bouts as spans (n, 2) s with their words, the spans without a pose (m, 2) s, and
+    how long it is.
 
-    vocabulary: all words that its ethogram could have, in the order of which report and replay colour them.
+    vocabulary: all words that its ethogram could have, in the order of which report and replay
+    colour them.
     """
 
     spans_s: np.ndarray
@@ -45,10 +51,13 @@ class Ethogram:
 
 
 class StudyData:
-    """The study that `look` lists, read lazily. Every public method may be called from several threads at once."""
+    """The study that `look` lists, read lazily. Every public method may be called from several
+    threads at once.
+    """
 
     def __init__(self, name: str, look: Callable[[], Sequence[Entry]]) -> None:
-        self.name, self._look = name, look
+        self.name = name
+        self._look = look
         self._lock = threading.RLock()
         self._kept: dict[tuple[str, str], tuple[Any, Any]] = {}
         self._stats: dict[Any, pd.DataFrame] = {}
@@ -64,7 +73,9 @@ class StudyData:
             self._stats.clear()
 
     def warm(self, progress: Progress = silent) -> None:
-        """Read what the first page shows; what the others show is read meanwhile, by a thread of its own."""
+        """Read what the first page shows; what the others show is read meanwhile, by a thread of
+        its own.
+        """
         entries = self.done
         for k, entry in enumerate(entries):
             progress(k, len(entries), "reading sessions")
@@ -85,7 +96,9 @@ class StudyData:
         ]
 
     def session(self, key: str) -> Session:
-        """An opened session; the same object until its folder changes. Raises SessionError where there is none."""
+        """An opened session; the same object until its folder changes. Raises SessionError where
+        there is none.
+        """
         entry = self.entries.get(key)
         if entry is None or entry.folder is None or entry.state not in DONE:
             raise SessionError(
@@ -134,7 +147,9 @@ class StudyData:
         }
 
     def collected(self) -> pd.DataFrame:
-        """One row per measured session, as the comparison of groups takes it; the study's groups overrule theirs."""
+        """One row per measured session, as the comparison of groups takes it; the study's groups
+        overrule theirs.
+        """
         import pandas as pd
 
         done = self.done
@@ -150,7 +165,9 @@ class StudyData:
         )
 
     def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
-        """The comparison of the groups: the usual measures and this one, with p corrected for all of them."""
+        """The comparison of the groups: the usual measures and this one, with p corrected for all
+        of them.
+        """
         table = self.collected()
         measures = cohort.usual_measures(table)
         wanted = measures if measure in measures else [*measures, measure]
@@ -161,7 +178,9 @@ class StudyData:
             return self._stats[asked]
 
     def described(self, measure: str) -> tuple[str, str]:
-        """The unit of a measure and what it means, from the column dictionary of the first session that has it."""
+        """The unit of a measure and what it means, from the column dictionary of the first session
+        that has it.
+        """
         for entry in self.done:
             columns = self._of_one("columns", lambda session: session.columns, entry)
             if not isinstance(columns, dict):
@@ -180,7 +199,8 @@ class StudyData:
 
     def _of_one(self, what: str, read: Callable[[Session], Any], entry: Entry) -> Any:
         assert entry.folder is not None
-        stamp, known = _stamp(entry.folder), self._kept.get((what, entry.key))
+        stamp = _stamp(entry.folder)
+        known = self._kept.get((what, entry.key))
         if known is not None and known[0] == stamp:
             return known[1]
         try:
@@ -216,7 +236,9 @@ def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
 
 
 def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str, str]:
-    """A colour for each word, where it is free its own of report and replay; words beyond the last share a grey."""
+    """A colour for each word, where it is free its own of report and replay; words beyond the last
+    share a grey.
+    """
     own = {word: action_colour(k) for k, word in reversed(list(enumerate(vocabulary)))}
     chosen: dict[str, str] = {}
     for word in words:
@@ -234,8 +256,8 @@ def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
 def raster(
     one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int
 ) -> np.ndarray:
-    """(n,) for each of n equal parts of a span: the place of the word with the most time in it, -1 for none, -2 where
-    there is mostly no pose.
+    """(n,) for each of n equal parts of a span: the place of the word with the most time in it, -1
+    for none, -2 where there is mostly no pose.
     """
     place = {word: k for k, word in enumerate(words)}
     seconds = np.zeros((len(words) + 1, n))
@@ -245,7 +267,8 @@ def raster(
         low, high = (float(np.clip((at - start_s) / step, 0, n)) for at in (a, b))
         if kind < 0 or high <= low:
             continue
-        first, last = int(low), min(int(np.ceil(high)), n) - 1
+        first = int(low)
+        last = min(int(np.ceil(high)), n) - 1
         seconds[kind, first : last + 1] += 1.0
         seconds[kind, first] -= low - first
         seconds[kind, last] -= last + 1 - high

@@ -1,4 +1,6 @@
-"""The depth picture of any frame of a session, out of its own replay file, with the skeleton over it."""
+"""The depth picture of any frame of a session, out of its own replay file, with the skeleton over
+it.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,8 @@ class Frames:
         uv = joints[["u_px", "v_px"]].to_numpy(float)
         posed = len(uv) > 0 and bool(np.isfinite(uv).all())
         if depth is None:
-            height, width = session.camera.height, session.camera.width
+            height = session.camera.height
+            width = session.camera.width
             depth = np.zeros((height, width), np.uint16)
         left, top, cut = (0, 0, depth) if whole or not posed else _around(depth, uv)
         bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]] if posed else []
@@ -83,7 +86,9 @@ class Frames:
 
 
 def _around(depth: NDArray[np.uint16], uv: np.ndarray) -> tuple[int, int, NDArray[np.uint16]]:
-    """The square of the picture around a skeleton (J, 2) px: its left and top, and the part of it that is there."""
+    """The square of the picture around a skeleton (J, 2) px: its left and top, and the part of it
+    that is there.
+    """
     centre = uv.mean(axis=0)
     half = max(1.6 * float(np.linalg.norm(uv - centre, axis=1).max()), _LEAST_PX)
     height, width = depth.shape
@@ -105,12 +110,12 @@ def _kept(session: Session, row: int) -> NDArray[np.uint16] | None:
         cut = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
         if cut is not None:
             depth = np.zeros((session.camera.height, session.camera.width), np.uint16)
-            left, top = int(entry["left_px"]), int(entry["top_px"])
-            x0, y0 = max(left, 0), max(top, 0)
-            x1, y1 = (
-                min(left + cut.shape[1], depth.shape[1]),
-                min(top + cut.shape[0], depth.shape[0]),
-            )
+            left = int(entry["left_px"])
+            top = int(entry["top_px"])
+            x0 = max(left, 0)
+            y0 = max(top, 0)
+            x1 = min(left + cut.shape[1], depth.shape[1])
+            y1 = min(top + cut.shape[0], depth.shape[0])
             depth[y0:y1, x0:x1] = cut[y0 - top : y1 - top, x0 - left : x1 - left]
             return depth
     return None

@@ -1,4 +1,6 @@
-"""Who may ask the dashboard for anything, and what its pages may load: this machine alone, unless told otherwise."""
+"""Who may ask the dashboard for anything, and what its pages may load: this machine alone, unless
+told otherwise.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,16 @@ if TYPE_CHECKING:
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _COOKIE = "liex_dashboard"
-_REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # a report needs no script, so it has none
+# a report needs no script, so it has none
+_REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
-    """Refuse requests of others: with a token those that do not know it, without one those of any other name.
+    """Refuse requests of others: with a token those that do not know it, without one those of any
+    other name.
 
-    A name that is not this machine's would be another site's whose address was bent to us (DNS rebinding); an origin
-    that is not ours another site's page that sends forms here.
+    A name that is not this machine's would be another site's whose address was bent to us (DNS
+    rebinding); an origin that is not ours another site's page that sends forms here.
     """
 
     @server.before_request

@@ -1,4 +1,6 @@
-"""What a person corrects from a session's page: head and tail of a span, a joint of a frame, a bout of the ethogram."""
+"""What a person corrects from a session's page: head and tail of a span, a joint of a frame, a bout
+of the ethogram.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,8 @@ def panel(session: Session, opened: bool) -> html.Details:
         children=[
             html.Summary("Correct this session"),
             html.P(
-                "Corrections lie beside the session, never over it, and are applied whenever it is read.",
+                "Corrections lie beside the session, never over it, and are applied whenever it "
+                "is read.",
                 className="muted",
             ),
             _row(
@@ -142,8 +145,8 @@ def _made(session: Session) -> html.Div:
 def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) -> Correction:
     """The correction that a button asks for, with what stands in the form.
 
-    told: from, to (s), action, new (an action that the ethogram has no word for), joint, u, v (px), x, y, z (mm).
-    Raises SessionError where it is not enough, or too much.
+    told: from, to (s), action, new (an action that the ethogram has no word for), joint, u, v (px),
+    x, y, z (mm). Raises SessionError where it is not enough, or too much.
     """
 
     def number(*names: str) -> list[float]:
@@ -163,7 +166,8 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
         new = str(told.get("new") or "").strip()
         if new and told.get("action"):
             raise SessionError(
-                f"this needs one action, got {told['action']} and the new word {new}; empty one of them"
+                f"this needs one action, got {told['action']} and the new word {new}; empty one of "
+                "them"
             )
         return (new, True) if new else (word("action"), False)
 

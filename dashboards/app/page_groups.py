@@ -30,8 +30,8 @@ def groups_page(data: StudyData) -> list[Any]:
             html.P("Study", className="kind"),
             html.H1("Groups"),
             html.P(
-                f"A comparison needs two groups of animals, and these {said}. State `group` for the animals in the "
-                "study file, or session.group in the plan."
+                f"A comparison needs two groups of animals, and these {said}. State `group` for "
+                "the animals in the study file, or session.group in the plan."
             ),
         ]
     return [
@@ -82,8 +82,8 @@ def groups_page(data: StudyData) -> list[Any]:
                             "each animal's mean and its sessions, by group",
                         ),
                         html.P(
-                            "Large marks are animals, small ones their sessions, the line is the mean of the animals. "
-                            "A click opens the session.",
+                            "Large marks are animals, small ones their sessions, the line is the "
+                            "mean of the animals. A click opens the session.",
                             className="muted",
                         ),
                     ]
@@ -114,18 +114,28 @@ def groups_page(data: StudyData) -> list[Any]:
 
 def verdict(row: dict[str, Any], unit: str) -> html.Div:
     """One contrast in words: what was found, how sure, of how many."""
-    sized = f"{number(row['estimate'])}{f' {unit}' if unit else ''}, 95 % interval {number(row['ci_low'])} to "
-    sized += f"{number(row['ci_high'])}; Hedges' g {number(row['effect_size'])} ({number(row['effect_low'])} to "
+    sized = (
+        f"{number(row['estimate'])}{f' {unit}' if unit else ''}, 95 % interval "
+        f"{number(row['ci_low'])} to "
+    )
+    sized += (
+        f"{number(row['ci_high'])}; Hedges' g {number(row['effect_size'])} "
+        f"({number(row['effect_low'])} to "
+    )
     sized += f"{number(row['effect_high'])})"
     if row["test"]:
-        tested = f"p = {number(row['p'])}, corrected for {row['n_family']} tests {number(row['p_fdr'])}; {row['test']}."
+        tested = (
+            f"p = {number(row['p'])}, corrected for {row['n_family']} tests "
+            f"{number(row['p_fdr'])}; {row['test']}."
+        )
     else:
         tested = f"No test: {row['refused']}."
     cages = f"{row['n_cages']} cages, " if row["n_cages"] else ""
     counts = (
-        f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'}); {row['n_animals']} "
-        f"animals, {cages}{row['n_sessions']} sessions, {row['n_bouts']:,} bouts, {number(row['observed_min'])} min; "
-        f"{row['n_without_value']} sessions without a value."
+        f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'}); "
+        f"{row['n_animals']} animals, {cages}{row['n_sessions']} sessions, {row['n_bouts']:,} "
+        f"bouts, {number(row['observed_min'])} min; {row['n_without_value']} sessions without a "
+        "value."
     )
     kind = "verdict" if row["test"] else "verdict is-refused"
     return html.Div(

@@ -1,4 +1,6 @@
-"""The page of one session at one moment: the frame's picture, its numbers, the curves around it, and its replay."""
+"""The page of one session at one moment: the frame's picture, its numbers, the curves around it,
+and its replay.
+"""
 
 from __future__ import annotations
 
@@ -63,9 +65,13 @@ def session_page(
     may_correct: bool,
     correcting: bool = False,
 ) -> list[Any]:
-    """A session at a moment (s since its first frame). correcting: the form for corrections is open."""
-    session, one = data.session(key), data.ethograms([key])[key]
-    entry, curves = data.entries[key], traces(session)
+    """A session at a moment (s since its first frame). correcting: the form for corrections is
+    open.
+    """
+    session = data.session(key)
+    one = data.ethograms([key])[key]
+    entry = data.entries[key]
+    curves = traces(session)
     coloured = colours_of(shown_words([one]), one.vocabulary)
     who = ", ".join(
         f"{name.replace('_', ' ')} {value}" for name, value in entry.who.items() if value
@@ -81,7 +87,8 @@ def session_page(
         ),
         html.H1(key),
         html.P(
-            f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s",
+            f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, "
+            f"{frames['duration_s']:.1f} s",
             className="muted",
         ),
         *(
@@ -165,7 +172,9 @@ def _steps(at_s: float) -> html.Div:
             id={"part": "step", "by": by, "to": to},
             n_clicks=0,
             type="button",
-            title=f"{'next' if to > 0 else 'previous'} {'frame with a flag' if by == 'flag' else by}",
+            title=(
+                f"{'next' if to > 0 else 'previous'} {'frame with a flag' if by == 'flag' else by}"
+            ),
         )
         for by, to, label in _STEPS
     ]
@@ -256,7 +265,9 @@ def nearest_row(session: Session, at_s: float) -> int:
 
 
 def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
-    """The next or previous frame, bout's onset, or frame with a flag; the same moment where there is none."""
+    """The next or previous frame, bout's onset, or frame with a flag; the same moment where there
+    is none.
+    """
     time_s = session.frames["time_s"].to_numpy(float)
     row = nearest_row(session, at_s)
     if by == "frame":
@@ -324,7 +335,8 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         State("session-unit-s", "data"),
     )
     def follow(at_s: float | None, key: str, unit_s: float) -> tuple[Any, ...]:
-        session, moment = data.session(key), float(at_s or 0.0)
+        session = data.session(key)
+        moment = float(at_s or 0.0)
         row = nearest_row(session, moment)
         marked = Patch()
         marked["layout"]["shapes"] = [plots.cursor(moment / unit_s)]

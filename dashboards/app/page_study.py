@@ -1,4 +1,6 @@
-"""Pages of the whole study: the list of its sessions, and their ethograms and time budgets side by side."""
+"""Pages of the whole study: the list of its sessions, and their ethograms and time budgets side by
+side.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +44,8 @@ def sessions_page(data: StudyData) -> list[Any]:
         ),
         html.Ul(chips, className="chips", id="state-counts"),
         html.P(
-            "A session's name opens it. Error is the joint error to be expected, median over its frames; flips are "
-            "stretches in which head and tail may have been exchanged.",
+            "A session's name opens it. Error is the joint error to be expected, median over its "
+            "frames; flips are stretches in which head and tail may have been exchanged.",
             className="muted",
         ),
         block("sessions", "Sessions of the study"),
@@ -119,7 +121,9 @@ def ethograms_page(data: StudyData) -> list[Any]:
 def chosen_keys(
     data: StudyData, names: Sequence[str] | None, sessions: Sequence[str] | None
 ) -> list[str]:
-    """The sessions that are named, or those of the groups, or all; by group, then as in the study."""
+    """The sessions that are named, or those of the groups, or all; by group, then as in the
+    study.
+    """
     done = data.done
     if sessions:
         return [entry.key for entry in done if entry.key in set(sessions)]

@@ -6,7 +6,8 @@ from typing import Any
 
 from dash import dcc, html
 
-# Plotly's toolbar has a button that sends the figure to its makers: it is taken out, and has no address to send it to
+# Plotly's toolbar has a button that sends the figure to its makers: it is taken out, and has no
+# address to send it to
 _GRAPH = {
     "displaylogo": False,
     "responsive": True,

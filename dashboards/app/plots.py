@@ -1,7 +1,7 @@
 """The dashboard's figures, as plotly takes them: what is drawn, and what a click on it means.
 
-Plotly reads markup in every text it is given, so all names are escaped. A click is told by `customdata`: the key of a
-session and, where there is one, a time.
+Plotly reads markup in every text it is given, so all names are escaped. A click is told by
+`customdata`: the key of a session and, where there is one, a time.
 """
 
 from __future__ import annotations
@@ -19,17 +19,21 @@ from liex_lab.behaviour.design import animal_means
 from ..report.svg import Array, kept_rows, png_uri, shade
 from .data import GREY, NO_POSE, OTHER, Ethogram, raster
 
-INK, MUTED, LINE = "#1f2328", "#626a73", "#d9dbd7"
-BLUE, GREEN, RED, PURPLE = "#4477AA", "#228833", "#EE6677", "#AA3377"
+INK = "#1f2328"
+MUTED = "#626a73"
+LINE = "#d9dbd7"
+BLUE = "#4477AA"
+GREEN = "#228833"
+RED = "#EE6677"
+PURPLE = "#AA3377"
 # Okabe and Ito's colours; beside them every group has its own mark
 GROUP_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GROUP_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star")
 NO_POSE_COLOUR = "#3a3f45"
 FEW = 60  # sessions; with more, rows are thin
-_COLUMNS, _MOST_CELLS = (
-    800,
-    40_000,
-)  # parts of the time that a row of an ethogram shows; of all rows together
+# parts of the time that a row of an ethogram shows; of all rows together
+_COLUMNS = 800
+_MOST_CELLS = 40_000
 _FONT = {
     "family": 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", sans-serif',
     "size": 13,
@@ -95,7 +99,9 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
 
 
 def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str, Any]:
-    """A bar per session; shares: one row per session, `key`, a column `WORD_share` for each action."""
+    """A bar per session; shares: one row per session, `key`, a column `WORD_share` for each
+    action.
+    """
     if shares.empty:
         return empty("No session is chosen, or none of those has a summary.")
     actions = [str(name).removesuffix("_share") for name in shares if str(name).endswith("_share")]
@@ -136,19 +142,24 @@ def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str,
 
 
 def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
-    """Every animal's mean in its group, its sessions as small dots beside it, and the mean of the animals."""
+    """Every animal's mean in its group, its sessions as small dots beside it, and the mean of the
+    animals.
+    """
     known = table[np.isfinite(table[measure].astype(float))] if measure in table else table.iloc[:0]
     if known.empty:
         return empty("No session has a value of this measure.")
     names = sorted(set(known["group"].fillna("").astype(str)))
-    rng, data, lines = np.random.default_rng(0), [], []
+    rng = np.random.default_rng(0)
+    data = []
+    lines = []
     for k, name in enumerate(names):
         own = known[known["group"].fillna("") == name]
         values = own[measure].to_numpy(float)
         animal, animals = pd.factorize(own["subject_id"].where(own["subject_id"] != "", own["key"]))
         means = animal_means(values, animal)
         beside = rng.uniform(-0.16, 0.16, len(animals)) if len(animals) > 1 else np.zeros(1)
-        colour, mark = GROUP_COLOURS[k % len(GROUP_COLOURS)], GROUP_MARKS[k % len(GROUP_MARKS)]
+        colour = GROUP_COLOURS[k % len(GROUP_COLOURS)]
+        mark = GROUP_MARKS[k % len(GROUP_MARKS)]
         n_of = np.bincount(animal)
         label = text(name or "no group")
         data.append(
@@ -223,7 +234,9 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
 
 
 def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
-    """Each contrast's difference with its 95 % interval; a hollow mark where the design allows no test."""
+    """Each contrast's difference with its 95 % interval; a hollow mark where the design allows no
+    test.
+    """
     known = stats[np.isfinite(stats["estimate"].astype(float))]
     if known.empty:
         return empty("No difference can be given; the table below says why.", 220)
@@ -273,7 +286,9 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
 def whole_session(
     one: Ethogram, coloured: Mapping[str, str], traces: Sequence[tuple[str, Array, Array, str]]
 ) -> dict[str, Any]:
-    """A lane per action over a whole session, and curves below: (name with unit, time s (n,), values (n,), colour)."""
+    """A lane per action over a whole session, and curves below: (name with unit, time s (n,),
+    values (n,), colour).
+    """
     n = 1200
     stop_s = max(one.duration_s, 1e-3)
     words = list(coloured)
@@ -305,7 +320,8 @@ def whole_session(
         }
     ]
     heights = [22 * len(lanes) + 20, *[96] * len(traces)]
-    domains, notes = _domains(heights), []
+    domains = _domains(heights)
+    notes = []
     layout: dict[str, Any] = {
         "yaxis": {
             "tickvals": list(range(len(lanes))),
@@ -354,12 +370,15 @@ def _only(one: Ethogram, word: str) -> Ethogram:
 def around(
     traces: Sequence[tuple[str, Array, Array, str]], moment_s: float, half_s: float
 ) -> dict[str, Any]:
-    """The curves near a moment, every frame a point: (name with unit, time s (n,), values (n,), colour)."""
+    """The curves near a moment, every frame a point: (name with unit, time s (n,), values (n,),
+    colour).
+    """
     if not traces:
         return empty("This session has no kinematics.")
     heights = [104] * len(traces)
     domains = _domains(heights)
-    data, notes = [], []
+    data = []
+    notes = []
     layout: dict[str, Any] = {}
     for k, (name, time_s, values, colour) in enumerate(traces):
         near = np.abs(time_s - moment_s) <= half_s
@@ -410,7 +429,8 @@ def frame_picture(
     top: int,
     reach_mm: float,
 ) -> dict[str, Any]:
-    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) px over it.
+    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) px
+    over it.
 
     The axes count the whole frame's pixels, (0, 0) the centre of the first.
     """
@@ -510,8 +530,11 @@ def _session_axis(n: int) -> dict[str, Any]:
 
 def _domains(heights: Sequence[int]) -> list[list[float]]:
     """Where figures of these heights stand above each other, the first on top."""
-    total, apart = float(sum(heights)), 24.0  # room for a title
-    top, out = 1.0, []
+    # room for a title
+    total = float(sum(heights))
+    apart = 24.0
+    top = 1.0
+    out = []
     for height in heights:
         bottom = top - height / total
         out.append([max(bottom, 0.0), top - apart / total])

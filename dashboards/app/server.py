@@ -1,4 +1,6 @@
-"""`liex dashboard`: a study in the browser, served from this machine, with nothing loaded from anywhere else."""
+"""`liex dashboard`: a study in the browser, served from this machine, with nothing loaded from
+anywhere else.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,9 @@ _INDEX = """<!doctype html>
 <body>{%app_entry%}<footer hidden>{%config%}{%scripts%}{%renderer%}</footer></body>
 </html>"""
 _POLICY = (
-    "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src "
+    "'self' data: blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action "
+    "'self'; frame-ancestors 'none'"
 )
 
 
@@ -45,10 +48,12 @@ def make_app(
     show_replay: ShowReplay | None = None,
     correct: Correct | None = None,
 ) -> Dash:
-    """The dashboard of a study, not yet served. token: what every visitor has to know; empty on this machine alone.
+    """The dashboard of a study, not yet served. token: what every visitor has to know; empty on
+    this machine alone.
 
-    show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the command is shown.
-    correct: adds corrections to the session in a folder, or takes some back; None: the pages only show.
+    show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the
+    command is shown. correct: adds corrections to the session in a folder, or takes some back;
+    None: the pages only show.
     """
     app = Dash(
         "liex_lab_dashboard",
@@ -81,7 +86,9 @@ def make_app(
 
 
 def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
-    """Serve until interrupted; `told` hears the port once it listens. Raises LiexError where it cannot."""
+    """Serve until interrupted; `told` hears the port once it listens. Raises LiexError where it
+    cannot.
+    """
     from werkzeug.serving import make_server
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
@@ -90,8 +97,8 @@ def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
     except (OSError, SystemExit) as error:
         why = getattr(error, "strerror", None) or "in use"
         raise LiexError(
-            f"the dashboard cannot listen on {host}, port {port} ({why}); name another with --port, or 0 for any that "
-            "is free"
+            f"the dashboard cannot listen on {host}, port {port} ({why}); name another with "
+            "--port, or 0 for any that is free"
         ) from None
     told(int(server.server_port))
     try:

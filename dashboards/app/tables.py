@@ -26,7 +26,9 @@ _BATCH = 20_000  # rows of a long table that are in memory at once
 
 @dataclass(frozen=True)
 class Table:
-    """A table as it is asked for: rows, the columns to show with their headings, and the column that links onwards."""
+    """A table as it is asked for: rows, the columns to show with their headings, and the column
+    that links onwards.
+    """
 
     rows: pd.DataFrame
     shown: dict[str, str]
@@ -102,8 +104,8 @@ _OF_SESSION = {"bouts": BOUTS, "gaps": GAPS, "flips": FLIPS}
 
 
 def find(data: StudyData, name: str) -> Table:
-    """A table by its name: sessions, summaries, stats?MEASURE?REFERENCE, or bouts, gaps, flips of a session
-    (bouts/KEY). Raises SessionError where there is none.
+    """A table by its name: sessions, summaries, stats?MEASURE?REFERENCE, or bouts, gaps, flips of a
+    session (bouts/KEY). Raises SessionError where there is none.
     """
     what, _, rest = name.partition("/")
     if name == "sessions":
@@ -188,7 +190,9 @@ def csv_address(name: str) -> str:
 
 
 def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str, Any]:
-    """What the page's script draws: headings that sort, cells as texts with what they are, and how many rows."""
+    """What the page's script draws: headings that sort, cells as texts with what they are, and how
+    many rows.
+    """
     rows = arranged(table, words, order["column"], order["down"])
     heads = [
         {
@@ -199,7 +203,8 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
         }
         for column, title in table.shown.items()
     ]
-    n, total = len(rows), len(table.rows)
+    n = len(rows)
+    total = len(table.rows)
     said = f"{n:,} rows" if n == total else f"{n:,} of {total:,} rows"
     said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {

@@ -20,7 +20,9 @@ _DPI = 110
 
 
 def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
-    """Write the matrices of what `evaluate_actions` found, rows what it was, each row's shares in per cent."""
+    """Write the matrices of what `evaluate_actions` found, rows what it was, each row's shares in
+    per cent.
+    """
     from matplotlib.figure import Figure
 
     words = [str(word).replace("_", " ") for word in result["confusion"]["words"]]

@@ -1,4 +1,6 @@
-"""The figures of `liex evaluate tables`, numbered as in the Lie-X paper; PNG. Nothing is computed here."""
+"""The figures of `liex evaluate tables`, numbered as in the Lie-X paper; PNG. Nothing is computed
+here.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,18 @@ _METHODS = {  # variant: (name in the legend, colour, line)
     "rf": ("RF", "#228833", "-"),
     "cnn": ("CNN", "#CCBB44", "-"),
 }
-_TRUE, _POSE, _CHOSEN = "#66CCEE", "#EE6677", "#DD2222"
+_TRUE = "#66CCEE"
+_POSE = "#EE6677"
+_CHOSEN = "#DD2222"
 _DPI = 130
-_MOST_CANDIDATES, _MOST_STAGES = 40, 8
+_MOST_CANDIDATES = 40
+_MOST_STAGES = 8
 
 
 def draw_figures(results: Mapping[str, Mapping[str, Any]], folder: Path) -> list[Path]:
-    """All figures of some animals (`vars` of their `Results`) into the folder; returns their paths."""
+    """All figures of some animals (`vars` of their `Results`) into the folder; returns
+    their paths.
+    """
     written = [
         _save(_sensitivity(results), folder / "fig07_sensitivity.png"),
         _save(_cumulative(results), folder / "fig08_cumulative_error.png"),
@@ -61,7 +68,9 @@ def _sheet(
 
 
 def _cumulative(results: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Fig. 8: the share of the frames whose mean joint error is within so many mm; lost frames never are."""
+    """Fig. 8: the share of the frames whose mean joint error is within so many mm; lost frames
+    never are.
+    """
     n_splits = max(len(one["splits"]) for one in results.values())
     figure, grid = _sheet(len(results), n_splits, 4.2, 3.2)
     for line, (animal, one) in zip(grid, results.items(), strict=True):
@@ -180,12 +189,15 @@ def _view(illustration: Mapping[str, Any]) -> tuple[float, float, float, float]:
     """The part of the height map that holds the animal, with a margin, in pixels."""
     rows, columns = np.nonzero(illustration["heights"] > 0)
     half = 0.75 * max(np.ptp(rows), np.ptp(columns))
-    x, y = 0.5 * (columns.min() + columns.max()), 0.5 * (rows.min() + rows.max())
+    x = 0.5 * (columns.min() + columns.max())
+    y = 0.5 * (rows.min() + rows.max())
     return x - half, x + half, y + half, y - half
 
 
 def _candidates(illustration: Mapping[str, Any]) -> Figure:
-    """Fig. 13-15: candidates in the order of the learned metric, with predicted and true error and rank."""
+    """Fig. 13-15: candidates in the order of the learned metric, with predicted and true error and
+    rank.
+    """
     ranked = illustration["ranked"]
     n = min(len(ranked["score_mm"]), _MOST_CANDIDATES)
     columns = min(n, 10 if n > 10 else 5)
@@ -203,16 +215,18 @@ def _candidates(illustration: Mapping[str, Any]) -> Figure:
             f"{true_rank[k]}: {ranked['error_mm'][k]:.2f} mm", color="#CC3311", fontsize=8
         )
     figure.suptitle(
-        f"{illustration['animal']}: candidates of one picture, red; truth, blue. Above: rank and predicted error; "
-        f"below: true rank and error.\nRank correlation of the two, mean of {illustration['n_images']} pictures: "
-        f"{illustration['rank_correlation']:.2f}",
+        f"{illustration['animal']}: candidates of one picture, red; truth, blue. Above: rank and "
+        "predicted error; below: true rank and error.\nRank correlation of the two, mean of "
+        f"{illustration['n_images']} pictures: {illustration['rank_correlation']:.2f}",
         fontsize=8,
     )
     return figure
 
 
 def _convergence(illustration: Mapping[str, Any]) -> Figure:
-    """Fig. 16: one candidate from start to end, and the error after every joint and round over all candidates."""
+    """Fig. 16: one candidate from start to end, and the error after every joint and round over all
+    candidates.
+    """
     from matplotlib.figure import Figure
 
     steps = illustration["steps"]
@@ -246,7 +260,8 @@ def _convergence(illustration: Mapping[str, Any]) -> Figure:
     panel.set_xticks(shown, [steps["names"][k] for k in shown], rotation=60, fontsize=7, ha="right")
     panel.set(ylabel="mean joint error, mm", ylim=(0, None))
     panel.set_title(
-        f"{illustration['animal']}: after every joint and round, {illustration['n_images']} pictures",
+        f"{illustration['animal']}: after every joint and round, {illustration['n_images']} "
+        "pictures",
         fontsize=8,
     )
     panel.legend(fontsize=7)

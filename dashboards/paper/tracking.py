@@ -1,4 +1,6 @@
-"""Fig. 18 of the Lie-X paper: the error of single frames and of the track over time, and the worst moments; PNG."""
+"""Fig. 18 of the Lie-X paper: the error of single frames and of the track over time, and the worst
+moments; PNG.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ _LINES = {  # row: (name in the legend, colour, width)
     "smoothed": ("smoothed", "#AA3377", 1.6),
 }
 _TRUTH = "#228833"
-_MOMENTS, _APART = 6, 12  # pictures, and frames between two of them at least
+# pictures, and frames between two of them at least
+_MOMENTS = 6
+_APART = 12
 _DPI = 110
 
 
@@ -43,7 +47,8 @@ def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Pa
 
 def worst_moments(error: Array) -> list[int]:
     """The frames with the largest errors (n,), none near another, in order of time."""
-    left, chosen = np.nan_to_num(error, nan=-1.0), []
+    left = np.nan_to_num(error, nan=-1.0)
+    chosen = []
     for _ in range(_MOMENTS):
         frame = int(np.argmax(left))
         if left[frame] < 0:
@@ -80,7 +85,8 @@ def _over_time(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed]
 
 def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], frame: int) -> None:
     """The depth around the animal with the true and the measured skeletons."""
-    camera, depth = sequence.camera, sequence.depths(frame, frame + 1)[0]
+    camera = sequence.camera
+    depth = sequence.depths(frame, frame + 1)[0]
     T_camera_arena = sequence.T_arena_camera.inverse()
     middle = sequence.joints_camera[frame].mean(axis=0)
     u, v = camera.project(middle)

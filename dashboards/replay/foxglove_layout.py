@@ -9,8 +9,13 @@ from typing import Any
 from liex_lab.sessions import Session
 
 FILE = "foxglove.json"
-_DEPTH, _CALIBRATION, _SKELETON = "/camera/depth", "/camera/calibration", "/camera/skeleton"
-_SCENE, _ACTIONS, _NOTES, _JOINTS = "/skeleton/scene", "/actions", "/log", "/skeleton/joints"
+_DEPTH = "/camera/depth"
+_CALIBRATION = "/camera/calibration"
+_SKELETON = "/camera/skeleton"
+_SCENE = "/skeleton/scene"
+_ACTIONS = "/actions"
+_NOTES = "/log"
+_JOINTS = "/skeleton/joints"
 
 
 def write_layout(session: Session) -> Path:
@@ -23,7 +28,9 @@ def write_layout(session: Session) -> Path:
 
 
 def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
-    """The layout from the content of session.json: scene and depth above, actions, heights and notes below."""
+    """The layout from the content of session.json: scene and depth above, actions, heights and
+    notes below.
+    """
     far_mm = float(about["camera"]["floor_distance_mm"])
     joints = list(about["animal"]["joints"])
     ends = sorted({0, len(joints) - 1} if about["animal"]["name"] != "hand" else {0})

@@ -1,4 +1,6 @@
-"""The layout in which a session's replay opens in Rerun: 3D scene and depth picture above, lanes and curves below."""
+"""The layout in which a session's replay opens in Rerun: 3D scene and depth picture above, lanes
+and curves below.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ _NAMES = {
 
 
 def write_blueprint(session: Session) -> Path:
-    """Write the layout as a file of its own, replay.rbl, into a session's folder: dragged into a viewer, it lays out
-    any replay of ours. Returns its path.
+    """Write the layout as a file of its own, replay.rbl, into a session's folder: dragged into a
+    viewer, it lays out any replay of ours. Returns its path.
     """
     path = session.path / FILE
     beside = path.with_name(f".{FILE}")
@@ -31,12 +33,15 @@ def write_blueprint(session: Session) -> Path:
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
-    """A Rerun blueprint from the content of session.json; handed to `Session.create` as `blueprint`."""
+    """A Rerun blueprint from the content of session.json; handed to `Session.create` as
+    `blueprint`.
+    """
     import rerun.blueprint as rrb
 
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
 
-    # with corrections, what they are made of is left out of the views, but is still there to be looked at
+    # with corrections, what they are made of is left out of the views, but is still there to be
+    # looked at
     corrected = bool(session.get("corrections"))
     at = corrected_entity if corrected else str
     measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []

@@ -18,18 +18,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_BLUE, _GREEN, _RED, _PURPLE = "#4477AA", "#228833", "#EE6677", "#AA3377"
-_CURVES = (  # column of the kinematics, title, what it is, unit, colour, whether the axis begins at zero
+_BLUE = "#4477AA"
+_GREEN = "#228833"
+_RED = "#EE6677"
+_PURPLE = "#AA3377"
+# column of the kinematics, title, what it is, unit, colour, whether the axis begins at zero
+_CURVES = (
     ("speed_mm_s", "Speed", "of the body centre, mm/s", "mm/s", _BLUE, True),
     ("nose_height_mm", "Nose height", "above the floor, mm; rearing shaded", "mm", _GREEN, True),
     ("z_mm", "Height", "of the body centre above the floor, mm", "mm", _GREEN, True),
     ("tail_beat_hz", "Tail beat", "frequency, Hz", "Hz", _PURPLE, True),
     ("bend_rad", "Bend", "of the whole body, rad; positive to the left", "rad", _PURPLE, False),
 )
-_WALKING, _SWIMMING = (
-    ("speed_mm_s", "nose_height_mm"),
-    ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz"),
-)
+_WALKING = ("speed_mm_s", "nose_height_mm")
+_SWIMMING = ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
 _AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz")
 # columns that are drawn
 FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
@@ -39,11 +41,10 @@ _CERTAIN = 0.05  # of p, corrected
 
 def charts(session: Session, words: list[str]) -> dict[str, str]:
     """All single figures, by name; empty where the session has no numbers for one."""
-    frames, bouts = session.frames, session.bouts
-    time_s, time = (
-        frames["time_s"].to_numpy(float),
-        figures.time_scale(session.metadata["frames"]["duration_s"]),
-    )
+    frames = session.frames
+    bouts = session.bouts
+    time_s = frames["time_s"].to_numpy(float)
+    time = figures.time_scale(session.metadata["frames"]["duration_s"])
     spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
     empty = session.gaps[
         session.gaps["n_frames_missing"] > 0
@@ -78,11 +79,11 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
     """What the body did over time: (title, what it is, SVG)."""
     if not session.has("kinematics.parquet"):
         return []
-    frames, moved, bouts = session.frames, session.kinematics, session.bouts
-    time_s, time = (
-        frames["time_s"].to_numpy(float),
-        figures.time_scale(session.metadata["frames"]["duration_s"]),
-    )
+    frames = session.frames
+    moved = session.kinematics
+    bouts = session.bouts
+    time_s = frames["time_s"].to_numpy(float)
+    time = figures.time_scale(session.metadata["frames"]["duration_s"])
     rears = bouts.loc[bouts["action"] == "rear", ["start_s", "stop_s"]].to_numpy(float)
     shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
     made = []
@@ -97,7 +98,9 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
 
 
 def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
-    """What can be looked at over time: (name with its unit, time s (n,), values (n,), colour), broken at gaps."""
+    """What can be looked at over time: (name with its unit, time s (n,), values (n,), colour),
+    broken at gaps.
+    """
     frames = session.frames
     time_s = frames["time_s"].to_numpy(float)
     made = []
@@ -116,10 +119,13 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
 
 
 def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
-    """A measure around the onsets of the actions: (title, SVG), all of a measure on the same scale."""
+    """A measure around the onsets of the actions: (title, SVG), all of a measure on the
+    same scale.
+    """
     if not session.has("kinematics.parquet"):
         return []
-    moved, made = session.kinematics, []
+    moved = session.kinematics
+    made = []
     for name, title, _, unit, colour, _ in _CURVES:
         if name not in _AROUND or name not in moved:
             continue
@@ -224,5 +230,7 @@ def _activity(table: pd.DataFrame, words: list[str]) -> str:
 
 
 def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:
-    """Values (n,) with the first one after a gap of the camera taken out, so that no line is drawn across it."""
+    """Values (n,) with the first one after a gap of the camera taken out, so that no line is drawn
+    across it.
+    """
     return np.asarray(values.where(frames["gap_before"] == 0), float)

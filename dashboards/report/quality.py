@@ -1,4 +1,6 @@
-"""What a reader has to know before believing a session: warnings in order of weight, and the frames' account."""
+"""What a reader has to know before believing a session: warnings in order of weight, and the
+frames' account.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,10 @@ import numpy as np
 
 from liex_lab.sessions import Session
 
-_LOST_SHARE, _DOUBTFUL_SHARE, _ERROR_SHARE, _NOISE_SHARE = 0.02, 0.05, 0.1, 1.0
+_LOST_SHARE = 0.02
+_DOUBTFUL_SHARE = 0.05
+_ERROR_SHARE = 0.1
+_NOISE_SHARE = 1.0
 
 
 def warnings(session: Session) -> list[str]:
@@ -20,13 +25,15 @@ def warnings(session: Session) -> list[str]:
 
 
 def _of_frames(session: Session) -> list[str]:
-    frames, found = session.metadata["frames"], []
-    n, lost = frames["n_frames"], frames["n_frames"] - frames["n_observed"]
+    frames = session.metadata["frames"]
+    found = []
+    n = frames["n_frames"]
+    lost = frames["n_frames"] - frames["n_observed"]
     doubtful = int(frames["flags"].get("doubtful", 0))
     if frames["n_missing"]:
         found.append(
-            f"The camera did not deliver {frames['n_missing']:,} frames, in {frames['n_gaps']:,} gaps; nothing is "
-            "measured across them."
+            f"The camera did not deliver {frames['n_missing']:,} frames, in {frames['n_gaps']:,} "
+            "gaps; nothing is measured across them."
         )
     if lost > _LOST_SHARE * n:
         found.append(
@@ -34,15 +41,15 @@ def _of_frames(session: Session) -> list[str]:
         )
     if doubtful > _DOUBTFUL_SHARE * n:
         found.append(
-            f"{doubtful:,} frames ({doubtful / n:.1%}) are doubtful: their predicted error is large."
+            f"{doubtful:,} frames ({doubtful / n:.1%}) are doubtful: their predicted error is "
+            "large."
         )
-    error, spine = (
-        session.frames["predicted_error_mm"].median(),
-        session.frames["spine_mm"].median(),
-    )
+    error = session.frames["predicted_error_mm"].median()
+    spine = session.frames["spine_mm"].median()
     if np.isfinite(error) and np.isfinite(spine) and error > _ERROR_SHARE * spine:
         found.append(
-            f"The predicted joint error is {error:.1f} mm in the median, {error / spine:.0%} of the animal's length."
+            f"The predicted joint error is {error:.1f} mm in the median, {error / spine:.0%} of "
+            "the animal's length."
         )
     return found
 
@@ -54,21 +61,24 @@ def _of_flips(session: Session) -> list[str]:
     seconds = float((flips["stop_s"] - flips["start_s"]).sum())
     undone = int(flips["applied"].astype(bool).sum())
     return [
-        f"Head and tail may have been exchanged in {len(flips)} stretches of {seconds:.1f} s in all; {undone} were put "
-        "right. They are listed below: look at them in the replay."
+        f"Head and tail may have been exchanged in {len(flips)} stretches of {seconds:.1f} s in "
+        f"all; {undone} were put right. They are listed below: look at them in the replay."
     ]
 
 
 def _of_measures(session: Session) -> list[str]:
     if not session.has("summary.csv"):
         return []
-    found, row = [], session.summary.iloc[0]
+    found = []
+    row = session.summary.iloc[0]
     rules = session.metadata.get("rules") or {}
-    noise, pause = row.get("speed_noise_mm_s", np.nan), rules.get("pause_below_mm_s", np.nan)
+    noise = row.get("speed_noise_mm_s", np.nan)
+    pause = rules.get("pause_below_mm_s", np.nan)
     if noise > _NOISE_SHARE * pause:
         found.append(
-            f"Errors of the pose alone may look like a speed of up to {noise:.0f} mm/s, and a pause is one below "
-            f"{pause:g} mm/s: pauses, and distance and speed at rest, are not to be trusted."
+            f"Errors of the pose alone may look like a speed of up to {noise:.0f} mm/s, and a "
+            f"pause is one below {pause:g} mm/s: pauses, and distance and speed at rest, are not "
+            "to be trusted."
         )
     described = session.columns
     fps = session.metadata["frames"]["fps_median"] or 0.0
@@ -82,12 +92,12 @@ def _of_measures(session: Session) -> list[str]:
 
 
 def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
-    """What became of all frames that the camera should have taken: (what, share, number, class for its colour)."""
+    """What became of all frames that the camera should have taken: (what, share, number, class for
+    its colour).
+    """
     frames = session.metadata["frames"]
-    doubtful, lost = (
-        int(frames["flags"].get("doubtful", 0)),
-        frames["n_frames"] - frames["n_observed"],
-    )
+    doubtful = int(frames["flags"].get("doubtful", 0))
+    lost = frames["n_frames"] - frames["n_observed"]
     parts = [
         ("trusted pose", frames["n_observed"] - doubtful, "good"),
         ("doubtful pose", doubtful, "doubt"),
@@ -99,7 +109,9 @@ def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
 
 
 def flip_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The stretches in which head and tail may have been exchanged, at most twelve: (from, to, probability, what)."""
+    """The stretches in which head and tail may have been exchanged, at most twelve: (from, to,
+    probability, what).
+    """
     shown = (
         session.flips.nlargest(12, "p_flip").sort_values("start_s")
         if len(session.flips)

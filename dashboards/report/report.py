@@ -79,7 +79,9 @@ def render(session: Session) -> str:
 
 
 def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The vocabulary: word, colour, meaning, and what the recording's frame rate cannot tell of it."""
+    """The vocabulary: word, colour, meaning, and what the recording's frame rate cannot
+    tell of it.
+    """
     unresolved = session.metadata.get("unresolved_actions") or {}
     return [
         (
@@ -125,7 +127,9 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
 
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The summary as (column, value, unit, meaning), but for the columns of the actions and zones."""
+    """The summary as (column, value, unit, meaning), but for the columns of the actions and
+    zones.
+    """
     if not session.has("summary.csv"):
         return []
     described = session.columns[session.columns["table"] == "summary"].set_index("name")
@@ -200,18 +204,22 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
 def facts(session: Session) -> list[tuple[str, str]]:
     """Where the numbers come from: recording, camera, animal, software, cost."""
     about = session.metadata
-    camera, frames, animal = about["camera"], about["frames"], about["animal"]
+    camera = about["camera"]
+    frames = about["frames"]
+    animal = about["animal"]
     flags = ", ".join(
         f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items()
     )
     size = f"{animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else "unknown"
-    memory, zones = about.get("peak_memory_mb"), ", ".join(zone.name for zone in session.zones)
+    memory = about.get("peak_memory_mb")
+    zones = ", ".join(zone.name for zone in session.zones)
     known = [
         ("Recording", f"{about['input']['name']} ({about['input']['format']})"),
         ("Input, sha256", about["input"]["sha256"]),
         (
             "Animal",
-            f"{about['individual']}, {animal['name']}, spine {size} ({animal.get('origin', 'origin unknown')})",
+            f"{about['individual']}, {animal['name']}, spine {size} "
+            f"({animal.get('origin', 'origin unknown')})",
         ),
         (
             "Frames",
@@ -220,9 +228,9 @@ def facts(session: Session) -> list[tuple[str, str]]:
         ),
         (
             "Camera",
-            f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy {camera['fy']:.1f}, "
-            f"cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px ({camera['source']}), {camera['floor_distance_mm']:.0f} mm "
-            "from the floor",
+            f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy "
+            f"{camera['fy']:.1f}, cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px "
+            f"({camera['source']}), {camera['floor_distance_mm']:.0f} mm from the floor",
         ),
         ("Arena", f"{session.arena}{f'; zones: {zones}' if zones else ''}"),
         (
@@ -246,12 +254,15 @@ def facts(session: Session) -> list[tuple[str, str]]:
 
 
 def _optics(session: Session) -> str:
-    """What was undone between the real camera and the ideal one, as a sentence without its full stop; or nothing."""
+    """What was undone between the real camera and the ideal one, as a sentence without its full
+    stop; or nothing.
+    """
     optics = session.metadata["camera"].get("optics", {})
     undone = []
     if bent := optics.get("distortion"):
         undone.append(
-            f"the lens distortion ({bent['model']} {', '.join(f'{k:g}' for k in bent['coefficients'])})"
+            f"the lens distortion ({bent['model']} "
+            f"{', '.join(f'{k:g}' for k in bent['coefficients'])})"
         )
     if water := optics.get("water"):
         undone.append(
@@ -283,12 +294,10 @@ def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
 def methods(session: Session) -> list[str]:
     """Paragraphs for a methods section, from the run's own record."""
     about = session.metadata
-    camera, frames, animal, model = (
-        about["camera"],
-        about["frames"],
-        about["animal"],
-        about["model"],
-    )
+    camera = about["camera"]
+    frames = about["frames"]
+    animal = about["animal"]
+    model = about["model"]
     error = session.frames["predicted_error_mm"].median()
     rate = f" at {frames['fps_median']:.1f} frames/s" if frames["fps_median"] else ""
     learned = (
@@ -308,13 +317,14 @@ def methods(session: Session) -> list[str]:
         else ""
     )
     first = (
-        f"Depth images of one {animal['name']} ({camera['width']} x {camera['height']} pixels, {frames['n_frames']:,} "
-        f"frames{rate}, camera {camera['floor_distance_mm']:.0f} mm from the floor) were analysed with liex_lab "
-        f"{about['versions']['liex_lab']}{learned}. A skeleton of {len(animal['joints'])} joints "
-        f"({', '.join(animal['joints'])}) on the body's mid-axis was fitted to every frame{size}{origin}. "
-        f"{frames['n_observed']:,} of {frames['n_frames']:,} recorded frames have a pose, "
-        f"{frames['flags'].get('doubtful', 0)} of them flagged as doubtful; {frames['n_missing']} further frames were "
-        f"not delivered by the camera.{known} Positions are millimetres in the arena frame, z up from the floor."
+        f"Depth images of one {animal['name']} ({camera['width']} x {camera['height']} pixels, "
+        f"{frames['n_frames']:,} frames{rate}, camera {camera['floor_distance_mm']:.0f} mm from "
+        f"the floor) were analysed with liex_lab {about['versions']['liex_lab']}{learned}. A "
+        f"skeleton of {len(animal['joints'])} joints ({', '.join(animal['joints'])}) on the body's "
+        f"mid-axis was fitted to every frame{size}{origin}. {frames['n_observed']:,} of "
+        f"{frames['n_frames']:,} recorded frames have a pose, {frames['flags'].get('doubtful', 0)} "
+        f"of them flagged as doubtful; {frames['n_missing']} further frames were not delivered by "
+        f"the camera.{known} Positions are millimetres in the arena frame, z up from the floor."
     )
     if undone := _optics(session):
         first += f" {undone[0].upper()}{undone[1:]}."
@@ -333,22 +343,24 @@ def _by_hand(session: Session) -> list[str]:
     }
     parts = ", ".join(f"{text}: {told[kind]}" for kind, text in kinds.items() if told.get(kind))
     return [
-        f"After measurement, {told['n']} corrections were made by hand by {', '.join(told['authors'])} ({parts})."
+        f"After measurement, {told['n']} corrections were made by hand by "
+        f"{', '.join(told['authors'])} ({parts})."
     ]
 
 
 def _behaviour_methods(session: Session) -> list[str]:
-    rules, actions = session.metadata.get("rules"), session.metadata.get("actions", {})
+    rules = session.metadata.get("rules")
+    actions = session.metadata.get("actions", {})
     if not rules or not actions:
         return []
     named = "; ".join(f"{word.replace('_', ' ')}: {meaning}" for word, meaning in actions.items())
     return [
         "Speed is that of the mean of all joints but the nose over the floor, from its positions "
-        f"{rules['speed_half_window_s']:g} s before and after at the frames' true times, never across a gap. Every "
-        f"frame has at most one name, given by rule, the first that applies of: {named}. Bouts of one kind with less "
-        f"than {rules['merge_pauses_s']:g} s between them were joined, then those shorter than "
-        f"{rules['min_bout_s']:g} s dropped. Shares are of the {session.metadata['frames']['observed_s']:.1f} s in "
-        "which the animal was observed."
+        f"{rules['speed_half_window_s']:g} s before and after at the frames' true times, never "
+        "across a gap. Every frame has at most one name, given by rule, the first that applies "
+        f"of: {named}. Bouts of one kind with less than {rules['merge_pauses_s']:g} s between them "
+        f"were joined, then those shorter than {rules['min_bout_s']:g} s dropped. Shares are of "
+        f"the {session.metadata['frames']['observed_s']:.1f} s in which the animal was observed."
     ]
 
 

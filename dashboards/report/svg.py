@@ -1,7 +1,7 @@
 """Small figures as SVG text: they take the page's colours, print sharply and weigh a few kilobytes.
 
-Numbers come in as arrays, text goes out; nothing is computed here but where a mark stands on the paper. Colours that
-belong to the page (ink, grid) are CSS classes of the report's template.
+Numbers come in as arrays, text goes out; nothing is computed here but where a mark stands on the
+paper. Colours that belong to the page (ink, grid) are CSS classes of the report's template.
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-WIDTH, LEFT, RIGHT = (
-    920,
-    116,
-    22,
-)  # shared by all figures over time, so that their axes stand below each other
+# shared by all figures over time, so that their axes stand below each other
+WIDTH = 920
+LEFT = 116
+RIGHT = 22
 ARENA = "the arena"  # the outline that needs no name
 _MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
@@ -95,8 +94,11 @@ def curve(
     from_zero: bool = True,
     last: bool = False,
 ) -> str:
-    """Values over time, broken where they are unknown; `shaded` spans (start, stop) in s; `last` writes the times."""
-    top, bottom = 10.0, 110.0
+    """Values over time, broken where they are unknown; `shaded` spans (start, stop) in s; `last`
+    writes the times.
+    """
+    top = 10.0
+    bottom = 110.0
     height = bottom + (34 if last else 10)
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
@@ -105,7 +107,8 @@ def curve(
     scale = Scale(low, low + spread * 1.06, bottom, top)
     parts = [y_axis(scale, unit, 4), x_axis(time, bottom, top, last)]
     for start, stop in shaded:
-        x0, x1 = float(time(start)), float(time(stop))
+        x0 = float(time(start))
+        x1 = float(time(stop))
         parts.append(
             f'<rect class="shade" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 0.5):.1f}" '
             f'height="{bottom - top}"/>'
@@ -123,8 +126,11 @@ def lanes(
     lost: Sequence[tuple[float, float]],
     time: Scale,
 ) -> str:
-    """One row per word of the ethogram, its bouts as bars (start, stop, word) in s; times without a pose hatched."""
-    row, top = 18.0, 6.0
+    """One row per word of the ethogram, its bouts as bars (start, stop, word) in s; times without a
+    pose hatched.
+    """
+    row = 18.0
+    top = 6.0
     bottom = top + row * max(len(words), 1)
     parts = [x_axis(time, bottom, top, False)]
     for start, stop in lost:
@@ -152,7 +158,9 @@ def lanes(
 
 
 def _merged(spans: Sequence[tuple[float, float]], time: Scale) -> list[tuple[float, float]]:
-    """Spans in order, those joined that would be nearer than a hair on the paper: an hour has thousands."""
+    """Spans in order, those joined that would be nearer than a hair on the paper: an hour has
+    thousands.
+    """
     least = 0.25 * (time.high - time.low) / (time.stop - time.start)
     out: list[tuple[float, float]] = []
     for start, stop in spans:
@@ -170,22 +178,22 @@ def trajectory(
     outlines: Sequence[tuple[str, Array]] = (),
     size: int = 420,
 ) -> str:
-    """The way over the floor seen from above, coloured by time from dark to light; y points up in the picture.
+    """The way over the floor seen from above, coloured by time from dark to light; y points up in
+    the picture.
 
     outlines: the arena and zones in it, each a name and its corners (n, 2) mm.
     """
     known = np.isfinite(x_mm) & np.isfinite(y_mm)
     if not known.any():
         return svg(size, 40, ['<text class="label" x="10" y="24">no position is known</text>'])
-    margin, plot = 52.0, size - 64.0
+    margin = 52.0
+    plot = size - 64.0
     shown = [
         np.column_stack([x_mm[known], y_mm[known]]),
         *(corners for _, corners in outlines if len(corners)),
     ]
-    low, high = (
-        np.min([p.min(axis=0) for p in shown], axis=0),
-        np.max([p.max(axis=0) for p in shown], axis=0),
-    )
+    low = np.min([p.min(axis=0) for p in shown], axis=0)
+    high = np.max([p.max(axis=0) for p in shown], axis=0)
     middle = 0.5 * (low + high)
     reach = 0.55 * max(float((high - low).max()), 20.0)
     across = Scale(middle[0] - reach, middle[0] + reach, margin, margin + plot)
@@ -197,7 +205,9 @@ def trajectory(
             f'<polygon class="outline" points="{places}"><title>{escape(name)}</title></polygon>'
         )
     keep = np.unique(np.linspace(0, len(x_mm) - 1, min(len(x_mm), _MAX_PLACES)).astype(int))
-    x, y, t = across(x_mm)[keep], up(y_mm)[keep], time_s[keep]
+    x = across(x_mm)[keep]
+    y = up(y_mm)[keep]
+    t = time_s[keep]
     span = max(float(t[-1] - t[0]), 1e-9)
     for piece in np.array_split(np.arange(len(keep)), min(64, max(1, len(keep) // 2))):
         rows = np.append(piece, piece[-1] + 1)[: len(keep) - piece[0]]
@@ -207,7 +217,8 @@ def trajectory(
         ]
     first, final = np.flatnonzero(known)[[0, -1]]
     for row, colour, word in ((first, viridis(0.0), "start"), (final, viridis(0.92), "end")):
-        px, py = float(across(x_mm[row])), float(up(y_mm[row]))
+        px = float(across(x_mm[row]))
+        py = float(up(y_mm[row]))
         parts.append(
             f'<circle class="mark" fill="{colour}" cx="{px:.1f}" cy="{py:.1f}" r="5">'
             f"<title>{word}</title></circle>"
@@ -217,7 +228,8 @@ def trajectory(
         if name != ARENA and len(corners):
             place = float(across(corners[:, 0].mean())), float(up(corners[:, 1].max())) + 13.0
             parts.append(
-                f'<text class="label halo" x="{place[0]:.1f}" y="{place[1]:.1f}" text-anchor="middle">'
+                f'<text class="label halo" x="{place[0]:.1f}" y="{place[1]:.1f}" '
+                'text-anchor="middle">'
                 f"{escape(name)}</text>"
             )
     return svg(size, size, parts)
@@ -235,10 +247,12 @@ def histogram(values: Array, unit: str, colour: str, width: int = 420, height: i
     up = Scale(0.0, max(float(counts.max()), 1.0) * 1.08, bottom, 8.0)
     parts = [y_axis(up, "frames", 3, 52.0, width - 12.0), x_ticks(across, bottom, unit, 5)]
     for count, a, b in zip(counts, edges[:-1], edges[1:], strict=True):
-        x0, x1, y = float(across(a)), float(across(b)), float(up(float(count)))
+        x0 = float(across(a))
+        x1 = float(across(b))
+        y = float(up(float(count)))
         parts.append(
-            f'<rect fill="{colour}" x="{x0 + 0.5:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 1, 0.5):.1f}" '
-            f'height="{bottom - y:.1f}"/>'
+            f'<rect fill="{colour}" x="{x0 + 0.5:.1f}" y="{y:.1f}" '
+            f'width="{max(x1 - x0 - 1, 0.5):.1f}" height="{bottom - y:.1f}"/>'
         )
     at = float(across(float(np.median(known))))
     parts.append(f'<line class="median" x1="{at:.1f}" x2="{at:.1f}" y1="8" y2="{bottom}"/>')
@@ -250,11 +264,13 @@ def histogram(values: Array, unit: str, colour: str, width: int = 420, height: i
 
 def budget(shares: Sequence[tuple[str, float, str]]) -> str:
     """One bar of shares (word, share, colour) that fills the width of the page."""
-    parts, at = [], 0.0
+    parts = []
+    at = 0.0
     for word, share, colour in shares:
         if share > 0:
             parts.append(
-                f'<rect fill="{colour}" x="{at * WIDTH:.1f}" y="0" width="{share * WIDTH:.1f}" height="26">'
+                f'<rect fill="{colour}" x="{at * WIDTH:.1f}" y="0" width="{share * WIDTH:.1f}" '
+                'height="26">'
                 f"<title>{escape(word)} {share:.1%}</title></rect>"
             )
         at += share
@@ -269,9 +285,11 @@ def picture(
     top: int,
     reach_mm: float,
 ) -> str:
-    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) over it.
+    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2)
+    over it.
 
-    Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not take all the colours.
+    Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not
+    take all the colours.
     """
     h, w = depth.shape
     points = (
@@ -295,7 +313,9 @@ def picture(
 
 
 def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
-    """Colours (h, w, 3) RGB of depth (h, w) mm: far dark, `reach_mm` nearer and beyond light, unread grey."""
+    """Colours (h, w, 3) RGB of depth (h, w) mm: far dark, `reach_mm` nearer and beyond light,
+    unread grey.
+    """
     read = depth > 0
     if not read.any():
         return np.full((*depth.shape, 3), 90, np.uint8)
@@ -330,8 +350,9 @@ def action_colour(place: int) -> str:
 
 
 _HATCH = (
-    '<defs><pattern id="hatch" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">'
-    '<line class="hatch" x1="0" y1="0" x2="0" y2="6"/></pattern></defs>'
+    '<defs><pattern id="hatch" width="6" height="6" patternUnits="userSpaceOnUse" '
+    'patternTransform="rotate(45)"><line class="hatch" x1="0" y1="0" x2="0" '
+    'y2="6"/></pattern></defs>'
 )
 
 
@@ -352,9 +373,11 @@ def _label_beside(x: float, y: float, text: str, right_until: float, away: float
 def _bar(
     time: Scale, start: float, stop: float, y: float, height: float, fill: str, title: str
 ) -> str:
-    x0, x1 = float(time(start)), float(time(stop))
+    x0 = float(time(start))
+    x1 = float(time(stop))
     return (
-        f'<rect fill="{fill}" x="{x0:.2f}" y="{y:.1f}" width="{max(x1 - x0, 0.5):.2f}" height="{height:.1f}">'
+        f'<rect fill="{fill}" x="{x0:.2f}" y="{y:.1f}" width="{max(x1 - x0, 0.5):.2f}" '
+        f'height="{height:.1f}">'
         f"<title>{escape(title)}</title></rect>"
     )
 
@@ -370,7 +393,8 @@ def y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WI
         )
     middle = 0.5 * (scale.start + scale.stop)
     label = (
-        f'<text class="label" transform="translate({x0 - 42:.0f} {middle:.0f}) rotate(-90)" text-anchor="middle">'
+        f'<text class="label" transform="translate({x0 - 42:.0f} {middle:.0f}) rotate(-90)" '
+        'text-anchor="middle">'
         f"{escape(unit)}</text>"
     )
     return "".join(marks) + label
@@ -387,7 +411,8 @@ def x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
         if last:
             text = f"{tick:g} {unit}"
             marks.append(
-                f'<text class="tick" x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{text}</text>'
+                f'<text class="tick" x="{x:.1f}" y="{bottom + 16}" '
+                f'text-anchor="middle">{text}</text>'
             )
     return "".join(marks)
 
@@ -398,17 +423,22 @@ def x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
         f'<line class="axis" x1="{scale.start}" x2="{scale.stop}" y1="{bottom}" y2="{bottom}"/>'
     ]
     marks += [
-        f'<text class="tick" x="{float(scale(tick)):.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>'
+        f'<text class="tick" x="{float(scale(tick)):.1f}" y="{bottom + 16}" '
+        f'text-anchor="middle">{tick:g}</text>'
         for tick in scale.ticks(about)
     ]
     middle = 0.5 * (scale.start + scale.stop)
-    label = f'<text class="label" x="{middle:.0f}" y="{bottom + 31}" text-anchor="middle">{escape(unit)}</text>'
+    label = (
+        f'<text class="label" x="{middle:.0f}" y="{bottom + 31}" '
+        f'text-anchor="middle">{escape(unit)}</text>'
+    )
     return "".join(marks) + label
 
 
 def _frame(across: Scale, up: Scale) -> str:
     """A square plot's frame with millimetres on both sides."""
-    bottom, top = up.start, up.stop
+    bottom = up.start
+    top = up.stop
     box = (
         f'<rect class="box" x="{across.start}" y="{top}" width="{across.stop - across.start}" '
         f'height="{bottom - top}"/>'
@@ -423,7 +453,9 @@ def _paths(x: Array, y: Array) -> list[str]:
 
 
 def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
-    """The rows of a curve (n,) to draw: all of a short one, of a long one each column's lowest and highest."""
+    """The rows of a curve (n,) to draw: all of a short one, of a long one each column's lowest and
+    highest.
+    """
     if len(y) <= 2 * n_columns:
         return np.arange(len(y))
     edges = np.linspace(0, len(y), n_columns + 1).astype(int)
@@ -438,7 +470,9 @@ def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
 
 
 def _broken(x: Array, y: Array) -> list[str]:
-    """Path data of a line that is interrupted where a point is unknown; a lone point becomes a dot."""
+    """Path data of a line that is interrupted where a point is unknown; a lone point
+    becomes a dot.
+    """
     known = np.isfinite(x) & np.isfinite(y)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     paths = []

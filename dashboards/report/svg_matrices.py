@@ -1,4 +1,6 @@
-"""Figures of what the actions sum up to: a matrix of transitions, a measure around onsets, activity by the minute."""
+"""Figures of what the actions sum up to: a matrix of transitions, a measure around onsets, activity
+by the minute.
+"""
 
 from __future__ import annotations
 
@@ -15,34 +17,48 @@ _WIDTH = 300.0
 def matrix(
     words: Sequence[str], probability: Array, chance: Array, significant: Array, counts: Array
 ) -> str:
-    """From a row's action to a column's: the darker, the more probable; ▲ above and ▼ below chance where certain.
+    """From a row's action to a column's: the darker, the more probable; ▲ above and ▼ below chance
+    where certain.
 
     All (k, k), NaN on the diagonal and where nothing followed.
     """
-    cell, left, top = 58.0, 124.0, 104.0  # room for words as long as 'rear unsupported'
+    # room for words as long as 'rear unsupported'
+    cell = 58.0
+    left = 124.0
+    top = 104.0
     size = cell * len(words)
     parts = []
     for k, word in enumerate(words):
-        label, at = escape(word.replace("_", " ")), (k + 0.5) * cell
+        label = escape(word.replace("_", " "))
+        at = (k + 0.5) * cell
         parts.append(
-            f'<text class="label" x="{left - 8}" y="{top + at + 4:.1f}" text-anchor="end">{label}</text>'
+            f'<text class="label" x="{left - 8}" y="{top + at + 4:.1f}" '
+            f'text-anchor="end">{label}</text>'
         )
-        x, y = left + at, top - 8
+        x = left + at
+        y = top - 8
         parts.append(
-            f'<text class="label" x="{x:.1f}" y="{y}" transform="rotate(-40 {x:.1f} {y})">{label}</text>'
+            f'<text class="label" x="{x:.1f}" y="{y}" transform="rotate(-40 {x:.1f} '
+            f'{y})">{label}</text>'
         )
     for i, word in enumerate(words):
         for j, other in enumerate(words):
-            x, y, p = left + j * cell, top + i * cell, probability[i, j]
+            x = left + j * cell
+            y = top + i * cell
+            p = probability[i, j]
             box = f'x="{x + 1:.1f}" y="{y + 1:.1f}" width="{cell - 2}" height="{cell - 2}" rx="4"'
             if i == j or not np.isfinite(p):
                 parts.append(f'<rect class="void" {box}/>')
                 continue
             mark = "" if not significant[i, j] else " ▲" if p > chance[i, j] else " ▼"
-            title = f"{word} to {other}: {int(counts[i, j])} times, {p:.0%}; by chance {chance[i, j]:.0%}"
+            title = (
+                f"{word} to {other}: {int(counts[i, j])} times, {p:.0%}; by chance "
+                f"{chance[i, j]:.0%}"
+            )
             parts.append(
-                f'<rect class="cell" fill-opacity="{0.06 + 0.94 * p:.3f}" {box}><title>{escape(title)}</title>'
-                f'</rect><text class="{"inside" if p > 0.45 else "tick"}" x="{x + cell / 2:.1f}" '
+                f'<rect class="cell" fill-opacity="{0.06 + 0.94 * p:.3f}" '
+                f"{box}><title>{escape(title)}</title></rect><text "
+                f'class="{"inside" if p > 0.45 else "tick"}" x="{x + cell / 2:.1f}" '
                 f'y="{y + cell / 2 + 4:.1f}" text-anchor="middle">{p:.0%}{mark}</text>'
             )
     parts.append(f'<text class="tick" x="{left - 8}" y="14" text-anchor="end">followed by</text>')
@@ -59,7 +75,8 @@ def around(
     limits: tuple[float, float],
 ) -> str:
     """Median and quartiles of a measure around the onset of an action, at 0 s."""
-    width, bottom = _WIDTH, 110.0
+    width = _WIDTH
+    bottom = 110.0
     across = Scale(float(time_s[0]), float(time_s[-1]), 52.0, width - 8.0)
     up = Scale(limits[0], limits[1], bottom, 8.0)
     known = np.isfinite(median)
@@ -87,7 +104,8 @@ def activity(
 ) -> str:
     """Stacked shares of the observed time per interval: (word, seconds (k,), colour)."""
     time = time_scale(float(stop_s[-1]))
-    top, bottom = 8.0, 96.0
+    top = 8.0
+    bottom = 96.0
     up = Scale(0.0, 1.0, bottom, top)
     drawn = [y_axis(up, "share", 2), x_axis(time, bottom, top, True)]
     below = np.zeros(len(start_s))
@@ -95,10 +113,14 @@ def activity(
         share = np.divide(seconds, observed_s, out=np.zeros_like(seconds), where=observed_s > 0)
         for a, b, low, part in zip(start_s, stop_s, below, share, strict=True):
             if part > 0:
-                x0, x1, y = float(time(a)), float(time(b)), float(up(min(low + part, 1.0)))
+                x0 = float(time(a))
+                x1 = float(time(b))
+                y = float(up(min(low + part, 1.0)))
                 drawn.append(
-                    f'<rect fill="{colour}" x="{x0:.1f}" y="{y:.1f}" width="{max(x1 - x0 - 0.6, 0.4):.1f}" '
-                    f'height="{max(float(up(low)) - y, 0.0):.1f}"><title>{escape(word)} {part:.0%}</title>'
+                    f'<rect fill="{colour}" x="{x0:.1f}" y="{y:.1f}" '
+                    f'width="{max(x1 - x0 - 0.6, 0.4):.1f}" '
+                    f'height="{max(float(up(low)) - y, 0.0):.1f}"><title>{escape(word)} '
+                    f"{part:.0%}</title>"
                     "</rect>"
                 )
         below += share

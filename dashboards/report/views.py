@@ -1,4 +1,6 @@
-"""Everything that is there to look at in a session's folder and can be made again from what lies in it."""
+"""Everything that is there to look at in a session's folder and can be made again from what lies in
+it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from .report import write_report
 
 
 def write_views(folder: str | Path) -> Path:
-    """The report, and the layouts of both replays as files of their own; returns the report's path."""
+    """The report, and the layouts of both replays as files of their own; returns the
+    report's path.
+    """
     session = Session.open(folder)
     write_blueprint(session)
     write_layout(session)

@@ -1,7 +1,8 @@
-"""A skops file that holds nothing but tables, lists, words, numbers and arrays, read without scikit-learn, and written
-so that equal contents are equal bytes.
+"""A skops file that holds nothing but tables, lists, words, numbers and arrays, read without
+scikit-learn, and written so that equal contents are equal bytes.
 
-Importing skops asks scikit-learn and Dask for everything they have, which takes as long as a short recording.
+Importing skops asks scikit-learn and Dask for everything they have, which takes as long as a short
+recording.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ _ADDRESS = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_plain(document: Any, path: str | Path) -> None:
-    """Write a skops file: skops names what it holds by addresses in memory, and dates it; here it is by numbers from 1
-    on in their order in the file, on one day.
+    """Write a skops file: skops names what it holds by addresses in memory, and dates it; here it
+    is by numbers from 1 on in their order in the file, on one day.
     """
     from skops import io
 
@@ -46,7 +47,9 @@ def write_plain(document: Any, path: str | Path) -> None:
 
 
 def read_plain(path: str | Path) -> Any:
-    """The content of a skops file. Raises ValueError where it holds anything else, or more than its size allows."""
+    """The content of a skops file. Raises ValueError where it holds anything else, or more than its
+    size allows.
+    """
     with zipfile.ZipFile(path) as packed:
         if sum(entry.file_size for entry in packed.infolist()) > _MOST_BYTES:
             raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MB")
@@ -57,7 +60,8 @@ def _value(node: Any, packed: zipfile.ZipFile, depth: int) -> Any:
     """What a node of the schema stands for."""
     if depth > _DEEPEST:
         raise ValueError("its tables are nested too deeply")
-    kind, content = node["__loader__"], node.get("content")
+    kind = node["__loader__"]
+    content = node.get("content")
     if kind == "DictNode":
         return {str(key): _value(inner, packed, depth + 1) for key, inner in content.items()}
     if kind == "ListNode":

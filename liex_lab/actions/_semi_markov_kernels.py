@@ -1,8 +1,10 @@
-"""Kernels of a semi-Markov chain of actions: each lasts at least so many ticks, then ends with a constant chance.
+"""Kernels of a semi-Markov chain of actions: each lasts at least so many ticks, then ends with a
+constant chance.
 
-An action k is a row of D_k states that are passed one by one; in the last one it may stay. scores (m, K): logarithms of
-how well each tick fits each action; first (K,): index of each action's first state, with the total as one more; stay,
-leave (K,): log chances of the last state; switch (K, K): log chances of what follows, -inf for itself.
+An action k is a row of D_k states that are passed one by one; in the last one it may stay. scores
+(m, K): logarithms of how well each tick fits each action; first (K,): index of each action's first
+state, with the total as one more; stay, leave (K,): log chances of the last state; switch (K, K):
+log chances of what follows, -inf for itself.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ _NEVER = -1e30
 def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, stayed):
     """The ways that end in each state at tick stop - 1, from those at tick start - 1.
 
-    value (states,): the log score of the best way to each, brought on; came_from (m, n): the action before, where one
-    begins at a tick; stayed (m, n): whether the best way was in an action's last state before.
+    value (states,): the log score of the best way to each, brought on; came_from (m, n): the action
+    before, where one begins at a tick; stayed (m, n): whether the best way was in an action's last
+    state before.
     """
     n = scores.shape[1]
     total = first[n]
@@ -28,22 +31,27 @@ def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, sta
             value[first[k] : first[k + 1]] = scores[0, k] - np.log(
                 total
             )  # it may begin in the middle of one
-            came_from[0, k], stayed[0, k] = 0, False
+            came_from[0, k] = 0
+            stayed[0, k] = False
     for t in range(max(start, 1), stop):
         for k in range(n):
-            best, source = _NEVER, 0
+            best = _NEVER
+            source = 0
             for j in range(n):
                 if j != k:
                     reach = value[first[j + 1] - 1] + leave[j] + switch[j, k]
                     if reach > best:
-                        best, source = reach, j
-            came_from[t, k], stayed[t, k] = source, False
+                        best = reach
+                        source = j
+            came_from[t, k] = source
+            stayed[t, k] = False
             last = first[k + 1] - 1
             for s in range(last, first[k], -1):
                 fresh[s] = value[s - 1]
             fresh[first[k]] = best
             if value[last] + stay[k] > fresh[last]:
-                fresh[last], stayed[t, k] = value[last] + stay[k], True
+                fresh[last] = value[last] + stay[k]
+                stayed[t, k] = True
             for s in range(first[k], last + 1):
                 fresh[s] += scores[t, k]
         value[:] = fresh
@@ -74,9 +82,13 @@ def probabilities(scores, first, stay, leave, switch, out):
     """The probability (m, K) of each action at every tick, by sums forward and backward in time."""
     m, n = scores.shape
     total = first[n]
-    go, end, follow = np.exp(stay), np.exp(leave), np.exp(switch)
+    go = np.exp(stay)
+    end = np.exp(leave)
+    follow = np.exp(switch)
     ahead = np.empty((m, total), np.float32)
-    now, fresh, like = np.ones(total) / total, np.empty(total), np.empty(n)
+    now = np.ones(total) / total
+    fresh = np.empty(total)
+    like = np.empty(n)
     for t in range(m):
         _likelihood(scores, t, like)
         if t > 0:

@@ -1,8 +1,9 @@
-"""What a body does from moment to moment, in seconds and body lengths, on a steady clock of its own.
+"""What a body does from moment to moment, in seconds and body lengths, on a steady clock of its
+own.
 
-A track of any frame rate becomes channels of one rate, so that a recogniser sees the same movement whatever the camera.
-A faster camera is averaged, a slower one interpolated; poses that cannot be true and short gaps are bridged, long gaps
-part the track into stretches.
+A track of any frame rate becomes channels of one rate, so that a recogniser sees the same movement
+whatever the camera. A faster camera is averaged, a slower one interpolated; poses that cannot be
+true and short gaps are bridged, long gaps part the track into stretches.
 """
 
 from __future__ import annotations
@@ -29,14 +30,18 @@ _PIECE = 4096  # ticks whose channels are made at once
 
 @dataclass(frozen=True)
 class Stretch:
-    """Channels (m, C) on a steady clock: times_s (m,) since the track's first frame, from one unbroken stretch."""
+    """Channels (m, C) on a steady clock: times_s (m,) since the track's first frame, from one
+    unbroken stretch.
+    """
 
     times_s: Array
     values: Array
 
 
 def channel_names(skeleton: Skeleton) -> list[str]:
-    """What the columns of a stretch are, see `stretches_of`; those that end in ~ change sign in a mirror."""
+    """What the columns of a stretch are, see `stretches_of`; those that end in ~ change sign in a
+    mirror.
+    """
     pitches = [f"pitch_{k}" for k in range(_GROUPS)] if skeleton.axes[1:, 1].any() else []
     floor = (
         ["tip_height", "middle_height", "base_height", "tip_over_base"] if _stands(skeleton) else []
@@ -65,8 +70,8 @@ def channel_names(skeleton: Skeleton) -> list[str]:
 def stretches_of(
     track: Track, rate_hz: float, wall_mm: Array | None = None, room: Room = np.empty
 ) -> list[Stretch]:
-    """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal from a wall; room:
-    where the channels are to lie.
+    """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal
+    from a wall; room: where the channels are to lie.
     """
     time_s = (track.times_ns - track.times_ns[:1]).astype(np.float64) * 1e-9
     good = np.flatnonzero(track.observed)
@@ -74,7 +79,8 @@ def stretches_of(
         return []
     good = good[~_reversed(track, good, time_s)]
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
-    # a doubt is one beside the recording's usual errors: how large these are depends on camera and animal, and on how
+    # a doubt is one beside the recording's usual errors: how large these are depends on camera and
+    # animal, and on how
     # errors are predicted, and says nothing of actions
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
@@ -110,15 +116,19 @@ def _forward(skeleton: Skeleton) -> tuple[int, int]:
 
 
 def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[np.bool_]:
-    """Which of the good frames point against what lies around them: head and tail were exchanged."""
+    """Which of the good frames point against what lies around them: head and tail were
+    exchanged.
+    """
     rear, front = _forward(track.skeleton)
-    axis, total = np.empty((len(good), 3)), np.zeros((len(good) + 1, 3))
+    axis = np.empty((len(good), 3))
+    total = np.zeros((len(good) + 1, 3))
     for some in blocks(len(good), _PIECE):
         axis[some] = track.joints_mm[good[some], front] - track.joints_mm[good[some], rear]
         axis[some] /= np.maximum(np.linalg.norm(axis[some], axis=1, keepdims=True), 1e-9)
         track.rest()
     np.cumsum(axis, axis=0, out=total[1:])
-    times, against = time_s[good], np.empty(len(good), np.bool_)
+    times = time_s[good]
+    against = np.empty(len(good), np.bool_)
     for some in blocks(len(good), _PIECE):
         low = np.searchsorted(times, times[some] - _FLIP_S, "left")
         high = np.searchsorted(times, times[some] + _FLIP_S, "right")
@@ -128,16 +138,22 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
 
 
 class _OnClock:
-    """What the channels are made of, at any of a clock's times (m,) s, from frames `rows` of a track.
+    """What the channels are made of, at any of a clock's times (m,) s, from frames `rows` of a
+    track.
 
-    A faster camera is averaged over what falls to each tick, a slower one interpolated, linearly; ends are held.
+    A faster camera is averaged over what falls to each tick, a slower one interpolated, linearly;
+    ends are held.
     """
 
     def __init__(
         self, track: Track, rows: NDArray[np.int64], time_s: Array, wall: Array, clock: Array
     ) -> None:
-        self._track, self._rows, self._wall = track, rows, wall
-        times, step, n = time_s[rows], clock[1] - clock[0], len(rows)
+        self._track = track
+        self._rows = rows
+        self._wall = wall
+        times = time_s[rows]
+        step = clock[1] - clock[0]
+        n = len(rows)
         self._starts: NDArray[np.int64] | None = None  # of the rows that fall to one tick
         if n > 2 and np.median(np.diff(times)) < 0.7 * step:
             tick = np.clip(np.round((times - clock[0]) / step).astype(int), 0, len(clock) - 1)
@@ -151,11 +167,14 @@ class _OnClock:
             self._share = np.clip(passed, 0.0, 1.0)[:, None]
 
     def at(self, ticks: slice) -> tuple[Array, Array, Array, Array]:
-        """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, predicted error (m,) mm."""
+        """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, predicted
+        error (m,) mm.
+        """
         if self._n == 1:
             out = np.repeat(self._measured(0, 1), ticks.stop - ticks.start, axis=0)
         else:
-            low, share = self._low[ticks], self._share[ticks]
+            low = self._low[ticks]
+            share = self._share[ticks]
             first = int(low[0])
             seen = self._measured(first, int(low[-1]) + 2)
             out = seen[low - first] * (1.0 - share) + seen[low - first + 1] * share
@@ -168,12 +187,12 @@ class _OnClock:
         )
 
     def _measured(self, first: int, stop: int) -> Array:
-        """Columns (k, 6 J + 2) of measurements first to stop, each of a frame or of those of a tick."""
+        """Columns (k, 6 J + 2) of measurements first to stop, each of a frame or of those of a
+        tick.
+        """
         starts = None if self._starts is None else self._starts[first : stop + 1]
-        track, rows = (
-            self._track,
-            self._rows[first:stop] if starts is None else self._rows[starts[0] : starts[-1]],
-        )
+        track = self._track
+        rows = self._rows[first:stop] if starts is None else self._rows[starts[0] : starts[-1]]
         n = len(rows)
         distance = np.nan_to_num(self._wall[rows], nan=1e6)
         error = np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)
@@ -202,16 +221,21 @@ def _stretch(
     clock: Array,
     room: Room,
 ) -> Stretch:
-    """The channels of an unbroken stretch, a piece after the other. units_mm: the length and the usual error."""
-    found, m = _OnClock(track, rows, time_s, wall, clock), len(clock)
-    heading, steep = np.empty(m), np.empty(m, np.bool_)
+    """The channels of an unbroken stretch, a piece after the other. units_mm: the length and the
+    usual error.
+    """
+    found = _OnClock(track, rows, time_s, wall, clock)
+    m = len(clock)
+    heading = np.empty(m)
+    steep = np.empty(m, np.bool_)
     for piece in blocks(m, _PIECE):
         heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
         track.rest()
     heading = np.unwrap(heading)
     # a body that stands upright has no heading: it keeps the last one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
-    values, step = room((m, len(channel_names(track.skeleton))), np.float64), clock[1] - clock[0]
+    values = room((m, len(channel_names(track.skeleton))), np.float64)
+    step = clock[1] - clock[0]
     for piece in blocks(m, _PIECE):
         # a channel looks two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
@@ -223,7 +247,9 @@ def _stretch(
 
 
 def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where the trunk of a body with these joints (m, J, 3) points on the floor (m,) rad, and whether it is upright."""
+    """Where the trunk of a body with these joints (m, J, 3) points on the floor (m,) rad, and
+    whether it is upright.
+    """
     rear, front = _forward(skeleton)
     axis = joints[:, front] - joints[:, rear]
     upright = np.hypot(axis[:, 0], axis[:, 1]) < 0.25 * np.linalg.norm(axis, axis=1)
@@ -240,15 +266,16 @@ def _channels(
     wall: Array,
     error: Array,
 ) -> Array:
-    """Channels (m, C) of headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and predicted
-    errors (m,) mm on a clock whose ticks are `step` s apart.
+    """Channels (m, C) of headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances
+    (m,) mm and predicted errors (m,) mm on a clock whose ticks are `step` s apart.
     """
     (rear, front), (length_mm, usual_mm) = _forward(skeleton), units_mm
     axis = joints[:, front] - joints[:, rear]
     climb = np.arctan2(axis[:, 2], np.hypot(axis[:, 0], axis[:, 1]))
     middle = joints.mean(axis=1) / length_mm
     velocity = _rate(_softened(middle), step)
-    ahead, aside = np.cos(heading), np.sin(heading)
+    ahead = np.cos(heading)
+    aside = np.sin(heading)
     forward = velocity[:, 0] * ahead + velocity[:, 1] * aside
     sideways = velocity[:, 1] * ahead - velocity[:, 0] * aside
     bones = np.linalg.norm(np.diff(joints, axis=1), axis=2).sum(axis=1)
@@ -283,7 +310,9 @@ def _channels(
 
 
 def _twist(joints: Array, length_mm: float, step: float) -> Array:
-    """(m,) lengths a second: how fast the joints move against the body's middle, of whatever part."""
+    """(m,) lengths a second: how fast the joints move against the body's middle, of
+    whatever part.
+    """
     own = (joints - joints.mean(axis=1, keepdims=True)) / length_mm
     return np.asarray(
         np.sqrt((_rate(_softened(own.reshape(len(own), -1)), step) ** 2).mean(axis=1) * 3.0)
@@ -291,7 +320,9 @@ def _twist(joints: Array, length_mm: float, step: float) -> Array:
 
 
 def _softened(rows: Array) -> Array:
-    """Rows (m, ...) with a quarter of each neighbour: jitter from frame to frame is not movement."""
+    """Rows (m, ...) with a quarter of each neighbour: jitter from frame to frame is not
+    movement.
+    """
     if len(rows) < 3:
         return rows
     inner = 0.25 * rows[:-2] + 0.5 * rows[1:-1] + 0.25 * rows[2:]

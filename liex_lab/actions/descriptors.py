@@ -1,10 +1,13 @@
-"""The descriptors of the paper: a cut-out sequence, resampled to 32 frames, as one row of numbers (Lie-X section 6).
+"""The descriptors of the paper: a cut-out sequence, resampled to 32 frames, as one row of numbers
+(Lie-X section 6).
 
-Per frame, tangent vectors: of the base, the twist from this frame to the next, in its own frame (6); of the front half
-and of the hind half of the chain, the rotation of a joint against the one before it and its change to the next frame,
-averaged over the half's joints (3 + 3 each). The paper states 252 = 7 x 2 x 18 and three sub-vectors of equal length;
-that each half holds three rotation numbers of either kind is our reading, as bones are rigid and a joint's twist has no
-other. Joint positions: all joints in the arena frame (63 for the fish), and the base's mean position and orientation.
+Per frame, tangent vectors: of the base, the twist from this frame to the next, in its own frame
+(6); of the front half and of the hind half of the chain, the rotation of a joint against the one
+before it and its change to the next frame, averaged over the half's joints (3 + 3 each). The paper
+states 252 = 7 x 2 x 18 and three sub-vectors of equal length; that each half holds three rotation
+numbers of either kind is our reading, as bones are rigid and a joint's twist has no other. Joint
+positions: all joints in the arena frame (63 for the fish), and the base's mean position and
+orientation.
 """
 
 from __future__ import annotations
@@ -23,7 +26,9 @@ _PYRAMID = (4, 2, 1)  # equal parts, each described by its mean and standard dev
 
 
 def tangent_descriptor(track: Track) -> Array:
-    """(252,) of a sequence: the temporal pyramid over its tangent vectors. Frames without a pose are left out."""
+    """(252,) of a sequence: the temporal pyramid over its tangent vectors. Frames without a pose
+    are left out.
+    """
     root, angles = _resampled(track)
     now, following = (
         SE3(root.rotation[part], root.translation[part])
@@ -43,7 +48,9 @@ def tangent_descriptor(track: Track) -> Array:
 
 
 def position_descriptor(track: Track) -> Array:
-    """(888,) of a fish's sequence: the temporal pyramid over its joint positions, and the base's mean place."""
+    """(888,) of a fish's sequence: the temporal pyramid over its joint positions, and the base's
+    mean place.
+    """
     seen = track.observed
     if seen.sum() < 2:
         return np.zeros(14 * 3 * track.skeleton.n_joints + 6)
@@ -60,12 +67,15 @@ def pyramid(rows: Array) -> Array:
 
 
 def _resampled(track: Track) -> tuple[SE3, Array]:
-    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames that have a pose."""
+    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames that have a
+    pose.
+    """
     seen = track.observed
     n = int(seen.sum())
     if n < 2:
         return SE3.identity(N_FRAMES), np.zeros((N_FRAMES, track.skeleton.n_joints, 3))
-    kept, at = some_rows(track, seen), _places(n)
+    kept = some_rows(track, seen)
+    at = _places(n)
     low = np.minimum(at.astype(int), n - 2)
     before, after = (SE3(kept.root_rotation[rows], kept.root_mm[rows]) for rows in (low, low + 1))
     return before.geodesic(after, at - low), _lerp(kept.angles_rad, at)

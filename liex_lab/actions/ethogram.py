@@ -15,14 +15,18 @@ UNLABELLED = ""  # the word of a frame that no action names
 
 
 def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]:
-    """Where the runs of equal values (m,), of which there are some, start and stop, and their values."""
+    """Where the runs of equal values (m,), of which there are some, start and stop, and their
+    values.
+    """
     starts = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
     return starts, np.append(starts[1:], len(values)), values[starts]
 
 
 @dataclass(frozen=True)
 class Bout:
-    """One stretch with a name, half open: the frame at stop_ns is the first outside. score: probability of its name."""
+    """One stretch with a name, half open: the frame at stop_ns is the first outside. score:
+    probability of its name.
+    """
 
     start_ns: int
     stop_ns: int
@@ -32,7 +36,9 @@ class Bout:
 
 @dataclass(frozen=True)
 class Ethogram:
-    """One animal's bouts, in order and without overlap; vocabulary: word -> definition. source: model or human."""
+    """One animal's bouts, in order and without overlap; vocabulary: word -> definition. source:
+    model or human.
+    """
 
     bouts: tuple[Bout, ...]
     vocabulary: Mapping[str, str] = field(default_factory=dict)
@@ -43,12 +49,13 @@ class Ethogram:
         for bout in self.bouts:
             if bout.stop_ns <= bout.start_ns:
                 raise LiexError(
-                    f"a bout of {bout.action} stops at {bout.stop_ns} ns, which is not after its start"
+                    f"a bout of {bout.action} stops at {bout.stop_ns} ns, which is not after its "
+                    "start"
                 )
             if last is not None and bout.start_ns < last.stop_ns:
                 raise LiexError(
-                    f"bouts overlap: {last.action} stops at {last.stop_ns} ns, but {bout.action} starts at "
-                    f"{bout.start_ns} ns; end one before the next begins"
+                    f"bouts overlap: {last.action} stops at {last.stop_ns} ns, but {bout.action} "
+                    f"starts at {bout.start_ns} ns; end one before the next begins"
                 )
             last = bout
 
@@ -79,8 +86,9 @@ class Ethogram:
         source: str = "model",
         names: Sequence[str] | None = None,
     ) -> Ethogram:
-        """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never leaves its `part`
-        (n,), the unbroken stretch of the recording that it lies in; names: `words` are places in it.
+        """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never
+        leaves its `part` (n,), the unbroken stretch of the recording that it lies in; names:
+        `words` are places in it.
         """
         label = np.asarray(words, np.str_ if names is None else np.int64)
         n = len(label)
@@ -90,7 +98,8 @@ class Ethogram:
         changes = (label[1:] != label[:-1]) | (part[1:] != part[:-1])
         starts = np.flatnonzero(np.append(True, changes))
         stops = np.append(starts[1:], n)
-        stop_ns, sure = frame_stops(times_ns), np.ones(n) if score is None else score
+        stop_ns = frame_stops(times_ns)
+        sure = np.ones(n) if score is None else score
         named = [str(one if names is None else names[one]) for one in label[starts]]
         bouts = [
             Bout(int(times_ns[a]), int(stop_ns[b - 1]), word, float(sure[a:b].mean()))
@@ -101,7 +110,9 @@ class Ethogram:
 
 
 def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median step later."""
+    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median
+    step later.
+    """
     if len(times_ns) < 2:
         return times_ns + 1
     step = np.diff(times_ns)

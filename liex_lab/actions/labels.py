@@ -1,5 +1,5 @@
-"""Labels that people made: tables of bouts, ours or anybody's, and their place on a track; a track with them is what
-recognisers learn from and are judged by.
+"""Labels that people made: tables of bouts, ours or anybody's, and their place on a track; a track
+with them is what recognisers learn from and are judged by.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _NEEDED = ("action", "start_s", "stop_s")
 
 
 def read_labels(path: str | Path) -> pd.DataFrame:
-    """Bouts from a table: our bouts.parquet, or a CSV with the columns action, start_s, stop_s and, where it tells of
-    several recordings, session_id. Raises LiexError where it is not such a table.
+    """Bouts from a table: our bouts.parquet, or a CSV with the columns action, start_s, stop_s and,
+    where it tells of several recordings, session_id. Raises LiexError where it is not such a table.
     """
     source = Path(path)
     try:
@@ -36,8 +36,8 @@ def read_labels(path: str | Path) -> pd.DataFrame:
     lacking = [name for name in _NEEDED if name not in table]
     if lacking:
         raise LiexError(
-            f"{source} should have the columns {', '.join(_NEEDED)} (session_id, too, for several recordings); it "
-            f"lacks {', '.join(lacking)}"
+            f"{source} should have the columns {', '.join(_NEEDED)} (session_id, too, for several "
+            f"recordings); it lacks {', '.join(lacking)}"
         )
     return checked(table.assign(source=HUMAN), str(source))
 
@@ -50,8 +50,8 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
     if len(wrong):
         row = {name: " ".join(str(table[name].iloc[wrong[0]]).split())[:80] for name in _NEEDED}
         raise LiexError(
-            f"{origin}: each bout starts before it stops, in seconds; the one of {row['action']} in row {wrong[0] + 1} "
-            f"has start_s={row['start_s']} and stop_s={row['stop_s']}"
+            f"{origin}: each bout starts before it stops, in seconds; the one of {row['action']} "
+            f"in row {wrong[0] + 1} has start_s={row['start_s']} and stop_s={row['stop_s']}"
         )
     out = table.reset_index(drop=True).assign(
         action=table["action"].to_numpy().astype(str), **times
@@ -90,8 +90,9 @@ def vocabulary(table: pd.DataFrame) -> Mapping[str, str]:
 
 @dataclass(frozen=True)
 class LabelledTrack:
-    """A track and the word (n,) of each of its frames, '' where it has none; animal: whose it is; wall_mm (n,): how far
-    its middle is from the nearest wall, NaN where nobody knows; truth (n, J, 3) mm: true joints, of rendered animals.
+    """A track and the word (n,) of each of its frames, '' where it has none; animal: whose it is;
+    wall_mm (n,): how far its middle is from the nearest wall, NaN where nobody knows; truth (n, J,
+    3) mm: true joints, of rendered animals.
     """
 
     track: Track

@@ -1,4 +1,6 @@
-"""Training the default recogniser from labelled tracks, and validating it on animals that it has not seen."""
+"""Training the default recogniser from labelled tracks, and validating it on animals that it has
+not seen.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +22,21 @@ from liex_lab.runtime.progress import Progress, silent
 
 Array = NDArray[np.float64]
 
-_HIDDEN, _EPOCHS, _BATCH, _MEMBERS = 64, 10, 512, 2
-_LEAST_STEPS, _MOST_EPOCHS = 1500, 200  # of few labels
+_HIDDEN = 64
+_EPOCHS = 10
+_BATCH = 512
+_MEMBERS = 2
+# of few labels
+_LEAST_STEPS = 1500
+_MOST_EPOCHS = 200
 _WEIGHT_DECAY = 2e-3
-_RATE, _LEAST_RATE = 1.5e-3, 1e-5
+_RATE = 1.5e-3
+_LEAST_RATE = 1e-5
 _MOST_TICKS = 120_000  # to learn from; of more, every so many-th
 _SHARPNESS = 0.1
-_USUAL, _LEAST_PEAK = (
-    (0.005, 0.99),
-    0.01,
-)  # quantiles of the speeds of a word, and of its bouts' highest ones
+# quantiles of the speeds of a word, and of its bouts' highest ones
+_USUAL = (0.005, 0.99)
+_LEAST_PEAK = 0.01
 _FAST = 1.0  # lengths a second, in the mean of a bout: an action that goes fast
 _NEVER = -30.0  # what a network says of a word that it has not seen
 
@@ -42,7 +49,9 @@ def learn(
     sequences: Sequence[LabelledTrack] = (),
     progress: Progress = silent,
 ) -> TimelineModel:
-    """A recogniser from labelled tracks; sequences: single actions cut out of somewhere, without their surroundings."""
+    """A recogniser from labelled tracks; sequences: single actions cut out of somewhere, without
+    their surroundings.
+    """
     words = vocabulary_of([*tracks, *sequences])
     clock_hz = clock_of(tracks[0].track.skeleton)
     progress(0, 3, "features of the labelled recordings")
@@ -50,7 +59,8 @@ def learn(
     progress(1, 3, "learning what each action looks like")
     networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
-    speeds, peaks = speeds_of(examples, len(words)), peaks_of(examples, len(words))
+    speeds = speeds_of(examples, len(words))
+    peaks = peaks_of(examples, len(words))
     chain = ActionChain.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
         tracks[0].track.skeleton.name,
@@ -71,13 +81,16 @@ def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
     found = sorted({str(word) for one in tracks for word in np.unique(one.words)} - {UNLABELLED})
     if len(found) < 2 and not any((one.words == UNLABELLED).any() for one in tracks):
         raise LiexError(
-            f"labels of at least two actions, or of one and stretches without it, are needed; got {found or 'none'}"
+            "labels of at least two actions, or of one and stretches without it, are needed; got "
+            f"{found or 'none'}"
         )
     return (UNLABELLED, *found)
 
 
 def speeds_of(examples: Examples, n_words: int) -> Array:
-    """(K, 2) lengths a second: between which speeds nearly all ticks of each word lie; what has no name has any."""
+    """(K, 2) lengths a second: between which speeds nearly all ticks of each word lie; what has no
+    name has any.
+    """
     limits = np.tile([0.0, np.inf], (n_words, 1))
     for k in range(1, n_words):  # 0 is UNLABELLED
         speed = examples.speed[examples.code == k]
@@ -87,15 +100,14 @@ def speeds_of(examples: Examples, n_words: int) -> Array:
 
 
 def peaks_of(examples: Examples, n_words: int) -> Array:
-    """(K,) lengths a second: the highest speed that nearly all bouts of each fast word reached; 0 of others, for
-    another animal may well be stiller than all that were seen, and not run just before or after.
+    """(K,) lengths a second: the highest speed that nearly all bouts of each fast word reached; 0
+    of others, for another animal may well be stiller than all that were seen, and not run just
+    before or after.
     """
     least = np.zeros(n_words)
     starts, stops, codes = runs_of(examples.code + n_words * examples.recording)
-    peak, mean = (
-        np.maximum.reduceat(examples.speed, starts),
-        np.add.reduceat(examples.speed, starts) / (stops - starts),
-    )
+    peak = np.maximum.reduceat(examples.speed, starts)
+    mean = np.add.reduceat(examples.speed, starts) / (stops - starts)
     for k in range(1, n_words):  # 0 is UNLABELLED
         own = codes % n_words == k
         if own.any() and np.median(mean[own]) > _FAST:
@@ -107,8 +119,10 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     """A network with one hidden layer, see `descend`."""
     step = max(1, -(-len(examples.code) // _MOST_TICKS))
     rows = np.arange(seed % step, len(examples.code), step)
-    features, code = examples.features[rows], examples.code[rows]
-    centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
+    features = examples.features[rows]
+    code = examples.code[rows]
+    centre = features.mean(axis=0)
+    scale = features.std(axis=0) + 1e-6
     inputs = np.clip((features - centre) / scale, -LIMIT, LIMIT)
     batch = int(np.clip(len(code) // 8, 1, _BATCH))
     epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
@@ -125,9 +139,11 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
         seed=seed,
     )
     if len(present) == 2:  # one number decides between two words
-        weights, bias = np.hstack([0 * weights, weights]), np.hstack([0 * bias, bias])
+        weights = np.hstack([0 * weights, weights])
+        bias = np.hstack([0 * bias, bias])
     last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
-    last[0][:, present], last[1][present] = weights, bias
+    last[0][:, present] = weights
+    last[1][present] = bias
     layers = first, last
     return Network(
         centre.astype(np.float32),

@@ -1,4 +1,6 @@
-"""The paper's recogniser of cut-out sequences: a random forest on the temporal pyramid of a descriptor."""
+"""The paper's recogniser of cut-out sequences: a random forest on the temporal pyramid of a
+descriptor.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ DESCRIPTORS: dict[str, Callable[[Track], Array]] = {
     "tangent": tangent_descriptor,
     "joints": position_descriptor,
 }
-_TREES, _DEPTH = 50, 20
+_TREES = 50
+_DEPTH = 20
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,9 @@ class SequenceForest:
         return SequenceForest(descriptor, forest.fit(rows, list(words)))
 
     def name(self, rows: Array) -> list[str]:
-        """The word (n) of each sequence with descriptors (n, D): the largest class of the averaged leaves."""
+        """The word (n) of each sequence with descriptors (n, D): the largest class of the averaged
+        leaves.
+        """
         return [str(word) for word in self.forest.predict(rows)]
 
 

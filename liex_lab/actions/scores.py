@@ -20,16 +20,17 @@ def timeline_scores(
 ) -> dict[str, Any]:
     """Scores of recognised words (n,) beside the labels of their tracks.
 
-    macro_f1: mean over the actions of their frame-wise F1; segment_f1_50: F1 of bouts, of which one is right where it
-    and a true bout of its action share at least half of what either covers; per_action: F1, precision and recall of
-    frames, segment F1, and how many bouts there were.
+    macro_f1: mean over the actions of their frame-wise F1; segment_f1_50: F1 of bouts, of which one
+    is right where it and a true bout of its action share at least half of what either covers;
+    per_action: F1, precision and recall of frames, segment F1, and how many bouts there were.
     """
     named = [word for word in words if word != UNLABELLED]
     hits, found, true = (dict.fromkeys(named, 0) for _ in range(3))
     frames = {word: np.zeros(3, np.int64) for word in words}
     for one, recognised in pairs:
         for word in words:
-            a, b = one.words == word, recognised == word
+            a = one.words == word
+            b = recognised == word
             frames[word] += [int((a & b).sum()), int(b.sum()), int(a.sum())]
         for word in named:
             counted = match_bouts(one.words == word, recognised == word)
@@ -61,9 +62,13 @@ def timeline_scores(
 def match_bouts(
     true: NDArray[np.bool_], found: NDArray[np.bool_], overlap: float = 0.5
 ) -> tuple[int, int, int]:
-    """How many runs of `found` (n,) match a run of `true` (n,), how many were found, and how many there are."""
-    spans, guesses = _spans(true), _spans(found)
-    taken, hits = set(), 0
+    """How many runs of `found` (n,) match a run of `true` (n,), how many were found, and how many
+    there are.
+    """
+    spans = _spans(true)
+    guesses = _spans(found)
+    taken = set()
+    hits = 0
     for start, stop in guesses:
         shares = [
             (min(stop, b) - max(start, a)) / (max(stop, b) - min(start, a))
@@ -103,6 +108,8 @@ def confusion(true: Sequence[str], found: Sequence[str], words: Sequence[str]) -
 
 def interval95(hits: float, n: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share of hits out of n."""
-    z, p = 1.959964, hits / n
-    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    z = 1.959964
+    p = hits / n
+    middle = p + z * z / (2 * n)
+    half = z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     return float((middle - half) / (1 + z * z / n)), float((middle + half) / (1 + z * z / n))

@@ -1,4 +1,6 @@
-"""The order and the length of actions: a chain in which each lasts a least time, learned from labelled bouts."""
+"""The order and the length of actions: a chain in which each lasts a least time, learned from
+labelled bouts.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ _MARGIN = 512  # ... with so many more on either side
 
 @dataclass(frozen=True)
 class ActionChain:
-    """shortest_s, mean_s (K,): how long each action lasts at least and on average; follow (K, K): the chance that one
-    follows another, 0 on the diagonal.
+    """shortest_s, mean_s (K,): how long each action lasts at least and on average; follow (K, K):
+    the chance that one follows another, 0 on the diagonal.
     """
 
     shortest_s: Array
@@ -31,7 +33,9 @@ class ActionChain:
 
     @staticmethod
     def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> ActionChain:
-        """From the bouts (word, length in s) of recordings, in order. Words that never occur get usual values."""
+        """From the bouts (word, length in s) of recordings, in order. Words that never occur get
+        usual values.
+        """
         lengths: list[list[float]] = [[] for _ in range(n_words)]
         counts = np.full((n_words, n_words), 0.5)
         for run in runs:
@@ -58,12 +62,15 @@ class ActionChain:
         return np.concatenate([[0], np.cumsum(least)]), np.log(go), np.log1p(-go), switch
 
     def decode(self, scores: Array, step_s: float, room: Room = np.empty) -> NDArray[np.int64]:
-        """The most probable word (m,) of every tick, from log scores (m, K). room: for what takes much of it on the
-        way.
+        """The most probable word (m,) of every tick, from log scores (m, K). room: for what takes
+        much of it on the way.
         """
-        scores, terms = np.ascontiguousarray(scores), self._terms(step_s)
-        value, label = np.empty(terms[0][-1]), np.zeros(len(scores), np.int64)
-        came_from, stayed = room(scores.shape, np.int16), room(scores.shape, np.bool_)
+        scores = np.ascontiguousarray(scores)
+        terms = self._terms(step_s)
+        value = np.empty(terms[0][-1])
+        label = np.zeros(len(scores), np.int64)
+        came_from = room(scores.shape, np.int16)
+        stayed = room(scores.shape, np.bool_)
         for ticks in blocks(len(scores), _PIECE):
             kernels.go_on(ticks.start, ticks.stop, scores, *terms, value, came_from, stayed)
             let_go(scores, came_from, stayed)
@@ -71,10 +78,14 @@ class ActionChain:
         return label
 
     def probabilities(self, scores: Array, step_s: float, room: Room = np.empty) -> Array:
-        """The probability (m, K) of each word at every tick, given all of them; room: where they are to lie."""
-        out, terms = room(scores.shape, float), self._terms(step_s)
+        """The probability (m, K) of each word at every tick, given all of them; room: where they
+        are to lie.
+        """
+        out = room(scores.shape, float)
+        terms = self._terms(step_s)
         for ticks in blocks(len(scores), _PIECE):
-            low, high = max(0, ticks.start - _MARGIN), min(len(scores), ticks.stop + _MARGIN)
+            low = max(0, ticks.start - _MARGIN)
+            high = min(len(scores), ticks.stop + _MARGIN)
             piece = np.empty((high - low, scores.shape[1]))
             kernels.probabilities(np.ascontiguousarray(scores[low:high]), *terms, piece)
             out[ticks] = piece[ticks.start - low : ticks.stop - low]

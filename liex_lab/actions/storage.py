@@ -1,4 +1,6 @@
-"""Action models on disk: skops files, which hold numbers and words and no code, and where the bundled ones are."""
+"""Action models on disk: skops files, which hold numbers and words and no code, and where the
+bundled ones are.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from liex_lab.errors import ModelError
 from liex_lab.mlp import Network
 
 SUFFIX = ".skops"
-_FORMAT, _WITHOUT_PEAKS = 2, 1
+_FORMAT = 2
+_WITHOUT_PEAKS = 1
 
 
 def save_action_model(model: TimelineModel, path: str | Path) -> Path:
@@ -51,14 +54,16 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
 
 
 def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
-    """A bundled model by its animal ('mouse'), or one from a file. Raises ModelError where it cannot be used."""
+    """A bundled model by its animal ('mouse'), or one from a file. Raises ModelError where it
+    cannot be used.
+    """
     path = find_action_model(name, folder)
     try:
         document = read_plain(path)
         if document["format"] not in (_FORMAT, _WITHOUT_PEAKS):
             raise ModelError(
-                f"the action model {path} has format {document['format']}, this liex_lab reads {_WITHOUT_PEAKS} and "
-                f"{_FORMAT}"
+                f"the action model {path} has format {document['format']}, this liex_lab reads "
+                f"{_WITHOUT_PEAKS} and {_FORMAT}"
             )
         peaks = (
             np.zeros(len(document["words"]))
@@ -89,7 +94,8 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
         raise
     except Exception as error:  # a file that is not ours can fail anywhere in the reader
         raise ModelError(
-            f"{path} should be an action model made by `liex train actions`, but: {type(error).__name__}: {error}"
+            f"{path} should be an action model made by `liex train actions`, but: "
+            f"{type(error).__name__}: {error}"
         ) from None
 
 
@@ -102,8 +108,8 @@ def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
         near = difflib.get_close_matches(str(name), known, 1)
         hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
         raise ModelError(
-            f"there is no action model '{name}'; {hint}, or give the path of a {SUFFIX} file made by "
-            "`liex train actions`"
+            f"there is no action model '{name}'; {hint}, or give the path of a {SUFFIX} file made "
+            "by `liex train actions`"
         )
     return path
 

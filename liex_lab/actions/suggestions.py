@@ -1,4 +1,6 @@
-"""Which stretches of a recording a person should label next: those that would teach the recogniser most."""
+"""Which stretches of a recording a person should label next: those that would teach the recogniser
+most.
+"""
 
 from __future__ import annotations
 
@@ -17,23 +19,27 @@ _STEP = 0.5  # of a window: how far apart windows begin
 def doubtful_stretches(
     found: Recognised, times_ns: NDArray[np.int64], n: int, least_s: float
 ) -> list[dict[str, Any]]:
-    """Up to n stretches of at least least_s, the least certain of every pair of confused words first.
+    """Up to n stretches of at least least_s, the least certain of every pair of confused words
+    first.
 
-    uncertainty: entropy of the words' probabilities, of its largest value, on average over the stretch.
+    uncertainty: entropy of the words' probabilities, of its largest value, on average over the
+    stretch.
     """
     p = np.clip(np.nan_to_num(found.probability, nan=0.0), 1e-9, 1.0)
     known = np.isfinite(found.probability[:, 0])
     entropy = np.where(known, -(p * np.log(p)).sum(axis=1) / np.log(p.shape[1]), 0.0)
     time_s = (times_ns - times_ns[:1]) * 1e-9
     starts = np.arange(0.0, max(time_s[-1] - least_s, 0.0) + 1e-9, _STEP * least_s)
-    low, high = np.searchsorted(time_s, starts), np.searchsorted(time_s, starts + least_s)
+    low = np.searchsorted(time_s, starts)
+    high = np.searchsorted(time_s, starts + least_s)
     total = np.concatenate([[0.0], np.cumsum(entropy)])
     mean = (total[high] - total[low]) / np.maximum(high - low, 1)
     taken = np.zeros(len(time_s), bool)
     pairs: dict[tuple[int, ...], int] = {}
     rows: list[tuple[int, float, int, dict[str, Any]]] = []
     for k in np.argsort(-mean, kind="stable"):
-        a, b = int(low[k]), int(high[k])
+        a = int(low[k])
+        b = int(high[k])
         if b <= a or taken[a:b].any() or mean[k] <= 0:
             continue
         first, second = np.argsort(-p[a:b].mean(axis=0))[:2]

@@ -1,7 +1,9 @@
-"""The default recogniser: names for every moment of an uncut recording, at any frame rate from 15 to 120 per second.
+"""The default recogniser: names for every moment of an uncut recording, at any frame rate from 15
+to 120 per second.
 
-Channels on a clock of its own (in seconds and body lengths), windows around each tick, a small network for what the
-tick looks like, and a semi-Markov chain for what can follow what and for how long.
+Channels on a clock of its own (in seconds and body lengths), windows around each tick, a small
+network for what the tick looks like, and a semi-Markov chain for what can follow what and for how
+long.
 """
 
 from __future__ import annotations
@@ -28,27 +30,28 @@ Array = NDArray[np.float64]
 
 CLOCKS_HZ = {"fish": 50.0}
 _CLOCK_HZ = 30.0
-_PIECE, _MARGIN_S = 16_384, 1.5  # ticks whose features are made at once
-_SPEED_S, _SLACK, _STILL, _UNSEEN = (
-    0.2,
-    1.25,
-    0.1,
-    6.0,
-)  # half window; how far beyond is meant, and what it costs
-_MOST_DECODED, _REFUSED = (
-    6,
-    10.0,
-)  # how often bouts that are too slow are refused, and what that costs a tick
+# ticks whose features are made at once
+_PIECE = 16_384
+_MARGIN_S = 1.5
+# half window; how far beyond is meant, and what it costs
+_SPEED_S = 0.2
+_SLACK = 1.25
+_STILL = 0.1
+_UNSEEN = 6.0
+# how often bouts that are too slow are refused, and what that costs a tick
+_MOST_DECODED = 6
+_REFUSED = 10.0
 _FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
 _RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
 
 
 @dataclass(frozen=True)
 class TimelineModel:
-    """A trained recogniser. words (K): its vocabulary, UNLABELLED among them; share (K,): of the training time;
-    sharpness: how much one tick counts in the chain, as ticks beside each other tell much the same; speeds (K, 2):
-    between which speeds, lengths a second, each word was seen, for a network says anything of what it has not seen;
-    peaks (K,): the highest speed that bouts of a fast word reached at least, for what is never fast is no dart.
+    """A trained recogniser. words (K): its vocabulary, UNLABELLED among them; share (K,): of the
+    training time; sharpness: how much one tick counts in the chain, as ticks beside each other tell
+    much the same; speeds (K, 2): between which speeds, lengths a second, each word was seen, for a
+    network says anything of what it has not seen; peaks (K,): the highest speed that bouts of a
+    fast word reached at least, for what is never fast is no dart.
     """
 
     skeleton: str
@@ -66,10 +69,14 @@ class TimelineModel:
     def log_probabilities(
         self, stretch: Stretch, names: Sequence[str], speed: Array
     ) -> Iterator[tuple[slice, Array]]:
-        """(some, K) of each word at each of some consecutive ticks by itself; speed (m,): the `steady_speed`."""
-        margin, m = round(_MARGIN_S * self.clock_hz), len(stretch.times_s)
+        """(some, K) of each word at each of some consecutive ticks by itself; speed (m,): the
+        `steady_speed`.
+        """
+        margin = round(_MARGIN_S * self.clock_hz)
+        m = len(stretch.times_s)
         for ticks in blocks(m, _PIECE):
-            low, high = max(0, ticks.start - margin), min(m, ticks.stop + margin)
+            low = max(0, ticks.start - margin)
+            high = min(m, ticks.stop + margin)
             features = window_features(
                 Stretch(stretch.times_s[low:high], stretch.values[low:high]), names
             )
@@ -85,8 +92,8 @@ class TimelineModel:
     def scores(
         self, stretch: Stretch, names: Sequence[str], speed: Array, room: Room = np.empty
     ) -> Array:
-        """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is; room: where they are to
-        lie.
+        """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is; room:
+        where they are to lie.
         """
         scores = room((len(stretch.times_s), len(self.words)), float)
         for ticks, log_p in self.log_probabilities(stretch, names, speed):
@@ -97,17 +104,20 @@ class TimelineModel:
     def recognise(
         self, track: Track, wall_mm: Array | None = None, room: Room = np.empty
     ) -> Recognised:
-        """The ethogram of a track, and the probability of each word in each of its frames. room: for what takes much
-        of it on the way.
+        """The ethogram of a track, and the probability of each word in each of its frames. room:
+        for what takes much of it on the way.
         """
         n = track.n_frames
-        probability, score = room((n, len(self.words)), float), np.zeros(n)
-        code, part = np.full(n, self.words.index(UNLABELLED)), np.full(n, -1)
+        probability = room((n, len(self.words)), float)
+        score = np.zeros(n)
+        code = np.full(n, self.words.index(UNLABELLED))
+        part = np.full(n, -1)
         for rows in blocks(n, _PIECE):
             probability[rows] = np.nan
             let_go(probability)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
-        names, step = channel_names(track.skeleton), 1.0 / self.clock_hz
+        names = channel_names(track.skeleton)
+        step = 1.0 / self.clock_hz
         for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, room)):
             speed = steady_speed(stretch, names)
             scores = self.scores(stretch, names, speed, room)
@@ -121,7 +131,9 @@ class TimelineModel:
                     np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1
                 )
                 told = certain[tick]
-                code[rows], probability[rows], part[rows] = decoded[tick], told, number
+                code[rows] = decoded[tick]
+                probability[rows] = told
+                part[rows] = number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
                 let_go(certain, probability)
         ethogram = Ethogram.of_words(
@@ -130,8 +142,8 @@ class TimelineModel:
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
 
     def _decode(self, scores: Array, speed: Array, room: Room) -> NDArray[np.int64]:
-        """The most probable words (m,) of bouts that are all as fast at some time as their words ask for; scores (m, K)
-        of others are lowered in place.
+        """The most probable words (m,) of bouts that are all as fast at some time as their words
+        ask for; scores (m, K) of others are lowered in place.
         """
         for _ in range(_MOST_DECODED):
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz, room)
@@ -145,33 +157,36 @@ class TimelineModel:
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
-        """Per word, what this frame rate cannot tell: bouts that hold fewer than four frames, and parts of an action
-        that are over before a camera can follow them (`vocabulary.FASTEST`).
+        """Per word, what this frame rate cannot tell: bouts that hold fewer than four frames, and
+        parts of an action that are over before a camera can follow them (`vocabulary.FASTEST`).
         """
         if len(times_ns) < 2:
             return {}
         rate = 1e9 / float(np.median(np.diff(times_ns)))
-        fastest, found = FASTEST.get(self.skeleton, {}), {}
+        fastest = FASTEST.get(self.skeleton, {})
+        found = {}
         for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):
             told = []
             if word != UNLABELLED and shortest * rate < _FRAMES_NEEDED:
                 told.append(
-                    f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at {rate:.0f} per "
-                    "second, and may be missed"
+                    f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at "
+                    f"{rate:.0f} per second, and may be missed"
                 )
             part = fastest.get(word)
             if part is not None and rate < part.least_hz - _RATE_SLACK_HZ:
                 told.append(
-                    f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} frames at "
-                    f"{rate:.0f} per second: that it happened may be told, but not how fast, how often or when "
-                    f"exactly, which wants {part.least_hz:.0f} per second"
+                    f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} "
+                    f"frames at {rate:.0f} per second: that it happened may be told, but not how "
+                    f"fast, how often or when exactly, which wants {part.least_hz:.0f} per second"
                 )
             if told:
                 found[word] = "; ".join(told)
         return found
 
     def name(self, track: Track, wall_mm: Array | None = None) -> str:
-        """The one word that fits a cut-out sequence best; UNLABELLED only where nothing was measured."""
+        """The one word that fits a cut-out sequence best; UNLABELLED only where nothing was
+        measured.
+        """
         total = np.zeros(len(self.words))
         names = channel_names(track.skeleton)
         for stretch in stretches_of(track, self.clock_hz, wall_mm):
@@ -185,8 +200,8 @@ class TimelineModel:
 
 @dataclass(frozen=True)
 class Recognised:
-    """An ethogram, the words and their probability (n, K) in every frame (NaN where there is no pose), and what the
-    frame rate cannot resolve, word -> why.
+    """An ethogram, the words and their probability (n, K) in every frame (NaN where there is no
+    pose), and what the frame rate cannot resolve, word -> why.
     """
 
     ethogram: Ethogram
@@ -197,8 +212,9 @@ class Recognised:
 
 @dataclass(frozen=True)
 class Examples:
-    """What a recogniser learns from: features (m, F), word codes (m,) and steady speeds (m,) of ticks, the animal's
-    number (m,) and which recording's (m,) they are; and the bouts (word, s) of every recording.
+    """What a recogniser learns from: features (m, F), word codes (m,) and steady speeds (m,) of
+    ticks, the animal's number (m,) and which recording's (m,) they are; and the bouts (word, s) of
+    every recording.
     """
 
     features: NDArray[np.float32]
@@ -227,7 +243,12 @@ def clock_of(skeleton: Skeleton) -> float:
 
 def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: float) -> Examples:
     """The examples of labelled tracks."""
-    features, codes, speeds, animals, recordings, runs = [], [], [], [], [], []
+    features = []
+    codes = []
+    speeds = []
+    animals = []
+    recordings = []
+    runs = []
     number = {name: k for k, name in enumerate(sorted({one.animal for one in tracks}))}
     place = {word: k for k, word in enumerate(words)}
     for k, one in enumerate(tracks):

@@ -1,4 +1,6 @@
-"""The words of the bundled ethograms and what they mean; thresholds are starting values, with the literature's."""
+"""The words of the bundled ethograms and what they mean; thresholds are starting values, with the
+literature's.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +8,28 @@ from typing import NamedTuple
 
 DEFINITIONS: dict[str, dict[str, str]] = {
     "fish": {
-        "scoot": "forward swim with tail beats, 0.7 to 4 lengths/s, bends below about 32 degrees in all, no turn",
-        "j_turn": "slow turn of up to 45 degrees by repeated one-sided bends far caudally, the front half straight",
-        "c_turn": "C-bend of more than about 90 degrees in all within some 0.1 s, then a counter-bend and a burst",
-        "r_turn": "routine turn by a single bend of about 45 to 110 degrees in all, without a strong counter-bend",
+        "scoot": (
+            "forward swim with tail beats, 0.7 to 4 lengths/s, bends below about 32 degrees in "
+            "all, no turn"
+        ),
+        "j_turn": (
+            "slow turn of up to 45 degrees by repeated one-sided bends far caudally, the front "
+            "half straight"
+        ),
+        "c_turn": (
+            "C-bend of more than about 90 degrees in all within some 0.1 s, then a counter-bend "
+            "and a burst"
+        ),
+        "r_turn": (
+            "routine turn by a single bend of about 45 to 110 degrees in all, without a strong "
+            "counter-bend"
+        ),
         "surface": "swims up, pitch above about 15 degrees",
         "dive": "swims down, pitch below about -15 degrees",
-        "zigzag": "erratic: turns of 65 degrees and more that change side every 0.2 to 0.4 s, at raised speed",
+        "zigzag": (
+            "erratic: turns of 65 degrees and more that change side every 0.2 to 0.4 s, at "
+            "raised speed"
+        ),
         "thrash": "large alternating bends of the whole body with little displacement",
         "freeze": "below about 0.1 lengths/s without tail beats for 0.9 s or more",
     },
@@ -21,10 +38,14 @@ DEFINITIONS: dict[str, dict[str, str]] = {
         "run": "goes faster than about 30 cm/s",
         "turn_left": "turns by more than 30 degrees to its left, at up to 15 cm/s",
         "turn_right": "turns by more than 30 degrees to its right, at up to 15 cm/s",
-        "rear_supported": "nose raised far above the tail's base with a wall within about 5 cm before it; rising and "
-        "descending belong to it",
-        "rear_unsupported": "nose raised far above the tail's base without a wall within about 5 cm before it; rising "
-        "and descending belong to it",
+        "rear_supported": (
+            "nose raised far above the tail's base with a wall within about 5 cm before it; "
+            "rising and descending belong to it"
+        ),
+        "rear_unsupported": (
+            "nose raised far above the tail's base without a wall within about 5 cm before it; "
+            "rising and descending belong to it"
+        ),
         "groom": "sits hunched below 2 cm/s with rhythmic strokes of head and paws",
         "pause": "stays below 5 cm/s and looks about",
         "freeze": "no movement of the body at all for 1 s or more",
@@ -36,7 +57,9 @@ DEFINITIONS: dict[str, dict[str, str]] = {
 
 
 class Fastest(NamedTuple):
-    """The fastest part of an action: what it is, how long it takes, and from which frame rate on it can be followed."""
+    """The fastest part of an action: what it is, how long it takes, and from which frame rate on it
+    can be followed.
+    """
 
     what: str
     seconds: float

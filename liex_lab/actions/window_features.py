@@ -17,19 +17,22 @@ RANGE_S = 0.25
 
 
 def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float32]:
-    """Features (m, F) of every tick of a stretch: its channels now, and their mean and spread around it.
+    """Features (m, F) of every tick of a stretch: its channels now, and their mean and spread
+    around it.
 
-    Windows end where the stretch does. Of channels that change sign in a mirror (their names end in ~) the sizes of the
-    means count, and their signs in the shorter windows only.
+    Windows end where the stretch does. Of channels that change sign in a mirror (their names end in
+    ~) the sizes of the means count, and their signs in the shorter windows only.
     """
     x = stretch.values
     step = stretch.times_s[1] - stretch.times_s[0]
     signed = np.array([name.endswith("~") for name in names])
-    n, n_signed = x.shape[1], int(signed.sum())
+    n = x.shape[1]
+    n_signed = int(signed.sum())
     n_features = (
         n + n_signed + len(HALF_WINDOWS_S) * (2 * n + n_signed) + len(SIDE_WINDOWS_S) * 2 * n + n
     )
-    found, filled = np.empty((len(x), n_features), np.float32), 0
+    found = np.empty((len(x), n_features), np.float32)
+    filled = 0
 
     def put(*parts: Array) -> None:  # one by one, for all of them in double precision are large
         nonlocal filled
@@ -51,7 +54,9 @@ def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float3
 
 
 def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:
-    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C); beyond the ends, the nearest tick."""
+    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C); beyond the ends,
+    the nearest tick.
+    """
     m = len(total) - 1
     rows = np.arange(m)
     low = np.clip(rows + round(start_s / step), 0, m - 1)

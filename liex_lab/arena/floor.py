@@ -14,7 +14,9 @@ from liex_lab.optics.camera import Camera
 
 Array = NDArray[np.float64]
 
-_N_VOTERS, _N_TRIALS = 6000, 600  # pixels that vote for a plane, and planes tried
+# pixels that vote for a plane, and planes tried
+_N_VOTERS = 6000
+_N_TRIALS = 600
 _N_FITTED = 60_000  # pixels that the plane is fitted to
 _INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
 _MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
@@ -26,9 +28,11 @@ _FLAT_MM = (
 
 @dataclass(frozen=True)
 class Floor:
-    """The floor plane `normal . p = distance_mm` in the camera frame, its unit normal (3,) pointing away from the lens.
+    """The floor plane `normal . p = distance_mm` in the camera frame, its unit normal (3,) pointing
+    away from the lens.
 
-    In a pinhole picture 1 / z of a plane is linear in the pixel: `inverse_depth` (3,) gives 1 / z = a u + b v + c.
+    In a pinhole picture 1 / z of a plane is linear in the pixel: `inverse_depth` (3,) gives 1 / z =
+    a u + b v + c.
     """
 
     normal: Array
@@ -47,7 +51,8 @@ class Floor:
     def from_plane(normal: Array, distance_mm: float, camera: Camera) -> Floor:
         """The plane normal . p = distance_mm in the camera frame."""
         n = np.asarray(normal, float) / np.linalg.norm(normal)
-        a, b = n[0] / camera.fx / distance_mm, n[1] / camera.fy / distance_mm
+        a = n[0] / camera.fx / distance_mm
+        b = n[1] / camera.fy / distance_mm
         return Floor(
             n,
             float(distance_mm),
@@ -56,7 +61,9 @@ class Floor:
 
     @cached_property
     def T_arena_camera(self) -> SE3:
-        """Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along the camera's."""
+        """Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x
+        along the camera's.
+        """
         up = -self.normal
         x = np.array([1.0, 0.0, 0.0]) - up[0] * up
         x = x / np.linalg.norm(x)
@@ -70,26 +77,31 @@ class Floor:
 
 
 def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -> Floor:
-    """The largest plane of an empty scene (H, W) mm, by RANSAC on inverse depth and least squares on its inliers.
+    """The largest plane of an empty scene (H, W) mm, by RANSAC on inverse depth and least squares
+    on its inliers.
 
-    Raises EstimationError where less than a fifth of the readable pixels lie on one plane that faces the camera.
+    Raises EstimationError where less than a fifth of the readable pixels lie on one plane that
+    faces the camera.
     """
     if camera.distortion is not None:
         raise EstimationError(
-            "a floor is found in pictures of a straight lens, but this camera's distortion was not undone; pass the "
-            "recording through liex_lab.recordings.rectify.rectified"
+            "a floor is found in pictures of a straight lens, but this camera's distortion was "
+            "not undone; pass the recording through liex_lab.recordings.rectify.rectified"
         )
     rows, columns = np.nonzero(background > 0)
     if len(rows) < 500:
         raise EstimationError(
-            f"a floor needs at least 500 readable background pixels, got {len(rows)}; check the depth unit and range"
+            f"a floor needs at least 500 readable background pixels, got {len(rows)}; check the "
+            "depth unit and range"
         )
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(rows), min(_N_FITTED, len(rows)), replace=False)
-    rows, columns = rows[chosen], columns[chosen]
+    rows = rows[chosen]
+    columns = columns[chosen]
     depth = background[rows, columns].astype(float)
     middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
-    # pixels counted from the picture's middle, in units of its size: so the sums below lose no digits
+    # pixels counted from the picture's middle, in units of its size: so the sums below lose no
+    # digits
     points = np.stack(
         [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
         axis=1,
@@ -102,20 +114,22 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
     if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
         raise EstimationError(
-            f"no floor was found: the largest plane holds {share:.0%} of the readable pixels and is tilted by "
-            f"{tilt:.0f} degrees; the camera should look down on a floor"
+            f"no floor was found: the largest plane holds {share:.0%} of the readable pixels and "
+            f"is tilted by {tilt:.0f} degrees; the camera should look down on a floor"
         )
     return floor
 
 
 def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Generator) -> Array:
-    """The plane (3,), 1 / depth = points . plane, that the most points (n, 3) are on, out of many through three each.
+    """The plane (3,), 1 / depth = points . plane, that the most points (n, 3) are on, out of many
+    through three each.
 
-    Planes that do not face the camera (a wall) do not stand. All are tried on some points, the best few on more.
-    focal: in the units of the points.
+    Planes that do not face the camera (a wall) do not stand. All are tried on some points, the best
+    few on more. focal: in the units of the points.
     """
     three = rng.integers(0, len(depth), (_N_TRIALS, 3))
-    p, w = points[three], 1.0 / depth[three]
+    p = points[three]
+    w = 1.0 / depth[three]
     ends = np.stack([p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]], axis=1)
     rise = np.stack([w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]], axis=1)
     area = ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]
@@ -134,7 +148,9 @@ def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Gen
 
 
 def _is_near(inverse: Array, depth: Array) -> NDArray[np.bool_]:
-    """Whether points at `depth` lie within `_INLIER_MM` of a plane that has 1 / z = inverse there."""
+    """Whether points at `depth` lie within `_INLIER_MM` of a plane that has 1 / z = inverse
+    there.
+    """
     return np.asarray(np.abs(depth * inverse - 1.0) < _INLIER_MM * inverse)
 
 
@@ -154,9 +170,11 @@ def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
 
 
 def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where (H, W) the floor lies: the convex hull of the largest connected part of the background on the plane.
+    """Where (H, W) the floor lies: the convex hull of the largest connected part of the background
+    on the plane.
 
-    Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the hull closes.
+    Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the
+    hull closes.
     """
     import cv2
 
@@ -169,7 +187,9 @@ def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> 
 
 
 def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The largest connected part (H, W) of the background (H, W) mm that lies on the bare floor (H, W) mm."""
+    """The largest connected part (H, W) of the background (H, W) mm that lies on the bare floor (H,
+    W) mm.
+    """
     import cv2
 
     flat = near_plane(background, bare).astype(np.uint8)

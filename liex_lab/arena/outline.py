@@ -1,4 +1,6 @@
-"""The shape of the arena: where its floor ends, as a circle or a rectangle, and whether walls stand there."""
+"""The shape of the arena: where its floor ends, as a circle or a rectangle, and whether walls stand
+there.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,16 @@ from liex_lab.optics.camera import Camera
 
 Array = NDArray[np.float64]
 
-ROUND, RECTANGULAR, IRREGULAR, OPEN = "round", "rectangular", "irregular", "open"
+ROUND = "round"
+RECTANGULAR = "rectangular"
+IRREGULAR = "irregular"
+OPEN = "open"
 _BORDER_PX = 8  # an outline this near to the picture's edge is the picture's and not the floor's
 _NOTCH_PX = 3.0  # and one this far inside the convex hull is a thing on the floor
 _SEEN_SHARE = 0.6  # of the way round must be in view
-_FIT_SHARE, _FIT_MM = (
-    0.025,
-    4.0,
-)  # an outline this near to a shape, of its size or in mm, has that shape
+# an outline this near to a shape, of its size or in mm, has that shape
+_FIT_SHARE = 0.025
+_FIT_MM = 4.0
 _BAND_MM = 60.0  # beyond the outline, in which a wall is looked for
 _WALL_MM = 20.0  # and how high it has to be there, or how deep a drop
 _SIDE_SHARE = 0.3  # of each side of a rectangle must be in view
@@ -32,10 +36,11 @@ _MAX_POINTS = 720  # of the outline
 class Arena:
     """What the floor's outline is, in the arena frame.
 
-    kind: round, rectangular, irregular (no shape that is known), or open (the picture does not show where the floor
-    ends). centre_mm (x, y); radius_mm of a round one; half_mm, half the lengths of a rectangular one's sides, turned by
-    yaw_rad; residual_mm: median distance of the outline from the shape; seen_share: of the outline, how much is in
-    view; edge: wall, drop (the floor ends in the air) or unknown. An irregular or open arena has no such numbers.
+    kind: round, rectangular, irregular (no shape that is known), or open (the picture does not show
+    where the floor ends). centre_mm (x, y); radius_mm of a round one; half_mm, half the lengths of
+    a rectangular one's sides, turned by yaw_rad; residual_mm: median distance of the outline from
+    the shape; seen_share: of the outline, how much is in view; edge: wall, drop (the floor ends in
+    the air) or unknown. An irregular or open arena has no such numbers.
     """
 
     kind: str
@@ -48,7 +53,9 @@ class Arena:
     edge: str = "unknown"
 
     def wall_distance_mm(self, xy_mm: Array) -> Array:
-        """How far (...) points (..., 2) mm are from the nearest wall, negative beyond it; NaN for an unknown shape."""
+        """How far (...) points (..., 2) mm are from the nearest wall, negative beyond it; NaN for
+        an unknown shape.
+        """
         xy = np.asarray(xy_mm, float)
         if self.centre_mm is None:
             return np.full(xy.shape[:-1], np.nan)
@@ -71,7 +78,9 @@ class Arena:
         return np.asarray(np.array(self.centre_mm) + corners @ _turn(self.yaw_rad or 0.0).T)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for session.json, rounded to what can be known; what is unknown is left out."""
+        """Plain numbers for session.json, rounded to what can be known; what is unknown is left
+        out.
+        """
         numbers = {
             name: value
             if isinstance(value, str)
@@ -126,9 +135,11 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
 def _outline(
     background: NDArray[np.float32], floor: Floor, camera: Camera
 ) -> tuple[Array, Array, float]:
-    """Where the floor ends: points (n, 2) mm in the arena frame, their pixels (n, 2), and the share of it in view.
+    """Where the floor ends: points (n, 2) mm in the arena frame, their pixels (n, 2), and the share
+    of it in view.
 
-    A point's place is that of the reading there, for the foot of a wall stands on the wall's own line at any height.
+    A point's place is that of the reading there, for the foot of a wall stands on the wall's own
+    line at any height.
     """
     import cv2
 
@@ -168,18 +179,25 @@ def _share_in_view(hull: Array, width: int, height: int) -> float:
 
 
 def fit_circle(points: Array) -> tuple[Array, float, float]:
-    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of them may be astray.
+    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of
+    them may be astray.
 
-    First, out of circles through three points each, the one with the least median distance; then least squares.
+    First, out of circles through three points each, the one with the least median distance; then
+    least squares.
     """
     a, b, c = np.moveaxis(
         points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0
     )
-    p, q = b - a, c - a
+    p = b - a
+    q = c - a
     twice = 2.0 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
     usable = np.abs(twice) > 1e-9
-    p, q, a, twice = p[usable], q[usable], a[usable], twice[usable]
-    pp, qq = (p * p).sum(axis=1), (q * q).sum(axis=1)
+    p = p[usable]
+    q = q[usable]
+    a = a[usable]
+    twice = twice[usable]
+    pp = (p * p).sum(axis=1)
+    qq = (q * q).sum(axis=1)
     off = (
         np.stack([q[:, 1] * pp - p[:, 1] * qq, p[:, 0] * qq - q[:, 0] * pp], axis=1)
         / twice[:, None]
@@ -190,14 +208,16 @@ def fit_circle(points: Array) -> tuple[Array, float, float]:
     for _ in range(3):
         design = np.concatenate([2.0 * some, np.ones((len(some), 1))], axis=1)
         x, y, c = np.linalg.lstsq(design, (some**2).sum(axis=1), rcond=None)[0]
-        centre, radius = np.array([x, y]), float(np.sqrt(max(c + x * x + y * y, 1e-9)))
+        centre = np.array([x, y])
+        radius = float(np.sqrt(max(c + x * x + y * y, 1e-9)))
         best = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
         some = points[best <= 3.0 * np.median(best) + 1e-6]
     return centre, radius, float(np.median(best))
 
 
 def fit_rectangle(points: Array) -> tuple[Array, Array, float, float]:
-    """Centre (2,), half sides (2,), yaw rad and median distance of the rectangle nearest to points (n, 2).
+    """Centre (2,), half sides (2,), yaw rad and median distance of the rectangle nearest to points
+    (n, 2).
 
     yaw is that of the first side, within 45 degrees of the x axis.
     """
@@ -217,8 +237,11 @@ def fit_rectangle(points: Array) -> tuple[Array, Array, float, float]:
 
 
 def _sides(points: Array) -> tuple[float, Array, Array]:
-    """Median distance of points (n, 2) from the sides of an upright rectangle, and its corners (2,) low and high."""
-    low, high = np.percentile(points, 2, axis=0), np.percentile(points, 98, axis=0)
+    """Median distance of points (n, 2) from the sides of an upright rectangle, and its corners (2,)
+    low and high.
+    """
+    low = np.percentile(points, 2, axis=0)
+    high = np.percentile(points, 98, axis=0)
     for _ in range(4):
         gaps = np.stack([points - low, high - points], axis=1).reshape(
             len(points), 4
@@ -266,7 +289,8 @@ def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels:
     known = np.isfinite(height).any(axis=0)
     if known.mean() < 0.3:
         return "unknown"
-    highest, lowest = np.nanmax(height[:, known], axis=0), np.nanmin(height[:, known], axis=0)
+    highest = np.nanmax(height[:, known], axis=0)
+    lowest = np.nanmin(height[:, known], axis=0)
     return (
         "wall"
         if np.median(highest) > _WALL_MM
@@ -284,7 +308,8 @@ def circle_points(n: int) -> Array:
 
 def _turn(yaw: float) -> Array:
     """Rotation (2, 2) by yaw; points @ it are turned back."""
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.array([[c, -s], [s, c]])
 
 

@@ -28,7 +28,9 @@ _EXAMPLE = '[[zones]], name = "centre", circle = { centre = [0, 0], radius = 80 
 
 @dataclass(frozen=True)
 class Zone:
-    """A named part of the floor, in the arena frame: a circle (x, y, radius) mm or a polygon of corners (x, y) mm."""
+    """A named part of the floor, in the arena frame: a circle (x, y, radius) mm or a polygon of
+    corners (x, y) mm.
+    """
 
     name: str
     circle_mm: tuple[float, float, float] | None = None
@@ -63,7 +65,8 @@ class Zone:
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Zone:
         """The zone that `to_dict` wrote."""
-        circle, polygon = numbers.get("circle_mm"), numbers.get("polygon_mm")
+        circle = numbers.get("circle_mm")
+        polygon = numbers.get("polygon_mm")
         return Zone(
             str(numbers["name"]),
             None if circle is None else (float(circle[0]), float(circle[1]), float(circle[2])),
@@ -72,7 +75,9 @@ class Zone:
 
 
 def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
-    """For each point (n, 2) mm the names of the zones that it lies in, joined by `SEPARATOR`; "" for none."""
+    """For each point (n, 2) mm the names of the zones that it lies in, joined by `SEPARATOR`; ""
+    for none.
+    """
     xy = np.asarray(xy_mm, float)
     inside = [(zone.name, zone.holds(xy)) for zone in zones]
     return [SEPARATOR.join(name for name, held in inside if held[k]) for k in range(len(xy))]
@@ -80,7 +85,9 @@ def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
 
 @dataclass(frozen=True)
 class DrawnZone:
-    """A zone as it stands in a file: a circle about its only point, or a polygon. where: what errors call it."""
+    """A zone as it stands in a file: a circle about its only point, or a polygon. where: what
+    errors call it.
+    """
 
     name: str
     points: tuple[tuple[float, float], ...]
@@ -90,7 +97,9 @@ class DrawnZone:
     where: str
 
     def placed(self, camera: Camera, floor: Floor, arena: Arena) -> Zone:
-        """The zone in the arena frame. Raises PlanError where the floor or the arena do not allow it."""
+        """The zone in the arena frame. Raises PlanError where the floor or the arena do not allow
+        it.
+        """
         points = np.array(self.points)
         if self.unit == "px":
             if self.radius is not None:  # a circle in the picture is none on a tilted floor
@@ -99,9 +108,11 @@ class DrawnZone:
         if self.relative_to is not None:
             if arena.centre_mm is None:
                 raise PlanError(
-                    f"{self.where} is relative to the arena's centre, but no walls were found; state it without that"
+                    f"{self.where} is relative to the arena's centre, but no walls were found; "
+                    "state it without that"
                 )
-            c, s = np.cos(arena.yaw_rad or 0.0), np.sin(arena.yaw_rad or 0.0)
+            c = np.cos(arena.yaw_rad or 0.0)
+            s = np.sin(arena.yaw_rad or 0.0)
             points = points @ np.array([[c, s], [-s, c]]) + np.array(arena.centre_mm)
         if self.radius is None:
             return Zone(self.name, polygon_mm=_pairs(points))
@@ -121,10 +132,11 @@ class DrawnZone:
 def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     """The zones in a TOML file.
 
-    Each [[zones]] has a name, and a circle = { centre = [x, y], radius = r } or a polygon = [[x, y], ...]. unit = "mm"
-    (or left out) are millimetres of the arena frame, "px" pixels (u, v) of the depth picture, whose view rays are met
-    with the floor. relative_to = "centre" counts millimetres from the centre of the arena that was found, turned with
-    it. Raises PlanError with one sentence where a zone cannot be.
+    Each [[zones]] has a name, and a circle = { centre = [x, y], radius = r } or a polygon = [[x,
+    y], ...]. unit = "mm" (or left out) are millimetres of the arena frame, "px" pixels (u, v) of
+    the depth picture, whose view rays are met with the floor. relative_to = "centre" counts
+    millimetres from the centre of the arena that was found, turned with it. Raises PlanError with
+    one sentence where a zone cannot be.
     """
     file = Path(path)
     try:
@@ -169,13 +181,16 @@ def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
     name = entry.get("name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)):
         raise PlanError(
-            f"{where} needs a name of letters, digits and _, for columns are named after it, got {name!r}"
+            f"{where} needs a name of letters, digits and _, for columns are named after it, got "
+            f"{name!r}"
         )
     where = f"zone '{name}' of {file}"
-    unit, relative = entry.get("unit", "mm"), entry.get("relative_to")
+    unit = entry.get("unit", "mm")
+    relative = entry.get("relative_to")
     if unit not in ("mm", "px") or relative not in (None, "centre") or (unit == "px" and relative):
         raise PlanError(
-            f'{where} has unit = "mm" or "px", and with mm perhaps relative_to = "centre"; correct it'
+            f'{where} has unit = "mm" or "px", and with mm perhaps relative_to = "centre"; correct '
+            "it"
         )
     if ("circle" in entry) == ("polygon" in entry):
         raise PlanError(f"{where} should have either a circle or a polygon; as in {_EXAMPLE}")
@@ -212,7 +227,8 @@ def _polygon(where: str, polygon: Any) -> Array:
         for j in range(i + 2, n - (i == 0)):
             if _cross(corners[i], ends[i], corners[j], ends[j]):
                 raise PlanError(
-                    f"{where}: sides {i + 1} and {j + 1} of the polygon cross; list its corners in order"
+                    f"{where}: sides {i + 1} and {j + 1} of the polygon cross; list its corners in "
+                    "order"
                 )
     return corners
 

@@ -1,4 +1,6 @@
-"""Numba kernels of the regression forest: votes of an animal's pixels for its place, then candidates for its pose."""
+"""Numba kernels of the regression forest: votes of an animal's pixels for its place, then
+candidates for its pose.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ _SETTLE = 2  # times the few mean-shift steps of `mode_of_votes`
 
 @njit(cache=True)
 def animal_points(heights, look, phase, points):
-    """P points (P, 3) mm on the animal's back, view frame, evenly spread over its pixels in reading order.
+    """P points (P, 3) mm on the animal's back, view frame, evenly spread over its pixels in reading
+    order.
 
     phase in [0, 1) chooses which of the pixels; look (17,) says how the height map (S, S) was cut.
     """
@@ -24,7 +27,8 @@ def animal_points(heights, look, phase, points):
     for h in heights.flat:
         total += h > 0
     n = points.shape[0]
-    seen, k = 0, 0
+    seen = 0
+    k = 0
     for row in range(heights.shape[0]):
         for column in range(heights.shape[1]):
             h = heights[row, column]
@@ -50,7 +54,9 @@ def points_all(heights, looks, image, phases, points):
 
 @njit(cache=True, parallel=True)
 def views_all(looks, image, places, headings, reach, views):
-    """Views (n, 1, 9) of places (n, 3) mm whose offsets are turned by headings (n,) rad in the image plane."""
+    """Views (n, 1, 9) of places (n, 3) mm whose offsets are turned by headings (n,) rad in the
+    image plane.
+    """
     for s in prange(image.size):
         turned = np.eye(3)
         turn_to(headings[s], turned)
@@ -60,21 +66,21 @@ def views_all(looks, image, places, headings, reach, views):
 @njit(cache=True)
 def turn_to(heading, rotation):
     """Rotation (3, 3) about the view's z axis by an angle, rad."""
-    c, s = np.cos(heading), np.sin(heading)
+    c = np.cos(heading)
+    s = np.sin(heading)
     rotation[:] = 0.0
-    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1], rotation[2, 2] = (
-        c,
-        -s,
-        s,
-        c,
-        1.0,
-    )
+    rotation[0, 0] = c
+    rotation[0, 1] = -s
+    rotation[1, 0] = s
+    rotation[1, 1] = c
+    rotation[2, 2] = 1.0
 
 
 @njit(cache=True)
 def heading_of(votes):
     """The heading, rad, that most votes (n, 2) agree on; a vote weighs as much as it is long."""
-    counts, angles = np.zeros(_BINS), np.empty(len(votes))
+    counts = np.zeros(_BINS)
+    angles = np.empty(len(votes))
     for k in range(len(votes)):
         angles[k] = np.arctan2(votes[k, 1], votes[k, 0])
         weight = np.hypot(votes[k, 0], votes[k, 1])
@@ -85,21 +91,26 @@ def heading_of(votes):
     x = y = 0.0
     for k in range(len(votes)):
         if np.cos(angles[k] - peak) > 0.7:
-            x, y = x + votes[k, 0], y + votes[k, 1]
+            x = x + votes[k, 0]
+            y = y + votes[k, 1]
     return np.arctan2(y, x)
 
 
 @njit(cache=True)
 def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leaves, used, place):
-    """The base joint's place (3,) mm in the view frame, and the heading, rad, as F1's trees vote; used (T,) bool.
+    """The base joint's place (3,) mm in the view frame, and the heading, rad, as F1's trees vote;
+    used (T,) bool.
 
-    Only votes whose own heading agrees with the chosen one take part in the place: a pixel that takes the nose for the
-    tail errs in both.
+    Only votes whose own heading agrees with the chosen one take part in the place: a pixel that
+    takes the nose for the tail errs in both.
     """
     points = np.empty((n_points, 3))
     animal_points(heights, look, phase, points)
-    view, none, upright = np.empty((1, VIEW), np.float32), np.zeros(1, np.float32), np.eye(3)
-    votes, n = np.empty((roots.size * n_points, 5)), 0
+    view = np.empty((1, VIEW), np.float32)
+    none = np.zeros(1, np.float32)
+    upright = np.eye(3)
+    votes = np.empty((roots.size * n_points, 5))
+    n = 0
     for p in range(n_points):
         fill_view(upright, points[p], look, 1.0, reach, view[0])
         for t in range(roots.size):
@@ -108,10 +119,12 @@ def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leave
             leaf = leaves[descend(nodes, roots[t], heights, np.float32(1.0), view, none)]
             for i in range(3):
                 votes[n, i] = points[p, i] + leaf[i]
-            votes[n, 3], votes[n, 4] = leaf[3], leaf[4]
+            votes[n, 3] = leaf[3]
+            votes[n, 4] = leaf[4]
             n += 1
     heading = heading_of(votes[:n, 3:])
-    c, s = np.cos(heading), np.sin(heading)
+    c = np.cos(heading)
+    s = np.sin(heading)
     place[:] = 0.0
     m = 0
     for k in range(n):
@@ -141,7 +154,9 @@ def locate_all(
     places,
     headings,
 ):
-    """`locate` for a batch: image (n,), phases (n,), used (n, T) into places (n, 3) and headings (n,)."""
+    """`locate` for a batch: image (n,), phases (n,), used (n, T) into places (n, 3) and headings
+    (n,).
+    """
     for s in prange(image.size):
         headings[s] = locate(
             heights[image[s]],
@@ -160,21 +175,25 @@ def locate_all(
 
 @njit(cache=True)
 def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotations, positions):
-    """The pose at F2's coordinates (D,) in lever units, from where F1 put it; all joints' frames. Returns the scale."""
+    """The pose at F2's coordinates (D,) in lever units, from where F1 put it; all joints' frames.
+    Returns the scale.
+    """
     twist = np.empty(7)
     for k in range(7):
         twist[k] = values[k] / levers[k]
     turn_to(heading, rotations[0])
     positions[0] = place
     scale = correct_base(rotations[0], positions[0], 1.0, twist, 1.0)
-    turns, at = np.zeros(3), 7
+    turns = np.zeros(3)
+    at = 7
     for j in range(1, parents.size):
         place_joint(j, parents, offsets, rest, scale, rotations, positions)
         n = 0
         for k in range(3):
             if axes[j, k]:
                 turns[n] = values[at] / levers[at]
-                n, at = n + 1, at + 1
+                n = n + 1
+                at = at + 1
         if n > 0:
             correct_joint(rotations[j], axes[j], turns, 1.0)
     return scale
@@ -205,7 +224,9 @@ def guess_all(
     for i in prange(heights.shape[0]):
         if not found[i]:
             continue
-        place, n_trees, width = np.empty(3), pose_roots.size, pose_leaves.shape[1]
+        place = np.empty(3)
+        n_trees = pose_roots.size
+        width = pose_leaves.shape[1]
         heading = locate(
             heights[i],
             looks[i],
@@ -219,14 +240,13 @@ def guess_all(
             np.ones(roots.size, np.bool_),
             place,
         )
-        turned, view, none = (
-            np.empty((3, 3)),
-            np.empty((1, VIEW), np.float32),
-            np.zeros(1, np.float32),
-        )
+        turned = np.empty((3, 3))
+        view = np.empty((1, VIEW), np.float32)
+        none = np.zeros(1, np.float32)
         turn_to(heading, turned)
         fill_view(turned, place, looks[i], 1.0, reach, view[0])
-        votes, values = np.empty((n_trees, width)), np.zeros(width)
+        votes = np.empty((n_trees, width))
+        values = np.zeros(width)
         for t in range(n_trees):
             leaf = descend(pose_nodes, pose_roots[t], heights[i], np.float32(1.0), view, none)
             for d in range(width):

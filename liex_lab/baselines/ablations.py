@@ -1,6 +1,7 @@
 """The method without its learned metric: the plain mean of all candidates (Lie-X Tables 1 and 2).
 
-The other ablation, without multiple initial poses, needs no code of its own: it is `PoseEstimator(model, 1)`.
+The other ablation, without multiple initial poses, needs no code of its own: it is
+`PoseEstimator(model, 1)`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from liex_lab.foreground.height_maps import Foreground
 
 @dataclass(frozen=True)
 class PlainMean:
-    """The paper's variant whose candidates are averaged "for each of the joints in the 3D Euclidean space"."""
+    """The paper's variant whose candidates are averaged "for each of the joints in the 3D Euclidean
+    space".
+    """
 
     estimator: PoseEstimator
 

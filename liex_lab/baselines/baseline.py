@@ -1,4 +1,6 @@
-"""What every baseline does: frames and a learned scene in, the joints of the animal in each frame out."""
+"""What every baseline does: frames and a learned scene in, the joints of the animal in each frame
+out.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ DAMAGE = (
 
 @dataclass(frozen=True)
 class Guesses:
-    """Joints (n, J, 3) mm of n frames in the camera frame, NaN where no animal was found; found (n,)."""
+    """Joints (n, J, 3) mm of n frames in the camera frame, NaN where no animal was found; found
+    (n,).
+    """
 
     joints: Array
     found: NDArray[np.bool_]
@@ -41,7 +45,9 @@ class Baseline(Protocol):
         """The animal's skeleton."""
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """The animal's size over home size; 1 where the baseline knows of no such thing, as the paper's do not."""
+        """The animal's size over home size; 1 where the baseline knows of no such thing, as the
+        paper's do not.
+        """
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
@@ -50,10 +56,12 @@ class Baseline(Protocol):
 
 
 def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple[Crops, Array]:
-    """The animal of each frame (n, H, W) mm as the paper's features see it, and how it was cut (n, 17).
+    """The animal of each frame (n, H, W) mm as the paper's features see it, and how it was cut (n,
+    17).
 
-    Heights along the optical axis, no size known. Where two things have about the animal's area, the one that is more
-    like it in area and volume is taken, as for the paper's own variant of the method.
+    Heights along the optical axis, no size known. Where two things have about the animal's area,
+    the one that is more like it in area and volume is taken, as for the paper's own variant of the
+    method.
     """
     crops, second = scene.extract_both(depths, 1.0, parallel, camera_view=True)
     unsure = np.flatnonzero(crops.n_blobs > 1)

@@ -1,12 +1,14 @@
-"""CNN, the paper's second baseline: an AlexNet that regresses all joints from one patch (Lie-X section 5.2).
+"""CNN, the paper's second baseline: an AlexNet that regresses all joints from one patch (Lie-X
+section 5.2).
 
-The paper takes AlexNet as trained on ImageNet and trains it on for 50 epochs of its 95,000 to 104,000 images. Here it
-is trained from scratch: weights that come from photographs cannot be had where this is built, and the budget is that
-of two CPU cores (`CnnPlan`). What follows from that: batch normalisation after every convolution, without which an
-AlexNet hardly learns from scratch in so few steps; no dropout, since no image is seen more than a few times; fully
-connected layers of 1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column), at a
-`width` of its numbers of channels. Products are of bfloat16 numbers, which such CPUs as have them do in half the time.
-The loss is the mean distance of the joints, in half sides of the patch.
+The paper takes AlexNet as trained on ImageNet and trains it on for 50 epochs of its 95,000 to
+104,000 images. Here it is trained from scratch: weights that come from photographs cannot be had
+where this is built, and the budget is that of two CPU cores (`CnnPlan`). What follows from that:
+batch normalisation after every convolution, without which an AlexNet hardly learns from scratch in
+so few steps; no dropout, since no image is seen more than a few times; fully connected layers of
+1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column), at a
+`width` of its numbers of channels. Products are of bfloat16 numbers, which such CPUs as have them
+do in half the time. The loss is the mean distance of the joints, in half sides of the patch.
 
 torch is an optional dependency: `pip install 'liex_lab[cnn]'`.
 """
@@ -41,9 +43,10 @@ _BATCH = 64
 
 @dataclass(frozen=True)
 class CnnPlan:
-    """The budget: about seven minutes of two cores with bfloat16 for 122,880 views. width: of AlexNet's own numbers of
-    channels, halved to see more images in that time; connected: neurons of the two hidden layers; epochs: times that
-    every image is seen; the step size rises to `rate` and falls to nothing.
+    """The budget: about seven minutes of two cores with bfloat16 for 122,880 views. width: of
+    AlexNet's own numbers of channels, halved to see more images in that time; connected: neurons of
+    the two hidden layers; epochs: times that every image is seen; the step size rises to `rate` and
+    falls to nothing.
     """
 
     width: float = 0.5
@@ -124,7 +127,9 @@ def torch_threads(parallel: bool) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Cnn:
-    """The trained network at work. It says joints, not a pose: nothing holds its bones at their lengths."""
+    """The trained network at work. It says joints, not a pose: nothing holds its bones at their
+    lengths.
+    """
 
     skeleton: Skeleton
     net: torch.nn.Sequential
@@ -146,7 +151,9 @@ class Cnn:
         return Guesses(joints, crops.found, crops)
 
     def joints(self, heights: NDArray[np.int16], looks: Array, parallel: bool = True) -> Array:
-        """Joints (n, J, 3) mm in the camera frame of animals whose height maps (n, S, S) were cut by looks (n, 17)."""
+        """Joints (n, J, 3) mm in the camera frame of animals whose height maps (n, S, S) were cut
+        by looks (n, 17).
+        """
         import torch
 
         with threads(parallel), torch_threads(parallel), torch.no_grad(), low_precision():
@@ -180,7 +187,9 @@ class Cnn:
 
 
 def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
-    """Patches (n, 224, 224) of 0-255, as the network wants them: three equal channels, about -1 to 1."""
+    """Patches (n, 224, 224) of 0-255, as the network wants them: three equal channels, about -1 to
+    1.
+    """
     import torch
 
     grey = torch.from_numpy((patches - 127.5) / 127.5)
@@ -221,7 +230,8 @@ def _loss(net: torch.nn.Sequential, data: TrainingSet, rows: NDArray[np.int64]) 
     """Mean distance of the joints of some images, in half sides of their patches."""
     import torch
 
-    heights, looks = data.images.heights[rows], data.images.looks[rows]
+    heights = data.images.heights[rows]
+    looks = data.images.looks[rows]
     frames = frames_of(heights, looks)
     wanted = torch.from_numpy(
         targets_of(in_camera_frame(data.truth.positions[rows], looks), looks, frames)

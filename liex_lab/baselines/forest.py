@@ -1,18 +1,26 @@
-"""RF, the paper's regression forest: F1 finds the animal and its heading, F2 its pose (Lie-X section 5.2).
+"""RF, the paper's regression forest: F1 finds the animal and its heading, F2 its pose (Lie-X
+section 5.2).
 
-"Two separate regression forests, F1 and F2 [...]. F1 is used to estimate the 3D location and in-plane orientation of
-the subject, followed by F2 which produces a set of 3D pose candidates", 7 and 12 trees of depth 20, on the depth
-invariant two-point features of Shotton et al. (2013). The rest the paper leaves open, and is chosen here:
+"Two separate regression forests, F1 and F2 [...]. F1 is used to estimate the 3D location and
+in-plane orientation of the subject, followed by F2 which produces a set of 3D pose candidates", 7
+and 12 trees of depth 20, on the depth invariant two-point features of Shotton et al. (2013). The
+rest the paper leaves open, and is chosen here:
 
-- F1 is asked at `n_points` pixels spread over the animal. Each of its leaves votes for the way from the pixel to the
-  base joint and for the heading. The heading that most votes agree on is taken, then the mean-shift mode of the places
+- F1 is asked at `n_points` pixels spread over the animal. Each of its leaves votes for the way from
+  the pixel to the
+  base joint and for the heading. The heading that most votes agree on is taken, then the mean-shift
+  mode of the places
   of those votes that agree with it.
-- F2 is asked once, at the place of F1, its offsets turned by the heading of F1. Each of its trees gives one pose
-  candidate in the skeleton's own coordinates, so bones keep their proportions; the mean-shift mode of the candidates is
+- F2 is asked once, at the place of F1, its offsets turned by the heading of F1. Each of its trees
+  gives one pose
+  candidate in the skeleton's own coordinates, so bones keep their proportions; the mean-shift mode
+  of the candidates is
   the answer.
-- Offsets reach as far as the animal is long. In half of the tests tried the second of the two points is the pixel
+- Offsets reach as far as the animal is long. In half of the tests tried the second of the two
+  points is the pixel
   itself, as in Shotton's own forests.
-- F2 learns from where trees of F1 that have not seen the image put it, and from that only where F1 has not taken the
+- F2 learns from where trees of F1 that have not seen the image put it, and from that only where F1
+  has not taken the
   tail for the head.
 """
 
@@ -50,8 +58,9 @@ _LEAST_LEVER = (
 
 @dataclass(frozen=True)
 class ForestPlan:
-    """How the two forests grow. training_points: pixels of an image that F1 learns from, and n_points that it is asked
-    at; draws: times that F2 sees each image, from other pixels; bandwidths (2) of the modes, of the animal's length.
+    """How the two forests grow. training_points: pixels of an image that F1 learns from, and
+    n_points that it is asked at; draws: times that F2 sees each image, from other pixels;
+    bandwidths (2) of the modes, of the animal's length.
     """
 
     where: GrowthPlan = _F1
@@ -64,8 +73,8 @@ class ForestPlan:
 
 @dataclass(frozen=True)
 class RegressionForest:
-    """The trained pair. where: F1, leaves (5): way to the base mm, heading; pose: F2, leaves (D): skeleton coordinates
-    in lever units.
+    """The trained pair. where: F1, leaves (5): way to the base mm, heading; pose: F2, leaves (D):
+    skeleton coordinates in lever units.
     """
 
     skeleton: Skeleton
@@ -82,7 +91,8 @@ class RegressionForest:
     ) -> Guesses:
         """Joints of frames (n, H, W) mm in the camera frame."""
         crops, looks = see(depths, scene, parallel)
-        s, n = self.skeleton, len(looks)
+        s = self.skeleton
+        n = len(looks)
         joints = np.full((n, s.n_joints, 3), np.nan)
         with threads(parallel):
             kernels.guess_all(
@@ -108,7 +118,9 @@ class RegressionForest:
         return Guesses(in_camera_frame(joints, looks), crops.found, crops)
 
     def to_bytes(self) -> bytes:
-        """The model as the bytes of an .npz without pickle; skeleton and plan are known to who asks for it."""
+        """The model as the bytes of an .npz without pickle; skeleton and plan are known to who asks
+        for it.
+        """
         arrays: dict[str, Any] = {}
         for name, forest in (("where", self.where), ("pose", self.pose)):
             arrays |= {
@@ -135,10 +147,12 @@ class RegressionForest:
 
 
 def levers(skeleton: Skeleton) -> Array:
-    """How far (D,) mm a unit of each coordinate of F2 moves the joints of the home pose, root mean square over joints.
+    """How far (D,) mm a unit of each coordinate of F2 moves the joints of the home pose, root mean
+    square over joints.
 
-    Coordinates: the base's rotation about x, y, z (rad), its translation (mm, lever 1), log scale, then the angles
-    about the other joints' free axes in the skeleton's order. One unit of label is then about one millimetre of error.
+    Coordinates: the base's rotation about x, y, z (rad), its translation (mm, lever 1), log scale,
+    then the angles about the other joints' free axes in the skeleton's order. One unit of label is
+    then about one millimetre of error.
     """
     rotations, positions = forward_kinematics(
         skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(())
@@ -164,7 +178,9 @@ def levers(skeleton: Skeleton) -> Array:
 def coordinates(
     data: TrainingSet, skeleton: Skeleton, image: NDArray[np.int32], places: Array, headings: Array
 ) -> Array:
-    """True coordinates (n, D) of F2 in lever units, as seen from places (n, 3) and headings (n,) in images (n,)."""
+    """True coordinates (n, D) of F2 in lever units, as seen from places (n, 3) and headings (n,) in
+    images (n,).
+    """
     zero = np.zeros_like(headings)
     start = SE3(so3.exp(np.stack([zero, zero, headings], axis=1)), places)
     truth = data.truth
@@ -185,7 +201,8 @@ def train_forests(
     where, in_bag = _grow_where(data, skeleton, plan, rng)
     tell(0.5, "F2")
     image = np.repeat(np.flatnonzero(data.animal).astype(np.int32), plan.draws)
-    places, headings = np.empty((len(image), 3)), np.empty(len(image))
+    places = np.empty((len(image), 3))
+    headings = np.empty(len(image))
     unseen = ~in_bag.T[image]
     unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees have seen it: then all are asked
     kernels.locate_all(

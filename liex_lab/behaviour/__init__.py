@@ -1,4 +1,6 @@
-"""What the animal did: measures per frame, bouts, places and sums, and groups compared. Pandas in, pandas out."""
+"""What the animal did: measures per frame, bouts, places and sums, and groups compared. Pandas in,
+pandas out.
+"""
 
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.kinematics import kinematics

@@ -26,12 +26,14 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
     row = np.clip(np.searchsorted(edges, time_s, side="right") - 1, 0, len(edges) - 2)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
     step = kinematics["step_mm"].to_numpy(float)
-    moved, n = np.isfinite(step), len(edges) - 1
+    moved = np.isfinite(step)
+    n = len(edges) - 1
 
     def total(values: Array, mask: NDArray[np.bool_]) -> Array:
         return np.bincount(row[mask], values[mask], n).astype(float)
 
-    distance, timed = total(step, moved), total(hold, moved)
+    distance = total(step, moved)
+    timed = total(hold, moved)
     spent = {}
     for word in words:
         own = bouts[bouts["action"] == word]
@@ -53,17 +55,22 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
 
 
 def intervals(duration_s: float) -> Array:
-    """Edges (k + 1,) s of whole minutes, the last one perhaps shorter, or of a tenth of less than ten minutes."""
+    """Edges (k + 1,) s of whole minutes, the last one perhaps shorter, or of a tenth of less than
+    ten minutes.
+    """
     if duration_s < FEWEST * BIN_S:
         return np.linspace(0.0, duration_s, FEWEST + 1)
     return np.append(np.arange(0.0, duration_s - 1e-9, BIN_S), duration_s)
 
 
 def time_within(start_s: Array, stop_s: Array, edges: Array) -> Array:
-    """(k,) s of spans (n,), which do not overlap and are in order, within each interval between edges (k + 1,)."""
+    """(k,) s of spans (n,), which do not overlap and are in order, within each interval between
+    edges (k + 1,).
+    """
     if len(start_s) == 0:
         return np.zeros(len(edges) - 1)
-    # time spent in spans before each edge: a broken line through (start, so far) and (stop, so far + length)
+    # time spent in spans before each edge: a broken line through (start, so far) and (stop, so far
+    # + length)
     so_far = np.append(0.0, np.cumsum(stop_s - start_s))
     at = np.stack([start_s, stop_s], axis=1).ravel()
     spent = np.stack([so_far[:-1], so_far[1:]], axis=1).ravel()

@@ -12,14 +12,17 @@ from liex_lab.behaviour.kinematics import segments
 
 Array = NDArray[np.float64]
 
-BEFORE_S, AFTER_S = 1.0, 2.0
+BEFORE_S = 1.0
+AFTER_S = 2.0
 _STEPS = 61
 _FEWEST = 5  # bouts; of fewer no quartiles are told
 
 
 @dataclass(frozen=True)
 class Around:
-    """Times (k,) s relative to the onset; median and quartiles (k,) over the bouts; how many bouts they are."""
+    """Times (k,) s relative to the onset; median and quartiles (k,) over the bouts; how many bouts
+    they are.
+    """
 
     time_s: Array
     low: Array
@@ -31,15 +34,17 @@ class Around:
 def around_onsets(
     kinematics: pd.DataFrame, bouts: pd.DataFrame, action: str, column: str
 ) -> Around | None:
-    """`column` of the table `kinematics` around every onset of `action`; None where there are too few bouts.
+    """`column` of the table `kinematics` around every onset of `action`; None where there are too
+    few bouts.
 
-    Values are interpolated between the frames' true times, never across a gap; where a bout has no value it does not
-    count.
+    Values are interpolated between the frames' true times, never across a gap; where a bout has no
+    value it does not count.
     """
     own = bouts.loc[bouts["action"] == action, "start_s"].to_numpy(float)
     if len(own) < _FEWEST:
         return None
-    time_s, values = kinematics["time_s"].to_numpy(float), kinematics[column].to_numpy(float)
+    time_s = kinematics["time_s"].to_numpy(float)
+    values = kinematics[column].to_numpy(float)
     grid = np.linspace(-BEFORE_S, AFTER_S, _STEPS)
     wanted = own[:, None] + grid
     after = np.clip(np.searchsorted(time_s, wanted), 1, len(time_s) - 1)

@@ -1,4 +1,6 @@
-"""Which joints play which part in an animal's chain: front, rear, the axis that gives its heading."""
+"""Which joints play which part in an animal's chain: front, rear, the axis that gives its
+heading.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,10 @@ from dataclasses import dataclass
 class Body:
     """An animal's joints by the parts they play, as places in its skeleton.
 
-    swims: the chain begins at the head, as a fish's does, and the animal moves in all three directions. spine: the
-    chain from front to rear. axis: (from, to), the line whose direction is the heading. trunk: the joints whose mean is
-    the body's centre. back: those between front and rear.
+    swims: the chain begins at the head, as a fish's does, and the animal moves in all three
+    directions. spine: the chain from front to rear. axis: (from, to), the line whose direction is
+    the heading. trunk: the joints whose mean is the body's centre. back: those between front and
+    rear.
     """
 
     joints: tuple[str, ...]
@@ -38,12 +41,15 @@ class Body:
 
     @staticmethod
     def of(joints: Sequence[str]) -> Body:
-        """The parts by name or along the chain: one that begins at a head swims; any other begins at the rump.
+        """The parts by name or along the chain: one that begins at a head swims; any other begins
+        at the rump.
 
-        A swimming body's heading is that of the front quarter of its chain, which is stiff, and its centre that of the
-        front half, which the tail's beat hardly moves; a walking body's are rump to neck, and all but the nose.
+        A swimming body's heading is that of the front quarter of its chain, which is stiff, and its
+        centre that of the front half, which the tail's beat hardly moves; a walking body's are rump
+        to neck, and all but the nose.
         """
-        names, n = tuple(joints), len(joints)
+        names = tuple(joints)
+        n = len(joints)
         if names[0] == "head":
             half = tuple(range(n // 2 + 1))
             return Body(names, True, tuple(range(n)), (min(max(n // 4, 1), n - 1), 0), half)

@@ -1,8 +1,9 @@
-"""Named stretches of behaviour by rule: rear, run, walk, pause. A thin first ethogram for the mouse.
+"""Named stretches of behaviour by rule: rear, run, walk, pause. A thin first ethogram for the
+mouse.
 
-One label per frame, half-open bouts, never across a gap. For every action: hysteresis, then interruptions shorter than
-`merge_pauses_s` are bridged, then bouts shorter than `min_bout_s` are dropped; where two actions claim a frame the
-first of `ACTIONS` has it.
+One label per frame, half-open bouts, never across a gap. For every action: hysteresis, then
+interruptions shorter than `merge_pauses_s` are bridged, then bouts shorter than `min_bout_s` are
+dropped; where two actions claim a frame the first of `ACTIONS` has it.
 """
 
 from __future__ import annotations
@@ -27,10 +28,12 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MouseRules:
-    """Thresholds of the first ethogram, by the names they have in a plan: `MouseRules(**plan.behaviour.model_dump())`.
+    """Thresholds of the first ethogram, by the names they have in a plan:
+    `MouseRules(**plan.behaviour.model_dump())`.
 
-    Starting values: Live Mouse Tracker's. Its 40 mm of rearing belong to an adult of some 90 mm; a smaller animal rears
-    from 0.6 of its own length on. A bout of rearing reaches to where the nose is below two thirds of that height.
+    Starting values: Live Mouse Tracker's. Its 40 mm of rearing belong to an adult of some 90 mm; a
+    smaller animal rears from 0.6 of its own length on. A bout of rearing reaches to where the nose
+    is below two thirds of that height.
     """
 
     speed_half_window_s: float = 0.034
@@ -47,16 +50,22 @@ class MouseRules:
     min_bout_s: float = 0.23
 
     def rear_mm(self, spine_mm: float) -> float:
-        """How much higher than the tail's base the nose of an animal of this length is when it rears."""
+        """How much higher than the tail's base the nose of an animal of this length is when it
+        rears.
+        """
         return min(self.rear_height_mm, self.rear_height_bl * spine_mm)
 
     def definitions(self) -> dict[str, str]:
         """What each word of `ACTIONS` means with these numbers."""
-        walk, run = f"{self.pause_below_mm_s:g} mm/s", f"{self.run_above_mm_s:g} mm/s"
+        walk = f"{self.pause_below_mm_s:g} mm/s"
+        run = f"{self.run_above_mm_s:g} mm/s"
         return {
-            "rear": f"the nose is {self.rear_height_mm:g} mm or more above the tail's base, or {self.rear_height_bl:g} "
-            f"body lengths for an animal shorter than {self.rear_height_mm / self.rear_height_bl:.0f} mm; rising and "
-            f"descending belong to it, down to {self.rear_leave:.0%} of that height",
+            "rear": (
+                f"the nose is {self.rear_height_mm:g} mm or more above the tail's base, or "
+                f"{self.rear_height_bl:g} body lengths for an animal shorter than "
+                f"{self.rear_height_mm / self.rear_height_bl:.0f} mm; rising and descending "
+                f"belong to it, down to {self.rear_leave:.0%} of that height"
+            ),
             "run": f"the body's centre moves faster than {run}",
             "walk": f"the body's centre moves at {walk} to {run}",
             "pause": f"the body's centre moves slower than {walk}",
@@ -89,7 +98,9 @@ def find_bouts(
 def raw_labels(
     kinematics: pd.DataFrame, spine_mm: float, number: NDArray[np.int64], rules: MouseRules
 ) -> dict[str, Mask]:
-    """(n,) per action: the frames that satisfy its rule, with hysteresis inside each unbroken stretch."""
+    """(n,) per action: the frames that satisfy its rule, with hysteresis inside each unbroken
+    stretch.
+    """
     speed = kinematics["speed_mm_s"].to_numpy(float)
     slope = (
         kinematics["nose_over_rump_mm"].to_numpy(float)
@@ -97,7 +108,8 @@ def raw_labels(
         else speed * np.nan
     )
     rear_mm = rules.rear_mm(spine_mm)
-    low, high = 1.0 - rules.speed_hysteresis, 1.0 + rules.speed_hysteresis
+    low = 1.0 - rules.speed_hysteresis
+    high = 1.0 + rules.speed_hysteresis
     moving = hysteresis(speed, rules.pause_below_mm_s * high, rules.pause_below_mm_s * low, number)
     running = hysteresis(speed, rules.run_above_mm_s * high, rules.run_above_mm_s * low, number)
     known = np.isfinite(speed)
@@ -110,11 +122,14 @@ def raw_labels(
 
 
 def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int64]) -> Mask:
-    """(n,) True from where `values` reach `enter` until they fall below `leave`, afresh in every stretch `number`.
+    """(n,) True from where `values` reach `enter` until they fall below `leave`, afresh in every
+    stretch `number`.
 
-    Rising belongs to it: the frames between `leave` and `enter` just before the threshold is reached count as well.
+    Rising belongs to it: the frames between `leave` and `enter` just before the threshold is
+    reached count as well.
     """
-    high, inside = values >= enter, values >= leave
+    high = values >= enter
+    inside = values >= leave
     out = np.zeros(len(values), bool)
     group = np.where(
         inside, number, -1 - number
@@ -132,7 +147,9 @@ def tidy(
     stop_s: Array,
     rules: MouseRules,
 ) -> Iterator[tuple[int, int]]:
-    """Bouts (start, stop) of a rule's frames: short pauses bridged over free frames, then short bouts dropped."""
+    """Bouts (start, stop) of a rule's frames: short pauses bridged over free frames, then short
+    bouts dropped.
+    """
     merged: list[tuple[int, int]] = []
     for start, stop, which in stretches(np.where(mask, number, -1)):
         if which < 0:
@@ -157,10 +174,8 @@ def _table(
     stop_s: Array,
 ) -> pd.DataFrame:
     """One row per run of equal labels inside one stretch."""
-    time_s, count = (
-        kinematics["time_s"].to_numpy(float),
-        frame_count(kinematics["frame_index"].to_numpy()),
-    )
+    time_s = kinematics["time_s"].to_numpy(float)
+    count = frame_count(kinematics["frame_index"].to_numpy())
     code = {action: k for k, action in enumerate(ACTIONS)}
     runs = np.array([code.get(word, -1) for word in label], np.int64)
     pieces = [

@@ -1,7 +1,8 @@
-"""Groups compared: from one row per session to one row per measure and contrast, with n at every level.
+"""Groups compared: from one row per session to one row per measure and contrast, with n at every
+level.
 
-Every measure that was asked for is in the table, significant or not, tested or refused. The false discovery rate is
-that of the whole table.
+Every measure that was asked for is in the table, significant or not, tested or refused. The false
+discovery rate is that of the whole table.
 """
 
 from __future__ import annotations
@@ -95,7 +96,9 @@ STATS: tuple[Column, ...] = columns(
 
 
 def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
-    """One row per session and animal: who it is (the table `sessions`), its summary, its number of bouts."""
+    """One row per session and animal: who it is (the table `sessions`), its summary, its number of
+    bouts.
+    """
     rows = []
     for session in sessions:
         who = session.table("sessions")
@@ -109,7 +112,9 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
-    """What is compared when nobody says: the usual ones that have values, and every action's share."""
+    """What is compared when nobody says: the usual ones that have values, and every
+    action's share.
+    """
     shares = [
         str(name)
         for name in table.columns
@@ -130,11 +135,12 @@ def compare(
     family: str = "all measures and contrasts",
     seed: int = 0,
 ) -> pd.DataFrame:
-    """The table `stats` from one row per session (see `collect`): every measure, every pair of groups.
+    """The table `stats` from one row per session (see `collect`): every measure, every pair of
+    groups.
 
-    reference: compare each group with this one only. engine: permutation, mixed, or auto, which takes the mixed model
-    where something is nested, there are `FEWEST_FOR_MODEL` units in each group and its variance is not zero. blocks:
-    columns within which animals are exchanged.
+    reference: compare each group with this one only. engine: permutation, mixed, or auto, which
+    takes the mixed model where something is nested, there are `FEWEST_FOR_MODEL` units in each
+    group and its variance is not zero. blocks: columns within which animals are exchanged.
     """
     table = _prepared(table, blocks)
     groups = sorted(set(table["group"]) - {""})
@@ -271,7 +277,10 @@ def _tested(
         model = mixed_model(rows, units, groups)
         if model is not None:
             what = "the animals' means" if model.random == CAGE else "the sessions' values"
-            name = f"mixed model of {what}, random intercept per {model.random}, t with units - 2 degrees of freedom"
+            name = (
+                f"mixed model of {what}, random intercept per {model.random}, t with units - 2 "
+                "degrees of freedom"
+            )
             return {"p": model.p, "test": name, **_sized(model.found, rows, groups)}
     check_reachable(units, alpha)
     within = ""
@@ -283,7 +292,8 @@ def _tested(
 
 def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
     """A sentence or three for a methods section, from the table `stats`."""
-    done, refused = stats[stats["test"] != ""], stats[stats["refused"] != ""]
+    done = stats[stats["test"] != ""]
+    refused = stats[stats["refused"] != ""]
     if len(stats) == 0:
         return ""
     units = ", ".join(sorted(set(done["unit"])))
@@ -294,9 +304,10 @@ def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
         else ""
     ) + (f"Tests: {tests}. " if tests else "")
     text += (
-        "Differences are given with 95 % intervals, and as Hedges' g relative to the standard deviation between "
-        f"animals. p values are two-sided and corrected by Benjamini and Hochberg's procedure over {len(done)} tests "
-        f"(family: {stats['family'].iloc[0]}); {alpha:g} was taken as the limit."
+        "Differences are given with 95 % intervals, and as Hedges' g relative to the standard "
+        "deviation between animals. p values are two-sided and corrected by Benjamini and "
+        f"Hochberg's procedure over {len(done)} tests (family: {stats['family'].iloc[0]}); "
+        f"{alpha:g} was taken as the limit."
     )
     if len(refused):
         text += f" {len(refused)} comparisons were not tested, as the design does not allow it."

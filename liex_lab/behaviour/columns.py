@@ -1,4 +1,6 @@
-"""The columns per frame and per bout: unit, meaning, formula, source, listed once. Writers and readers share them."""
+"""The columns per frame and per bout: unit, meaning, formula, source, listed once. Writers and
+readers share them.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +37,9 @@ KINEMATICS: tuple[Column, ...] = columns(
         "speed_mm_s",
         "float64",
         "mm/s",
-        "speed of the body centre: over the floor for an animal that stands on it, in "
-        "space for one that swims; never taken across a gap; faster than the plan's behaviour.impossible_above_mm_s it is "
-        "an error and left empty",
+        "speed of the body centre: over the floor for an animal that stands on it, in space for "
+        "one that swims; never taken across a gap; faster than the plan's "
+        "behaviour.impossible_above_mm_s it is an error and left empty",
         "|p(t + h) - p(t - h)| over the true time between the two frames, h the plan's "
         "behaviour.speed_half_window_s",
         LMT,
@@ -83,9 +85,9 @@ KINEMATICS: tuple[Column, ...] = columns(
         "heading_rad",
         "float64",
         "rad",
-        "direction from rump to neck (of a swimming animal, along its front quarter to "
-        "the head) on the floor, 0 along x, counter-clockwise seen from above; empty when the body stands steeper than 75 "
-        "degrees",
+        "direction from rump to neck (of a swimming animal, along its front quarter to the head) "
+        "on the floor, 0 along x, counter-clockwise seen from above; empty when the body stands "
+        "steeper than 75 degrees",
         "atan2(dy, dx)",
     ),
     (
@@ -438,7 +440,8 @@ SWIMMING_BOUTS: tuple[Column, ...] = columns(
         "float64",
         "mm/s",
         "speed of the wave of curvature that runs down the body",
-        "a third of the length / the lag from bend_middle_rad to bend_rear_rad at which they agree best",
+        "a third of the length / the lag from bend_middle_rad to bend_rear_rad at which they "
+        "agree best",
         OWN,
     ),
 )

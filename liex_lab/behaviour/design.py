@@ -1,8 +1,10 @@
-"""How animals came to their groups, read from who is where; and whether that allows a comparison at all.
+"""How animals came to their groups, read from who is where; and whether that allows a comparison at
+all.
 
-What was assigned to a group is what a test may shuffle: whole cages where every cage is of one group, animals within
-their cage where a cage holds both groups, animals where nothing is known of cages, and the two halves of an animal's
-own sessions where every animal was in both groups. Sessions and bouts are never units.
+What was assigned to a group is what a test may shuffle: whole cages where every cage is of one
+group, animals within their cage where a cage holds both groups, animals where nothing is known of
+cages, and the two halves of an animal's own sessions where every animal was in both groups.
+Sessions and bouts are never units.
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ class NotComparable(Exception):
 
 @dataclass(frozen=True)
 class Units:
-    """The units of one comparison: values (n,), whether each is of the second group (n,), its block (n,).
+    """The units of one comparison: values (n,), whether each is of the second group (n,), its block
+    (n,).
 
-    unit: cage, animal, or animal's own difference (values are then second minus first, `second` is all True). parent
-    (n,): for units that are animals within cages, their cage. n_animals (n,): animals that each value stands for.
+    unit: cage, animal, or animal's own difference (values are then second minus first, `second` is
+    all True). parent (n,): for units that are animals within cages, their cage. n_animals (n,):
+    animals that each value stands for.
     """
 
     unit: str
@@ -42,7 +46,9 @@ class Units:
         return self.unit == PAIRED
 
 
-CAGE, ANIMAL, PAIRED = "cage", "animal", "animal, in both groups"
+CAGE = "cage"
+ANIMAL = "animal"
+PAIRED = "animal, in both groups"
 
 
 def find_units(
@@ -50,14 +56,15 @@ def find_units(
 ) -> Units:
     """The units of a comparison of two groups from one row per session.
 
-    rows: subject_id, group, cage, value and the columns named in `blocks`; an empty cage or block is not known.
-    Raises NotComparable.
+    rows: subject_id, group, cage, value and the columns named in `blocks`; an empty cage or block
+    is not known. Raises NotComparable.
     """
     rows = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
     nameless = int((rows["subject_id"] == "").sum())
     if nameless:
         raise NotComparable(
-            f"{nameless} sessions do not say which animal they are of; state subject_id in the study"
+            f"{nameless} sessions do not say which animal they are of; state subject_id in the "
+            "study"
         )
     of_animal = rows.groupby("subject_id")["group"].nunique()
     both = [str(name) for name in of_animal.index[of_animal > 1]]
@@ -65,8 +72,8 @@ def find_units(
         return _own_differences(rows, groups)
     if both:
         raise NotComparable(
-            f"{len(both)} of {len(of_animal)} animals ({', '.join(both[:3])}) were in both groups and the others in "
-            "one; compare those within themselves, or the others with each other"
+            f"{len(both)} of {len(of_animal)} animals ({', '.join(both[:3])}) were in both groups "
+            "and the others in one; compare those within themselves, or the others with each other"
         )
     animals = _animals(rows, blocks)
     second = (animals["group"] == groups[1]).to_numpy()
@@ -111,7 +118,8 @@ def _check_cages(cage: NDArray[np.str_]) -> None:
     unknown = int((cage == "").sum())
     if 0 < unknown < len(cage):
         raise NotComparable(
-            f"the cage of {unknown} of {len(cage)} animals is not stated; state it for all, or for none"
+            f"the cage of {unknown} of {len(cage)} animals is not stated; state it for all, or for "
+            "none"
         )
 
 
@@ -125,7 +133,8 @@ def _blocks(
 ) -> NDArray[np.int64]:
     """(n,) the block of each animal: what it may be exchanged within.
 
-    A block of one group is no use; if all are so, group and block cannot be told apart, and the comparison is refused.
+    A block of one group is no use; if all are so, group and block cannot be told apart, and the
+    comparison is refused.
     """
     known = [
         name
@@ -141,8 +150,8 @@ def _blocks(
         0 < second[block == b].sum() < (block == b).sum() for b in np.unique(block)
     ):
         raise NotComparable(
-            f"every {' and '.join(known)} has animals of one group only, so a difference may be that of the "
-            f"{known[0]}; record both groups in each"
+            f"every {' and '.join(known)} has animals of one group only, so a difference may be "
+            f"that of the {known[0]}; record both groups in each"
         )
     return block
 
@@ -171,7 +180,9 @@ def _whole_cages(
 
 
 def _own_differences(rows: pd.DataFrame, groups: tuple[str, str]) -> Units:
-    """One value per animal: the mean of its sessions in the second group minus that of those in the first."""
+    """One value per animal: the mean of its sessions in the second group minus that of those in the
+    first.
+    """
     means = rows.groupby(["subject_id", "group"])["value"].mean().unstack("group")
     values = (means[groups[1]] - means[groups[0]]).to_numpy(float)
     if len(values) < 2:

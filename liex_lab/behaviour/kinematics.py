@@ -1,8 +1,10 @@
-"""What a body does from frame to frame: speed, heading, turning, heights, curvature. Pandas in, pandas out.
+"""What a body does from frame to frame: speed, heading, turning, heights, curvature. Pandas in,
+pandas out.
 
-Every derivative is taken over the frames' true times and never across a gap, and carries the standard deviation that
-follows from the joints' own. Errors of the joints of one frame are taken as one common error (the body is off as a
-whole), those of the two ends of a line as independent, and an error as lasting for `ERROR_LASTS_S`.
+Every derivative is taken over the frames' true times and never across a gap, and carries the
+standard deviation that follows from the joints' own. Errors of the joints of one frame are taken as
+one common error (the body is off as a whole), those of the two ends of a line as independent, and
+an error as lasting for `ERROR_LASTS_S`.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ HALF_WINDOW_S = (
     0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
 )
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
-ERROR_LASTS_S = 0.3  # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
+# after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
+ERROR_LASTS_S = 0.3
 _BLOCK = 16_384  # frames whose postures are in memory at a time
 _MOVING = (
     "x_mm",
@@ -63,8 +66,8 @@ STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direct
 
 @dataclass(frozen=True)
 class Spans:
-    """Which frames a derivative at each of some frames `rows` (m) is taken between, and the time from one to the other,
-    s. What it is taken of are always the values of all frames (n).
+    """Which frames a derivative at each of some frames `rows` (m) is taken between, and the time
+    from one to the other, s. What it is taken of are always the values of all frames (n).
     """
 
     before: Rows
@@ -74,7 +77,9 @@ class Spans:
 
     @staticmethod
     def of(time_s: Array, observed: NDArray[np.bool_], half_window_s: float) -> Spans:
-        """The neighbours about `half_window_s` away; a frame that stands alone has an empty span."""
+        """The neighbours about `half_window_s` away; a frame that stands alone has an empty
+        span.
+        """
         before, after = neighbours(time_s, observed, half_window_s)
         span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
         return Spans(before, after, span_s, slice(None))
@@ -95,8 +100,11 @@ class Spans:
         return np.asarray(turn / self.span_s)
 
     def sd(self, sd: Array) -> Array:
-        """(m,) standard deviation of the rate of values with these (n,); the nearer two frames, the more they agree."""
-        first, second = sd[self.before], sd[self.after]
+        """(m,) standard deviation of the rate of values with these (n,); the nearer two frames, the
+        more they agree.
+        """
+        first = sd[self.before]
+        second = sd[self.after]
         shared = np.exp(-self.span_s / ERROR_LASTS_S)
         return np.asarray(
             np.sqrt(first**2 + second**2 - 2.0 * shared * first * second) / self.span_s
@@ -111,10 +119,11 @@ def kinematics(
     surface_z_mm: float | None = None,
     room: Room = np.empty,
 ) -> pd.DataFrame:
-    """The table `kinematics` from the tables `frames` and `poses` (or its joints) of one animal: one row per frame.
+    """The table `kinematics` from the tables `frames` and `poses` (or its joints) of one animal:
+    one row per frame.
 
-    surface_z_mm: height of the water's surface above the floor, for an animal that swims. room: where its columns are
-    to lie.
+    surface_z_mm: height of the water's surface above the floor, for an animal that swims. room:
+    where its columns are to lie.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = Body.of(joints.names)
@@ -141,7 +150,9 @@ def kinematics(
 
 
 def _frame_by_frame(body: Body, joints: Joints, room: Room) -> tuple[Shape, dict[str, Array]]:
-    """What each frame tells by itself, and of an animal that stands its heights; a block of frames is in memory."""
+    """What each frame tells by itself, and of an animal that stands its heights; a block of frames
+    is in memory.
+    """
     shape = Shape.empty(joints.n_frames, room)
     heights = {} if body.swims else {name: room((joints.n_frames,), float) for name in _HEIGHTS}
     for rows in blocks(joints.n_frames, _BLOCK):
@@ -177,7 +188,8 @@ def _moving(
         columns[name] for name in ("speed_mm_s", "speed_sd_mm_s", "heading_rad", "heading_sd_rad")
     )
     for rows in blocks(len(hold_s), _BLOCK):
-        centre, velocity = shape.centre[rows], spans[rows].rate(shape.centre)
+        centre = shape.centre[rows]
+        velocity = spans[rows].rate(shape.centre)
         fast = np.linalg.norm(velocity if swims else velocity[:, :2], axis=1)
         speed[rows] = np.where(fast > impossible_above_mm_s, np.nan, fast)
         speed_sd[rows] = spans[rows].sd(shape.centre_sd)
@@ -218,7 +230,8 @@ def _moving(
 
 def _walking(body: Body, xyz: Array, sd: Array) -> dict[str, Array]:
     """Heights of an animal that stands on the floor."""
-    nose, rump = xyz[:, body.front], xyz[:, body.rear]
+    nose = xyz[:, body.front]
+    rump = xyz[:, body.rear]
     return {
         "nose_height_mm": nose[:, 2],
         "nose_height_sd_mm": sd[:, body.front],
@@ -250,8 +263,8 @@ def _swimming(
 
 @dataclass(frozen=True)
 class Joints:
-    """The joints of n frames: their names; at: positions (m, J, 3) mm in the arena of some frames and the sd (m, J) mm
-    along an axis, NaN where they are not known.
+    """The joints of n frames: their names; at: positions (m, J, 3) mm in the arena of some frames
+    and the sd (m, J) mm along an axis, NaN where they are not known.
     """
 
     names: list[str]
@@ -295,12 +308,16 @@ class Joints:
 
 
 def _apart(xyz: Sequence[Array]) -> Array:
-    """Three coordinates (m, J) as (m, J, 3), each by itself in memory: sums over joints then have the same bits."""
+    """Three coordinates (m, J) as (m, J, 3), each by itself in memory: sums over joints then have
+    the same bits.
+    """
     return np.moveaxis(np.stack(xyz), 0, -1)
 
 
 def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
-    """(n,) the number of the unbroken stretch each frame belongs to: no missing frame, no lost animal inside."""
+    """(n,) the number of the unbroken stretch each frame belongs to: no missing frame, no lost
+    animal inside.
+    """
     broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[
         : len(time_s)
     ]
@@ -310,11 +327,14 @@ def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
 def neighbours(
     time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S
 ) -> tuple[Rows, Rows]:
-    """(n,) rows to difference between: about `half_window_s` before and after, never outside the frame's own stretch.
+    """(n,) rows to difference between: about `half_window_s` before and after, never outside the
+    frame's own stretch.
 
-    At the ends of a stretch the difference is one-sided; a stretch of one frame has none (before == after).
+    At the ends of a stretch the difference is one-sided; a stretch of one frame has none (before ==
+    after).
     """
-    n, rows = len(time_s), np.arange(len(time_s))
+    n = len(time_s)
+    rows = np.arange(len(time_s))
     reach = (
         0.75 * half_window_s
     )  # at the camera's own rate the next frame counts, jitter of its clock or not

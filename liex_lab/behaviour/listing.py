@@ -1,4 +1,5 @@
-"""The columns that a reader is told of first: README.md's list is printed from the columns' own descriptions.
+"""The columns that a reader is told of first: README.md's list is printed from the columns' own
+descriptions.
 
 `python -m liex_lab.behaviour.listing` prints it; a test holds README.md to it.
 """

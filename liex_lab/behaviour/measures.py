@@ -22,9 +22,11 @@ _LEAST_CORRELATION = (
 
 
 def measure_bouts(bouts: pd.DataFrame, kinematics: pd.DataFrame) -> pd.DataFrame:
-    """The table `bouts` with its measures: `bouts` needs the columns of `tables.BOUTS`, others of it are replaced.
+    """The table `bouts` with its measures: `bouts` needs the columns of `tables.BOUTS`, others of
+    it are replaced.
 
-    What a camera of this frame rate cannot measure is left empty (see unreliable_below_fps in columns.json).
+    What a camera of this frame rate cannot measure is left empty (see unreliable_below_fps in
+    columns.json).
     """
     swims = "tail_angle_rad" in kinematics
     described = bout_columns(swims)
@@ -76,11 +78,14 @@ class BoutReader:
         return {**found, **(self._tail(start, stop) if self.swims else self._height(start, stop))}
 
     def since_last(self, bouts: pd.DataFrame, spans: Sequence[tuple[int, int]]) -> Array:
-        """(n,) s from the end of the last bout of the same action, where the animal was in sight all the time."""
+        """(n,) s from the end of the last bout of the same action, where the animal was in sight
+        all the time.
+        """
         number = segments(self.time_s, np.isfinite(self.place[:, 0]))
         last: dict[str, int] = {}
         out = np.full(len(bouts), np.nan)
-        begin, end = bouts["start_s"].to_numpy(float), bouts["stop_s"].to_numpy(float)
+        begin = bouts["start_s"].to_numpy(float)
+        end = bouts["stop_s"].to_numpy(float)
         for k, action in enumerate(bouts["action"]):
             before = last.get(action)
             if (
@@ -100,9 +105,11 @@ class BoutReader:
         return self._columns[name][start:stop]
 
     def _way(self, start: int, stop: int) -> dict[str, float]:
-        speed, step = self._cut("speed_mm_s", start, stop), self._cut("step_mm", start, stop)
+        speed = self._cut("speed_mm_s", start, stop)
+        step = self._cut("step_mm", start, stop)
         known = np.flatnonzero(np.isfinite(speed))
-        path, timed = float(np.nansum(step)), float(self.hold_s[start:stop][known].sum())
+        path = float(np.nansum(step))
+        timed = float(self.hold_s[start:stop][known].sum())
         seen = start + np.flatnonzero(np.isfinite(self.place[start:stop, 0]))
         off = self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
         top = known[speed[known].argmax()] if len(known) else None
@@ -122,13 +129,12 @@ class BoutReader:
         }
 
     def _turn(self, start: int, stop: int) -> dict[str, float]:
-        heading, sd = (
-            self._cut("heading_rad", start, stop),
-            self._cut("heading_sd_rad", start, stop),
-        )
+        heading = self._cut("heading_rad", start, stop)
+        sd = self._cut("heading_sd_rad", start, stop)
         known = np.isfinite(heading)
         way = np.append(0.0, np.cumsum(smallest_turn(np.diff(heading[known]))))
-        pitch, bend = self._cut("body_pitch_rad", start, stop), self._cut("bend_rad", start, stop)
+        pitch = self._cut("body_pitch_rad", start, stop)
+        bend = self._cut("bend_rad", start, stop)
         some = bool(known.any())
         ends = sd[known][[0, -1]] if some else np.full(2, np.nan)
         return {
@@ -151,15 +157,16 @@ class BoutReader:
         }
 
     def _tail(self, start: int, stop: int) -> dict[str, float]:
-        angle, bends = (
-            self._cut("tail_angle_rad", start, stop),
-            self._cut("tail_extreme_rad", start, stop),
-        )
-        beat, hold = self._cut("tail_beat_hz", start, stop), self.hold_s[start:stop]
+        angle = self._cut("tail_angle_rad", start, stop)
+        bends = self._cut("tail_extreme_rad", start, stop)
+        beat = self._cut("tail_beat_hz", start, stop)
+        hold = self.hold_s[start:stop]
         at = np.flatnonzero(np.isfinite(bends))
-        size, n = np.abs(bends[at]), len(at)
+        size = np.abs(bends[at])
+        n = len(at)
         duration = float(self.time_s[stop - 1] + hold[-1] - self.time_s[start])
-        left, right = max(_max(angle), 0.0), max(_max(-angle), 0.0)
+        left = max(_max(angle), 0.0)
+        right = max(_max(-angle), 0.0)
         return {
             "n_bends": n,
             "n_oscillations": n / 2.0,

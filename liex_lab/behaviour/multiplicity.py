@@ -7,7 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def false_discovery(p: ArrayLike) -> NDArray[np.float64]:
-    """Benjamini and Hochberg's corrected p of a family of tests (n,); NaN, a test not done, is not of the family."""
+    """Benjamini and Hochberg's corrected p of a family of tests (n,); NaN, a test not done, is not
+    of the family.
+    """
     values = np.asarray(p, float)
     out = np.full(values.shape, np.nan)
     known = np.flatnonzero(np.isfinite(values))

@@ -23,7 +23,9 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is around the animal: the arena's shape, the zones' names, the height of the water's surface, mm."""
+    """What is around the animal: the arena's shape, the zones' names, the height of the water's
+    surface, mm.
+    """
 
     arena: Arena = UNKNOWN
     zones: Sequence[str] = field(default=())
@@ -31,7 +33,9 @@ class Surroundings:
 
 
 def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> float | None:
-    """Height of the water's surface above the floor, from what session.json says of camera and optics."""
+    """Height of the water's surface above the floor, from what session.json says of camera and
+    optics.
+    """
     water = optics.get("water")
     if not isinstance(water, dict) or not water.get("height_mm"):
         return None
@@ -87,7 +91,9 @@ def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
 
 
 def outer_margin_mm(arena: Arena) -> float:
-    """How wide the border along the walls is that takes half of the floor's area; NaN for an unknown shape."""
+    """How wide the border along the walls is that takes half of the floor's area; NaN for an
+    unknown shape.
+    """
     if arena.radius_mm is not None:
         return float(arena.radius_mm * (1.0 - np.sqrt(0.5)))
     if arena.half_mm is not None:
@@ -97,7 +103,9 @@ def outer_margin_mm(arena: Arena) -> float:
 
 
 def place_measures(frames: pd.DataFrame, hold: Array, arena: Arena) -> dict[str, float]:
-    """Distance from the walls; hold (n,) s is how long each observed frame counts, 0 for the others."""
+    """Distance from the walls; hold (n,) s is how long each observed frame counts, 0 for the
+    others.
+    """
     wall = (
         frames["wall_distance_mm"].to_numpy(float)
         if "wall_distance_mm" in frames
@@ -121,7 +129,8 @@ def depth_measures(
     kinematics: pd.DataFrame, hold: Array, surface_z_mm: float | None
 ) -> dict[str, float]:
     """Where in the water the animal was."""
-    z, time_s = kinematics["z_mm"].to_numpy(float), kinematics["time_s"].to_numpy(float)
+    z = kinematics["z_mm"].to_numpy(float)
+    time_s = kinematics["time_s"].to_numpy(float)
     known = np.isfinite(z)
     total = float(hold[known].sum())
     out = {

@@ -1,8 +1,9 @@
 """The shape of a chain of joints in each frame: axis, length, bend and curvature.
 
-A bend is measured in the animal's own frontal plane: the one through its axis and the horizontal, as if it did not
-roll. Positive bends are towards the animal's left. What "the bend of a body" is differs between publications by a
-factor of two and more; here it is the whole turn from the direction of the front bone to that of the rear one.
+A bend is measured in the animal's own frontal plane: the one through its axis and the horizontal,
+as if it did not roll. Positive bends are towards the animal's left. What "the bend of a body" is
+differs between publications by a factor of two and more; here it is the whole turn from the
+direction of the front bone to that of the rear one.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Posture:
-    """A body (n frames) by its joints `spine` (n, K, 3) mm, front to rear, with their sd (n, K) mm along an axis.
+    """A body (n frames) by its joints `spine` (n, K, 3) mm, front to rear, with their sd (n, K) mm
+    along an axis.
 
-    centre (n, 3) mm and its sd (n,); axis (n, 3) mm, the line whose direction is the heading, and the sd (n,) of the
-    difference of its ends.
+    centre (n, 3) mm and its sd (n,); axis (n, 3) mm, the line whose direction is the heading, and
+    the sd (n,) of the difference of its ends.
     """
 
     body: Body
@@ -66,7 +68,9 @@ class Posture:
 
     @cached_property
     def heading_sd_rad(self) -> Array:
-        """(n,) standard deviation of the heading; of a direction that is not known at all it is no more than that."""
+        """(n,) standard deviation of the heading; of a direction that is not known at all it is no
+        more than that.
+        """
         return np.asarray(np.minimum(self.axis_sd / _positive(self._reach), np.pi / np.sqrt(3.0)))
 
     @cached_property
@@ -83,10 +87,14 @@ class Posture:
 
     @cached_property
     def turns_rad(self) -> Array:
-        """(n, K - 2) by how much the chain turns at each inner joint, front to rear; positive to the left."""
+        """(n, K - 2) by how much the chain turns at each inner joint, front to rear; positive to
+        the left.
+        """
         bones = np.diff(self.spine, axis=1)
-        a, b = bones[:, :-1], bones[:, 1:]
-        # the bones point backwards: a chain whose tail is on its left turns clockwise from front to rear
+        a = bones[:, :-1]
+        b = bones[:, 1:]
+        # the bones point backwards: a chain whose tail is on its left turns clockwise from front to
+        # rear
         across = -np.einsum("nki,ni->nk", np.cross(a, b), self._dorsal)
         return np.asarray(np.arctan2(across, np.einsum("nki,nki->nk", a, b)))
 
@@ -105,7 +113,9 @@ class Posture:
         return self.spine_sd[:, -1]
 
     def thirds_rad(self) -> tuple[Array, Array, Array]:
-        """(n,) each: by how much the front, middle and rear third of the chain turns; positive to the left."""
+        """(n,) each: by how much the front, middle and rear third of the chain turns; positive to
+        the left.
+        """
         inner = self.turns_rad.shape[1]
         third = 3 * np.arange(1, inner + 1) // (inner + 1)
         front, middle, rear = (self.turns_rad[:, third == k].sum(axis=1) for k in range(3))
@@ -113,12 +123,16 @@ class Posture:
 
     @cached_property
     def tail_mm(self) -> Array:
-        """(n,) how far the chain's rear end is beside the line of the axis; positive to the left."""
+        """(n,) how far the chain's rear end is beside the line of the axis; positive to the
+        left.
+        """
         return np.asarray(np.einsum("ni,ni->n", self.spine[:, -1] - self.spine[:, 0], self._left))
 
     @cached_property
     def tail_angle_rad(self) -> Array:
-        """(n,) angle at the front between the backward axis and the line to the rear end; positive to the left."""
+        """(n,) angle at the front between the backward axis and the line to the rear end; positive
+        to the left.
+        """
         to_rear = self.spine[:, -1] - self.spine[:, 0]
         ahead = self.axis / _positive(np.linalg.norm(self.axis, axis=1))[:, None]
         return np.asarray(np.arctan2(self.tail_mm, -np.einsum("ni,ni->n", to_rear, ahead)))
@@ -146,8 +160,8 @@ class Posture:
 
 @dataclass(frozen=True)
 class Shape:
-    """What is told of a body's posture in each of n frames; see `Posture`. thirds_rad (n, 3); rear_sd_mm (n,): of the
-    chain's rear end. Of a body that does not swim the last four are empty.
+    """What is told of a body's posture in each of n frames; see `Posture`. thirds_rad (n, 3);
+    rear_sd_mm (n,): of the chain's rear end. Of a body that does not swim the last four are empty.
     """
 
     centre: Array

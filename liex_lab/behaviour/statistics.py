@@ -1,7 +1,9 @@
-"""Tests and effect sizes for the units of a design: a permutation restricted by it, and a mixed model.
+"""Tests and effect sizes for the units of a design: a permutation restricted by it, and a mixed
+model.
 
-Whatever tests, the interval is that of the units' means (Welch's t, or a paired or blocked one). A bootstrap of three
-to six units, which is what many studies have, gives intervals that are far too short.
+Whatever tests, the interval is that of the units' means (Welch's t, or a paired or blocked one). A
+bootstrap of three to six units, which is what many studies have, gives intervals that are far too
+short.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ FEWEST_FOR_MODEL = 6  # units per group; with fewer, a model's variances are gue
 
 @dataclass(frozen=True)
 class Estimate:
-    """Second group minus first: the difference, its 95 % interval, and how the interval was made."""
+    """Second group minus first: the difference, its 95 % interval, and how the interval was
+    made.
+    """
 
     difference: float
     low: float
@@ -36,17 +40,23 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
     """The difference of the groups in the measure's own unit."""
     from scipy.stats import t
 
-    y, second = units.values, units.second
+    y = units.values
+    second = units.second
     if units.paired:
-        difference, error, freedom = y.mean(), y.std(ddof=1) / np.sqrt(len(y)), float(len(y) - 1)
+        difference = y.mean()
+        error = y.std(ddof=1) / np.sqrt(len(y))
+        freedom = float(len(y) - 1)
     elif len(np.unique(units.block)) > 1:
         difference, error, freedom = _within_blocks(units)
     else:
-        a, b = y[~second], y[second]
+        a = y[~second]
+        b = y[second]
         if min(len(a), len(b)) < 2:
             return Estimate(float(b.mean() - a.mean()), np.nan, np.nan)
-        va, vb = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
-        difference, error = b.mean() - a.mean(), np.sqrt(va + vb)
+        va = a.var(ddof=1) / len(a)
+        vb = b.var(ddof=1) / len(b)
+        difference = b.mean() - a.mean()
+        error = np.sqrt(va + vb)
         total = va**2 / (len(a) - 1) + vb**2 / (len(b) - 1)
         freedom = (va + vb) ** 2 / total if total > 0 else float(len(y) - 2)
     reach = float(t.ppf(0.5 + level / 2.0, max(freedom, 1.0))) * float(error)
@@ -54,7 +64,9 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
 
 
 def _within_blocks(units: Units) -> tuple[float, float, float]:
-    """Least squares with a mean for each block: difference, its standard error, degrees of freedom."""
+    """Least squares with a mean for each block: difference, its standard error, degrees of
+    freedom.
+    """
     design = np.concatenate(
         [units.second[:, None], units.block[:, None] == np.unique(units.block)], axis=1
     ).astype(float)
@@ -72,8 +84,11 @@ def _within_blocks(units: Units) -> tuple[float, float, float]:
 
 
 def spread_of_animals(values: Array, second: NDArray[np.bool_]) -> tuple[float, float]:
-    """Standard deviation between animals within their groups, and Hedges' correction for so few of them."""
-    a, b = values[~second], values[second]
+    """Standard deviation between animals within their groups, and Hedges' correction for so few of
+    them.
+    """
+    a = values[~second]
+    b = values[second]
     freedom = len(a) + len(b) - 2
     pooled = (
         np.sqrt((((a - a.mean()) ** 2).sum() + ((b - b.mean()) ** 2).sum()) / freedom)
@@ -104,7 +119,9 @@ def smallest_p(units: Units) -> float:
 
 
 def permutation(units: Units, rng: np.random.Generator) -> float:
-    """Two-sided p: how often a difference at least as large comes from giving the groups anew, as the design allows."""
+    """Two-sided p: how often a difference at least as large comes from giving the groups anew, as
+    the design allows.
+    """
     weight = _weights(units)
     observed = abs(float(weight @ units.values) if not units.paired else float(units.values.sum()))
     n_ways = arrangements(units)
@@ -118,14 +135,18 @@ def permutation(units: Units, rng: np.random.Generator) -> float:
 
 
 def _weights(units: Units) -> Array:
-    """(n,) so that their product with the values is the blocked difference of the groups, as least squares gives it."""
+    """(n,) so that their product with the values is the blocked difference of the groups, as least
+    squares gives it.
+    """
     out = np.zeros(len(units.values))
     for block in np.unique(units.block):
         inside = units.block == block
         b = inside & units.second
-        n, k = int(inside.sum()), int(b.sum())
+        n = int(inside.sum())
+        k = int(b.sum())
         if 0 < k < n:
-            out[b], out[inside & ~units.second] = (n - k) / n, -k / n
+            out[b] = (n - k) / n
+            out[inside & ~units.second] = -k / n
     return out
 
 
@@ -140,7 +161,8 @@ def _all_differences(units: Units) -> Array:
         inside = np.flatnonzero(units.block == block)
         k = int(units.second[inside].sum())
         ways = np.array(list(combinations(range(len(inside)), k)), np.int64).reshape(-1, k)
-        # sum of weights x values: k of n values get (n - k) / n and the others -k / n, which is sum - k x mean
+        # sum of weights x values: k of n values get (n - k) / n and the others -k / n, which is sum
+        # - k x mean
         differences = y[inside][ways].sum(axis=1) - k * y[inside].mean()
         total = (total[:, None] + differences).ravel()
     return total
@@ -163,7 +185,9 @@ def _some_differences(units: Units, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True)
 class ModelResult:
-    """What a mixed model found: difference, its 95 % interval and p; which random intercept it had."""
+    """What a mixed model found: difference, its 95 % interval and p; which random intercept
+    it had.
+    """
 
     found: Estimate
     p: float
@@ -171,10 +195,12 @@ class ModelResult:
 
 
 def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> ModelResult | None:
-    """The model value ~ group + (1 | cage) on the animals' means, or (1 | animal) on the sessions' values.
+    """The model value ~ group + (1 | cage) on the animals' means, or (1 | animal) on the sessions'
+    values.
 
-    rows: as for `find_units`. None where the model does not fit, or its random variance lies at zero, so that its
-    errors are not to be trusted. p is of t with as many degrees of freedom as there are units beyond the fixed effects.
+    rows: as for `find_units`. None where the model does not fit, or its random variance lies at
+    zero, so that its errors are not to be trusted. p is of t with as many degrees of freedom as
+    there are units beyond the fixed effects.
     """
     from scipy.stats import t
 
@@ -189,7 +215,8 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
         )
     clusters = data["cage" if units.unit == CAGE else "subject_id"].to_numpy(str)
     if len(np.unique(clusters)) == len(clusters) or len(np.unique(units.block)) > 1:
-        return None  # nothing is nested, or animals are shuffled within blocks: the permutation says it all
+        # nothing is nested, or animals are shuffled within blocks: the permutation says it all
+        return None
     fitted = _fit(
         data["value"].to_numpy(float), (data["group"] == groups[1]).to_numpy(float), clusters
     )
@@ -248,6 +275,6 @@ def check_reachable(units: Units, alpha: float) -> None:
         )
         sizes = f"{int((~units.second).sum())} against {int(units.second.sum())} {what}"
     raise NotComparable(
-        f"{sizes} can be arranged in {n_ways} ways, so p cannot be below {least:.2g}; more {units.unit.split(',')[0]}s "
-        "are needed"
+        f"{sizes} can be arranged in {n_ways} ways, so p cannot be below {least:.2g}; more "
+        f"{units.unit.split(',')[0]}s are needed"
     )

@@ -72,7 +72,9 @@ class Behaviour:
         return {name: getattr(self, name) for name in TABLES}
 
     def for_session(self) -> dict[str, Any]:
-        """The arguments that hand all of it to a session: `writer.close(**behaviour.for_session())`."""
+        """The arguments that hand all of it to a session:
+        `writer.close(**behaviour.for_session())`.
+        """
         return {
             "results": self.tables,
             "columns": self.vocabulary.columns,
@@ -92,13 +94,15 @@ def measure(
     actions: Mapping[str, str] | None = None,
     room: Room = np.empty,
 ) -> Behaviour:
-    """The behaviour tables of one animal from its tables `frames` and `poses` (or its joints), and `gaps` where there
-    are any.
+    """The behaviour tables of one animal from its tables `frames` and `poses` (or its joints), and
+    `gaps` where there are any.
 
-    bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`), with its vocabulary `actions`, word ->
-    definition; None takes the rules'. around: arena, zones and water. room: where the table `kinematics` is to lie.
+    bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`), with its vocabulary
+    `actions`, word -> definition; None takes the rules'. around: arena, zones and water. room:
+    where the table `kinematics` is to lie.
     """
-    rules, around = rules or MouseRules(), around or Surroundings()
+    rules = rules or MouseRules()
+    around = around or Surroundings()
     moved = kinematics(
         frames,
         poses,
@@ -134,7 +138,8 @@ def measure_rows(
     rows: Rows, rules: MouseRules | None = None, around: Surroundings | None = None, **how: Any
 ) -> Behaviour:
     """`measure` of a track that is not in a session yet; how: what else that may be told."""
-    frames, gaps = rows.frames_table(_FRAMES), to_pandas(GAPS, rows.gaps())
+    frames = rows.frames_table(_FRAMES)
+    gaps = to_pandas(GAPS, rows.gaps())
     return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **how)
 
 
@@ -152,7 +157,9 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:
-    """The behaviour tables of a session made anew from its folder alone, with its own ethogram and thresholds."""
+    """The behaviour tables of a session made anew from its folder alone, with its own ethogram and
+    thresholds.
+    """
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
     return measure(
@@ -173,8 +180,11 @@ def summarise(
     words: Vocabulary | None = None,
     around: Surroundings | None = None,
 ) -> pd.DataFrame:
-    """The table `summary`: one row from the tables `frames`, `kinematics` and `bouts` of one animal."""
-    words, around = words or Vocabulary(ACTIONS), around or Surroundings()
+    """The table `summary`: one row from the tables `frames`, `kinematics` and `bouts` of one
+    animal.
+    """
+    words = words or Vocabulary(ACTIONS)
+    around = around or Surroundings()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
     hold = np.where(observed, stop_times(time_s) - time_s, 0.0)
@@ -206,13 +216,12 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
     """How far, how fast, how it turned."""
     speed, step = (kinematics[name].to_numpy(float) for name in ("speed_mm_s", "step_mm"))
     known = np.isfinite(speed)
-    distance, timed = float(np.nansum(step)), float(hold[known].sum())
+    distance = float(np.nansum(step))
+    timed = float(hold[known].sum())
     turning = kinematics["yaw_rate_rad_s"].to_numpy(float)
     turns = np.isfinite(turning)
-    turned, either = (
-        float((turning * hold)[turns].sum()),
-        float((np.abs(turning) * hold)[turns].sum()),
-    )
+    turned = float((turning * hold)[turns].sum())
+    either = float((np.abs(turning) * hold)[turns].sum())
     turn_s = float(hold[turns].sum())
     return {
         "distance_m": distance / 1000.0,
@@ -232,7 +241,8 @@ def _budget(
     found: dict[str, float] = {}
     for word in words:
         own = bouts[bouts["action"] == word]
-        n, seconds = len(own), float(own["duration_s"].sum())
+        n = len(own)
+        seconds = float(own["duration_s"].sum())
         found |= {
             f"{word}_count": n,
             f"{word}_s": seconds,
@@ -249,7 +259,8 @@ def _budget(
 
 def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> dict[str, float]:
     """Seconds in each zone, and shares of the observed time."""
-    observed_s, found = float(hold.sum()), {}
+    observed_s = float(hold.sum())
+    found = {}
     for zone, inside in zip(zones, inside_zones(frames, zones), strict=True):
         found[f"zone_{zone}_s"] = float(hold[inside].sum())
         found[f"zone_{zone}_share"] = (

@@ -1,4 +1,6 @@
-"""The columns of the tables that sum a session up. Which there are depends on the actions' names and on the zones."""
+"""The columns of the tables that sum a session up. Which there are depends on the actions' names
+and on the zones.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ _GENERAL = (
         "float64",
         "s",
         "time with a pose; what rates and shares are divided by",
-        "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt",
+        "sum over frames with a pose of the time to the next frame; before a gap or the end, the "
+        "median dt",
     ),
     (
         "spine_mm",
@@ -272,8 +275,8 @@ TRANSITIONS: tuple[Column, ...] = columns(
         "p",
         "float64",
         "",
-        "probability of an n at least as far from chance, to either side; empty where chance leaves "
-        "no choice",
+        "probability of an n at least as far from chance, to either side; empty where chance "
+        "leaves no choice",
         "binomial test of n out of n_from",
         OWN,
     ),
@@ -303,7 +306,8 @@ ZONES: tuple[Column, ...] = columns(
         "int64",
         "",
         "how often the animal was there; shorter absences than the plan's "
-        "behaviour.merge_pauses_s are bridged, then shorter visits than behaviour.min_bout_s dropped",
+        "behaviour.merge_pauses_s are bridged, then shorter visits than behaviour.min_bout_s "
+        "dropped",
         "",
         OWN,
     ),
@@ -319,7 +323,9 @@ ZONES: tuple[Column, ...] = columns(
 
 
 def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
-    """The columns of the table `activity`: one row per minute, or per tenth of a recording of less than ten."""
+    """The columns of the table `activity`: one row per minute, or per tenth of a recording of less
+    than ten.
+    """
     return columns(
         "activity",
         *_WHO,
@@ -349,7 +355,9 @@ def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What decides which columns a session has: the actions' names, the zones' names, and how the animal moves."""
+    """What decides which columns a session has: the actions' names, the zones' names, and how the
+    animal moves.
+    """
 
     words: tuple[str, ...]
     zones: tuple[str, ...] = ()

@@ -22,7 +22,8 @@ _LEAST_SD = 2.0  # nor is one of fewer standard deviations
 
 @dataclass(frozen=True)
 class TailBeat:
-    """Per frame (n,): the tail's angle where it turns back, else NaN; frequency and amplitude of the swing it is in.
+    """Per frame (n,): the tail's angle where it turns back, else NaN; frequency and amplitude of
+    the swing it is in.
 
     amplitude_mm is half the way of the rear end from one side to the other.
     """
@@ -33,12 +34,15 @@ class TailBeat:
 
 
 def tail_beat(shape: Shape, time_s: Array, number: NDArray[np.int64], step_s: float) -> TailBeat:
-    """The beat within each unbroken stretch `number` (n,); step_s: the usual time from frame to frame.
+    """The beat within each unbroken stretch `number` (n,); step_s: the usual time from frame to
+    frame.
 
-    A swing lasts from one turning point to the next; frequency = 1 / (2 x its time). Slower than `SLOWEST_HZ` it is
-    left empty, and so are one faster than a quarter of the frame rate and its neighbours, for bends may be missing.
+    A swing lasts from one turning point to the next; frequency = 1 / (2 x its time). Slower than
+    `SLOWEST_HZ` it is left empty, and so are one faster than a quarter of the frame rate and its
+    neighbours, for bends may be missing.
     """
-    swing, angle = shape.tail_mm, shape.tail_angle_rad
+    swing = shape.tail_mm
+    angle = shape.tail_angle_rad
     out = TailBeat(*(np.full(len(swing), np.nan) for _ in range(3)))
     known = np.isfinite(swing)
     if step_s <= 0 or not known.any():
@@ -73,13 +77,16 @@ def turning_points(values: Array, least: float) -> NDArray[np.int64]:
     low = high = 0
     rising: bool | None = None
     for k, value in enumerate(values.tolist()):
-        high, low = (k if value > values[high] else high), (k if value < values[low] else low)
+        high = k if value > values[high] else high
+        low = k if value < values[low] else low
         if rising is not False and values[high] - value >= least:
             found.append(high)
-            rising, low = False, k
+            rising = False
+            low = k
         elif rising is not True and value - values[low] >= least:
             found.append(low)
-            rising, high = True, k
+            rising = True
+            high = k
     if (
         found and np.ptp(values[: found[0] + 1]) < least
     ):  # only where the tail lay before it began to swing
@@ -90,14 +97,16 @@ def turning_points(values: Array, least: float) -> NDArray[np.int64]:
 def vertex_times(
     time_s: Array, values: Array, rows: NDArray[np.int64], start: int, stop: int
 ) -> Array:
-    """Times of turning points `rows`, from the parabola through each and its two neighbours in [start, stop)."""
+    """Times of turning points `rows`, from the parabola through each and its two neighbours in
+    [start, stop).
+    """
     inner = rows[(rows > start) & (rows < stop - 1)]
     at = time_s[rows].copy()
-    t0, t1, t2 = time_s[inner - 1], time_s[inner], time_s[inner + 1]
-    left, right = (
-        (values[inner] - values[inner - 1]) / (t1 - t0),
-        (values[inner + 1] - values[inner]) / (t2 - t1),
-    )
+    t0 = time_s[inner - 1]
+    t1 = time_s[inner]
+    t2 = time_s[inner + 1]
+    left = (values[inner] - values[inner - 1]) / (t1 - t0)
+    right = (values[inner + 1] - values[inner]) / (t2 - t1)
     with np.errstate(divide="ignore", invalid="ignore"):
         vertex = (t0 + t1) / 2.0 - left * (t2 - t0) / (2.0 * (right - left))
     at[np.isin(rows, inner)] = np.where(np.isfinite(vertex), np.clip(vertex, t0, t2), t1)

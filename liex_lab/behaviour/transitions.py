@@ -22,13 +22,15 @@ def transitions(
 ) -> pd.DataFrame:
     """The table `transitions` of one animal: every ordered pair of different actions.
 
-    Chance: each action is followed by another one in proportion to how often those occur. One bout's action depends on
-    the last one's only; longer patterns are not looked for.
+    Chance: each action is followed by another one in proportion to how often those occur. One
+    bout's action depends on the last one's only; longer patterns are not looked for.
     """
     counts = count_transitions(bouts, words, gaps, longest_pause_s)
     expected = by_chance(counts)
     rows, columns = np.nonzero(~np.eye(len(words), dtype=bool))
-    n, n_from, chance = counts[rows, columns], counts.sum(axis=1)[rows], expected[rows, columns]
+    n = counts[rows, columns]
+    n_from = counts.sum(axis=1)[rows]
+    chance = expected[rows, columns]
     p = np.array(
         [_binomial(int(k), int(total), q) for k, total, q in zip(n, n_from, chance, strict=True)]
     )
@@ -52,10 +54,13 @@ def transitions(
 def count_transitions(
     bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float
 ) -> Counts:
-    """(k, k) how often word j followed upon word i != j, without a gap or a longer nameless stretch in between."""
+    """(k, k) how often word j followed upon word i != j, without a gap or a longer nameless stretch
+    in between.
+    """
     place = {word: k for k, word in enumerate(words)}
     code = np.array([place[word] for word in bouts["action"]], np.int64)
-    start, stop = bouts["start_s"].to_numpy(float), bouts["stop_s"].to_numpy(float)
+    start = bouts["start_s"].to_numpy(float)
+    stop = bouts["stop_s"].to_numpy(float)
     counts = np.zeros((len(words), len(words)), np.int64)
     if len(code) < 2:
         return counts
@@ -68,11 +73,13 @@ def count_transitions(
 
 
 def by_chance(counts: Counts) -> Array:
-    """(k, k) probability of j after i under quasi-independence: rows and columns as counted, the diagonal empty.
+    """(k, k) probability of j after i under quasi-independence: rows and columns as counted, the
+    diagonal empty.
 
     NaN in the rows of actions that nothing followed.
     """
-    rows, columns = counts.sum(axis=1).astype(float), counts.sum(axis=0).astype(float)
+    rows = counts.sum(axis=1).astype(float)
+    columns = counts.sum(axis=0).astype(float)
     fitted = (~np.eye(len(counts), dtype=bool)).astype(float) * np.outer(rows > 0, columns > 0)
     for _ in range(_ROUNDS):
         fitted *= np.divide(

@@ -1,4 +1,6 @@
-"""Kernel of forward kinematics: where all joints of many poses are, without NumPy's cost per joint."""
+"""Kernel of forward kinematics: where all joints of many poses are, without NumPy's cost
+per joint.
+"""
 
 from __future__ import annotations
 
@@ -11,36 +13,37 @@ def exp_so3(w, out):
     """Rotation (3, 3) of a rotation vector (3,) rad."""
     th2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if th2 < 1e-8:
-        a, b = 1.0 - th2 / 6.0, 0.5 - th2 / 24.0
+        a = 1.0 - th2 / 6.0
+        b = 0.5 - th2 / 24.0
     else:
         th = np.sqrt(th2)
-        a, b = np.sin(th) / th, 2.0 * np.sin(th / 2.0) ** 2 / th2
-    x, y, z = w[0], w[1], w[2]
-    out[0, 0], out[0, 1], out[0, 2] = (
-        1.0 - b * (y * y + z * z),
-        b * x * y - a * z,
-        b * x * z + a * y,
-    )
-    out[1, 0], out[1, 1], out[1, 2] = (
-        b * x * y + a * z,
-        1.0 - b * (x * x + z * z),
-        b * y * z - a * x,
-    )
-    out[2, 0], out[2, 1], out[2, 2] = (
-        b * x * z - a * y,
-        b * y * z + a * x,
-        1.0 - b * (x * x + y * y),
-    )
+        a = np.sin(th) / th
+        b = 2.0 * np.sin(th / 2.0) ** 2 / th2
+    x = w[0]
+    y = w[1]
+    z = w[2]
+    out[0, 0] = 1.0 - b * (y * y + z * z)
+    out[0, 1] = b * x * y - a * z
+    out[0, 2] = b * x * z + a * y
+    out[1, 0] = b * x * y + a * z
+    out[1, 1] = 1.0 - b * (x * x + z * z)
+    out[1, 2] = b * y * z - a * x
+    out[2, 0] = b * x * z - a * y
+    out[2, 1] = b * y * z + a * x
+    out[2, 2] = 1.0 - b * (x * x + y * y)
 
 
 @njit(cache=True)
 def place_joints(parents, offsets, rest, moves, rotation, translation, angles, scale, out):
     """Positions (n, J, 3) mm of the joints of n poses into `out`; the kernel twin of `Pose.joints`.
 
-    rotation (n, 3, 3), translation (n, 3): of the root; angles (n, J, 3); scale (n,); moves (J,): which joints turn.
+    rotation (n, 3, 3), translation (n, 3): of the root; angles (n, J, 3); scale (n,); moves (J,):
+    which joints turn.
     """
     n_joints = parents.size
-    turned, own, step = np.empty((n_joints, 3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    turned = np.empty((n_joints, 3, 3))
+    own = np.empty((3, 3))
+    step = np.empty((3, 3))
     for i in range(scale.size):
         for a in range(3):
             out[i, 0, a] = translation[i, a]

@@ -1,8 +1,9 @@
 """A z-buffer for triangle meshes: the kernel for one picture and drivers for a batch.
 
-Depth is drawn as its inverse: 1 / z of a plane is linear in the pixel, so it is interpolated without perspective error,
-and the nearest surface is the largest value. Both sides of a triangle are drawn: in a closed surface the nearer side
-hides the other anyway, and where a bent body folds into itself a turned triangle can be the one that is seen.
+Depth is drawn as its inverse: 1 / z of a plane is linear in the pixel, so it is interpolated
+without perspective error, and the nearest surface is the largest value. Both sides of a triangle
+are drawn: in a closed surface the nearer side hides the other anyway, and where a bent body folds
+into itself a turned triangle can be the one that is seen.
 """
 
 from __future__ import annotations
@@ -17,14 +18,18 @@ NEAR_MM = 1.0
 
 @njit(cache=True)
 def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse):
-    """Draw triangles (F, 3) into `inverse` (H, W), 1/mm: keeps the largest 1 / z under each pixel's centre.
+    """Draw triangles (F, 3) into `inverse` (H, W), 1/mm: keeps the largest 1 / z under each pixel's
+    centre.
 
-    vertices (V, 3) mm in a frame that (rotation, translation) carries into the camera's. (u0, v0) is the picture's
-    pixel that `inverse[0, 0]` shows. Triangles that reach behind NEAR_MM are left out.
+    vertices (V, 3) mm in a frame that (rotation, translation) carries into the camera's. (u0, v0)
+    is the picture's pixel that `inverse[0, 0]` shows. Triangles that reach behind NEAR_MM are left
+    out.
     """
     projected = np.empty((vertices.shape[0], 3))
     for i in range(vertices.shape[0]):
-        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        x = vertices[i, 0]
+        y = vertices[i, 1]
+        z = vertices[i, 2]
         xc = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
         yc = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
         zc = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
@@ -44,7 +49,12 @@ def _draw_triangle(p, a, b, c, inverse):
     if p[a, 2] <= 0.0 or p[b, 2] <= 0.0 or p[c, 2] <= 0.0:
         return
     height, width = inverse.shape
-    ax, ay, bx, by, kx, ky = p[a, 0], p[a, 1], p[b, 0], p[b, 1], p[c, 0], p[c, 1]
+    ax = p[a, 0]
+    ay = p[a, 1]
+    bx = p[b, 0]
+    by = p[b, 1]
+    kx = p[c, 0]
+    ky = p[c, 1]
     left = max(0, int(math.ceil(min(ax, bx, kx))))
     right = min(width - 1, int(math.floor(max(ax, bx, kx))))
     top = max(0, int(math.ceil(min(ay, by, ky))))
@@ -55,9 +65,12 @@ def _draw_triangle(p, a, b, c, inverse):
     if abs(area) < 1e-12:
         return
     # barycentric weights of b and c, and from them 1 / z, are linear in the pixel
-    wb_u, wb_v = (ky - ay) / area, -(kx - ax) / area
-    wc_u, wc_v = -(by - ay) / area, (bx - ax) / area
-    db, dc = p[b, 2] - p[a, 2], p[c, 2] - p[a, 2]
+    wb_u = (ky - ay) / area
+    wb_v = -(kx - ax) / area
+    wc_u = -(by - ay) / area
+    wc_v = (bx - ax) / area
+    db = p[b, 2] - p[a, 2]
+    dc = p[c, 2] - p[a, 2]
     slack = 1e-9  # a pixel centre on a shared edge belongs to both triangles, never to none
     for row in range(top, bottom + 1):
         wb = wb_u * (left - ax) + wb_v * (row - ay)
@@ -82,7 +95,9 @@ def to_depth(inverse, depth):
 
 @njit(cache=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth (n, H, W) mm of meshes (n, V, 3), one after the other; arguments as in `draw`, leading axis n."""
+    """Depth (n, H, W) mm of meshes (n, V, 3), one after the other; arguments as in `draw`, leading
+    axis n.
+    """
     inverse = np.empty(depth.shape[1:])
     for i in range(len(vertices)):
         inverse[:] = 0.0
@@ -104,7 +119,9 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
 
 @njit(cache=True, parallel=True, nogil=True)
 def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth (n, H, W) mm of meshes (n, V, 3) on all threads; arguments as in `draw`, leading axis n."""
+    """Depth (n, H, W) mm of meshes (n, V, 3) on all threads; arguments as in `draw`, leading axis
+    n.
+    """
     for i in prange(len(vertices)):
         inverse = np.zeros(depth.shape[1:])
         draw(

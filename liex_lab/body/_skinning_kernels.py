@@ -1,8 +1,10 @@
-"""Kernels that lay a closed triangle mesh around the joints of one pose; drivers that do it for a batch.
+"""Kernels that lay a closed triangle mesh around the joints of one pose; drivers that do it for a
+batch.
 
-Every part of a mesh is a *tube*: a pole, some rings, a pole. A body is one tube of ellipses along the spine, an ear or
-a foot an ellipsoid (a tube as well), a tail a thin tube, a capsule a straight tube around one bone. Lengths in mm, in
-the frame in which the joints are given; the tail needs that frame's z up and its floor at z = 0.
+Every part of a mesh is a *tube*: a pole, some rings, a pole. A body is one tube of ellipses along
+the spine, an ear or a foot an ellipsoid (a tube as well), a tail a thin tube, a capsule a straight
+tube around one bone. Lengths in mm, in the frame in which the joints are given; the tail needs that
+frame's z up and its floor at z = 0.
 """
 
 from __future__ import annotations
@@ -14,19 +16,25 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 BODY_SEGMENTS = 16
-BLOB_RINGS, BLOB_SEGMENTS = 4, 8
-TAIL_RINGS, TAIL_SEGMENTS = 12, 6
-CAPSULE_RINGS, CAPSULE_SEGMENTS = 6, 10
+BLOB_RINGS = 4
+BLOB_SEGMENTS = 8
+TAIL_RINGS = 12
+TAIL_SEGMENTS = 6
+CAPSULE_RINGS = 6
+CAPSULE_SEGMENTS = 10
 
 
 def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
-    """Triangles (F, 3) of a closed tube: vertex 0 is the first pole, then ring after ring, the last the other pole."""
+    """Triangles (F, 3) of a closed tube: vertex 0 is the first pole, then ring after ring, the last
+    the other pole.
+    """
     faces = []
     for k in range(n_segments):
         after = (k + 1) % n_segments
         faces.append((0, 1 + after, 1 + k))
         for r in range(n_rings - 1):
-            low, high = 1 + r * n_segments, 1 + (r + 1) * n_segments
+            low = 1 + r * n_segments
+            high = 1 + (r + 1) * n_segments
             faces += [(low + k, low + after, high + after), (low + k, high + after, high + k)]
         last = 1 + (n_rings - 1) * n_segments
         faces.append((last + k, last + after, last + n_segments))
@@ -35,7 +43,8 @@ def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
 
 def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
     """Triangles (F, 3) of several tubes (n_rings, n_segments) whose vertices follow one another."""
-    faces, start = [], 0
+    faces = []
+    start = 0
     for n_rings, n_segments in tubes:
         faces.append(tube_faces(n_rings, n_segments) + np.int32(start))
         start += n_rings * n_segments + 2
@@ -44,10 +53,11 @@ def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
 
 @njit(cache=True)
 def spine_frame(joints, rotations, arc, station, out):
-    """Centre, forward, left and up of the mid-axis at `station` (share of the spine's length) into `out` (4, 3).
+    """Centre, forward, left and up of the mid-axis at `station` (share of the spine's length) into
+    `out` (4, 3).
 
-    Between the joints (J, 3) runs a Catmull-Rom curve, outside it goes straight on. Up blends the joints' z axes
-    (rotations (J, 3, 3)). `arc` (J,) mm: length of the chain up to each joint.
+    Between the joints (J, 3) runs a Catmull-Rom curve, outside it goes straight on. Up blends the
+    joints' z axes (rotations (J, 3, 3)). `arc` (J,) mm: length of the chain up to each joint.
     """
     n_joints = joints.shape[0]
     total = arc[n_joints - 1]
@@ -60,9 +70,11 @@ def spine_frame(joints, rotations, arc, station, out):
     beyond = min(along, 0.0) + max(along - total, 0.0)
     before_length = arc[k] - arc[k - 1] if k > 0 else 1.0
     after_length = arc[k + 2] - arc[k + 1] if k < n_joints - 2 else 1.0
-    s2, s3 = s * s, s * s * s
+    s2 = s * s
+    s3 = s * s * s
     for axis in range(3):
-        here, there = joints[k, axis], joints[k + 1, axis]
+        here = joints[k, axis]
+        there = joints[k + 1, axis]
         bone = (there - here) / length
         start = bone
         if k > 0:
@@ -102,7 +114,9 @@ def _cross(rows, a, b, out):
     x = rows[a, 1] * rows[b, 2] - rows[a, 2] * rows[b, 1]
     y = rows[a, 2] * rows[b, 0] - rows[a, 0] * rows[b, 2]
     z = rows[a, 0] * rows[b, 1] - rows[a, 1] * rows[b, 0]
-    rows[out, 0], rows[out, 1], rows[out, 2] = x, y, z
+    rows[out, 0] = x
+    rows[out, 1] = y
+    rows[out, 2] = z
 
 
 @njit(cache=True)
@@ -120,8 +134,11 @@ def chain_arc(joints, arc):
 def _body(
     joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, start
 ):
-    """The trunk: a superellipse across the mid-axis at every station; the first and last stations are the poles."""
-    n, at = len(stations), start
+    """The trunk: a superellipse across the mid-axis at every station; the first and last stations
+    are the poles.
+    """
+    n = len(stations)
+    at = start
     for r in range(n):
         spine_frame(joints, rotations, arc, stations[r], frame)
         if r == 0 or r == n - 1:
@@ -129,10 +146,12 @@ def _body(
                 out[at, axis] = frame[0, axis]
             at += 1
             continue
-        wide, high = girth * half_width[r], girth * half_height[r]
+        wide = girth * half_width[r]
+        high = girth * half_height[r]
         for k in range(BODY_SEGMENTS):
             phi = 2.0 * math.pi * k / BODY_SEGMENTS
-            c, s = math.cos(phi), math.sin(phi)
+            c = math.cos(phi)
+            s = math.sin(phi)
             if power != 2.0:
                 c = math.copysign(abs(c) ** (2.0 / power), c)
                 s = math.copysign(abs(s) ** (2.0 / power), s)
@@ -146,14 +165,18 @@ def _body(
 
 @njit(cache=True)
 def ellipsoid(frame, radii, out, start):
-    """An ellipsoid about frame (4, 3) = centre, forward, left, up with radii (3,) mm into `out` from row `start`."""
+    """An ellipsoid about frame (4, 3) = centre, forward, left, up with radii (3,) mm into `out`
+    from row `start`.
+    """
     at = start
     for r in range(BLOB_RINGS + 2):
         theta = math.pi * r / (BLOB_RINGS + 1)
-        along, across = -math.cos(theta) * radii[0], math.sin(theta)
+        along = -math.cos(theta) * radii[0]
+        across = math.sin(theta)
         for k in range(1 if r == 0 or r == BLOB_RINGS + 1 else BLOB_SEGMENTS):
             phi = 2.0 * math.pi * k / BLOB_SEGMENTS
-            left, up = across * math.cos(phi) * radii[1], across * math.sin(phi) * radii[2]
+            left = across * math.cos(phi) * radii[1]
+            up = across * math.sin(phi) * radii[2]
             for axis in range(3):
                 out[at, axis] = (
                     frame[0, axis]
@@ -167,7 +190,9 @@ def ellipsoid(frame, radii, out, start):
 
 @njit(cache=True)
 def _blob(joints, rotations, arc, girth, blob, frame, out, start):
-    """One ear or foot: `blob` = station, left, up of its centre, its three radii, mm at scale 1; radius 0 hides it."""
+    """One ear or foot: `blob` = station, left, up of its centre, its three radii, mm at scale 1;
+    radius 0 hides it.
+    """
     spine_frame(joints, rotations, arc, blob[0], frame)
     for axis in range(3):
         frame[0, axis] += girth * (blob[1] * frame[2, axis] + blob[2] * frame[3, axis])
@@ -176,15 +201,21 @@ def _blob(joints, rotations, arc, girth, blob, frame, out, start):
 
 @njit(cache=True)
 def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
-    """A tube that leaves the rump at station `first`, sinks to the floor z = 0 and turns by `bends` rad at its rings.
+    """A tube that leaves the rump at station `first`, sinks to the floor z = 0 and turns by `bends`
+    rad at its rings.
 
-    tail: length, radius at the rump, radius at the tip, mm at scale 1; length 0 hides it inside the body.
+    tail: length, radius at the rump, radius at the tip, mm at scale 1; length 0 hides it inside the
+    body.
     """
     spine_frame(joints, rotations, arc, first, frame)
-    x, y, z = frame[0, 0], frame[0, 1], frame[0, 2]
+    x = frame[0, 0]
+    y = frame[0, 1]
+    z = frame[0, 2]
     if girth * tail[0] <= 0.0:
         for k in range(TAIL_RINGS * TAIL_SEGMENTS + 2):
-            out[start + k, 0], out[start + k, 1], out[start + k, 2] = x, y, z
+            out[start + k, 0] = x
+            out[start + k, 1] = y
+            out[start + k, 2] = z
         return start + TAIL_RINGS * TAIL_SEGMENTS + 2
     heading = math.atan2(-frame[1, 1], -frame[1, 0])
     if (
@@ -193,7 +224,9 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
         heading = math.atan2(frame[3, 1], frame[3, 0])
     step = girth * tail[0] / TAIL_RINGS
     at = start
-    out[at, 0], out[at, 1], out[at, 2] = x, y, z
+    out[at, 0] = x
+    out[at, 1] = y
+    out[at, 2] = z
     at += 1
     for r in range(TAIL_RINGS):
         share = (r + 1.0) / TAIL_RINGS
@@ -201,7 +234,9 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
         heading += bends[r]
         fall = min(max((z - radius) * 0.45, -0.6 * step), 0.8 * step)
         run = math.sqrt(step * step - fall * fall)
-        x, y, z = x + run * math.cos(heading), y + run * math.sin(heading), z - fall
+        x = x + run * math.cos(heading)
+        y = y + run * math.sin(heading)
+        z = z - fall
         for k in range(TAIL_SEGMENTS):
             phi = 2.0 * math.pi * k / TAIL_SEGMENTS
             side = radius * math.cos(phi)
@@ -209,7 +244,9 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
             out[at, 1] = y + side * math.cos(heading)
             out[at, 2] = z + radius * math.sin(phi)
             at += 1
-    out[at, 0], out[at, 1], out[at, 2] = x, y, z
+    out[at, 0] = x
+    out[at, 1] = y
+    out[at, 2] = z
     return at + 1
 
 
@@ -217,8 +254,11 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
 def skin_tube(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
-    """Vertices (V, 3) mm of one animal with a tubular body: trunk, blobs, tail. Shapes as in `BodyShape`."""
-    arc, frame = np.empty(joints.shape[0]), np.empty((4, 3))
+    """Vertices (V, 3) mm of one animal with a tubular body: trunk, blobs, tail. Shapes as in
+    `BodyShape`.
+    """
+    arc = np.empty(joints.shape[0])
+    frame = np.empty((4, 3))
     chain_arc(joints, arc)
     at = _body(
         joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, 0
@@ -272,11 +312,14 @@ def skin_tubes_parallel(
 
 @njit(cache=True, parallel=True)
 def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out):
-    """Vertices of C capsules, round at both ends, for a batch: rotations (n, J, 3, 3), joints (n, J, 3), which (C, 2)
-    joints carry the ends, offsets (n, C, 2, 3) mm times scale (n,), radii (n, C, 2) mm times girth (n,); out (n, V, 3).
+    """Vertices of C capsules, round at both ends, for a batch: rotations (n, J, 3, 3), joints (n,
+    J, 3), which (C, 2) joints carry the ends, offsets (n, C, 2, 3) mm times scale (n,), radii (n,
+    C, 2) mm times girth (n,); out (n, V, 3).
     """
     for i in prange(len(joints)):
-        at, frame, ends = 0, np.empty((4, 3)), np.empty((2, 3))
+        at = 0
+        frame = np.empty((4, 3))
+        ends = np.empty((2, 3))
         for c in range(len(which)):
             for e in range(2):
                 j = which[c, e]
@@ -320,10 +363,8 @@ def _capsule(first, last, first_radius, last_radius, frame, out, start):
         along = -radius * math.cos(theta) if near else length + radius * math.cos(theta)
         for k in range(1 if r == 0 or r == CAPSULE_RINGS + 1 else CAPSULE_SEGMENTS):
             phi = 2.0 * math.pi * k / CAPSULE_SEGMENTS
-            left, up = (
-                radius * math.sin(theta) * math.cos(phi),
-                radius * math.sin(theta) * math.sin(phi),
-            )
+            left = radius * math.sin(theta) * math.cos(phi)
+            up = radius * math.sin(theta) * math.sin(phi)
             for axis in range(3):
                 out[at, axis] = (
                     first[axis]

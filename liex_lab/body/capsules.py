@@ -1,4 +1,6 @@
-"""A body made of capsules: one around every bone, and more where a skeleton's [surface] table puts them."""
+"""A body made of capsules: one around every bone, and more where a skeleton's [surface] table puts
+them.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,12 @@ PARTS = ("capsules", "beyond")
 
 @dataclass(frozen=True)
 class Capsules:
-    """C tapered capsules that move with a skeleton; one body, or a batch (n) of them. Lengths in mm at scale 1.
+    """C tapered capsules that move with a skeleton; one body, or a batch (n) of them. Lengths in mm
+    at scale 1.
 
-    joints (C, 2): which joints carry the two ends; offsets (..., C, 2, 3): where the ends lie in these joints' frames;
-    radii (..., C, 2) at the ends; fur (...) as in `BodyShape`. The first J - 1 capsules are the skeleton's bones, in
-    order.
+    joints (C, 2): which joints carry the two ends; offsets (..., C, 2, 3): where the ends lie in
+    these joints' frames; radii (..., C, 2) at the ends; fur (...) as in `BodyShape`. The first J -
+    1 capsules are the skeleton's bones, in order.
     """
 
     joints: NDArray[np.int64]
@@ -52,12 +55,15 @@ class Capsules:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Capsules:
-        """The body that a skeleton's [surface] describes: radii_mm at the joints, and [[surface.capsules]]."""
+        """The body that a skeleton's [surface] describes: radii_mm at the joints, and
+        [[surface.capsules]].
+        """
         radii = np.array(skeleton.surface.get("radii_mm", []), float)
         if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
             raise LiexError(
-                f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each of its "
-                f"{skeleton.n_joints} joints, or stations with half_width_mm and half_height_mm"
+                f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each "
+                f"of its {skeleton.n_joints} joints, or stations with half_width_mm and "
+                "half_height_mm"
             )
         joints = [[int(skeleton.parents[j]), j] for j in range(1, skeleton.n_joints)]
         at_ends = [[radii[a], radii[b]] for a, b in joints]
@@ -70,8 +76,8 @@ class Capsules:
 
     @staticmethod
     def listed(skeleton: Skeleton, part: str) -> Capsules:
-        """The capsules of one of the lists in a skeleton's [surface]: 'capsules' belong to the body, and 'beyond' says
-        where something may go on that does not, as an arm behind a hand.
+        """The capsules of one of the lists in a skeleton's [surface]: 'capsules' belong to the
+        body, and 'beyond' says where something may go on that does not, as an arm behind a hand.
         """
         rows = [_parsed(table, skeleton, part) for table in skeleton.surface.get(part, [])]
         return Capsules(
@@ -125,7 +131,8 @@ def _parsed(
         and min(radii) > 0
     ):
         raise LiexError(
-            f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, got {table}"
+            f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, "
+            f"got {table}"
         )
     return [skeleton.names.index(name) for name in names], offsets, radii
 

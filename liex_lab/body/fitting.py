@@ -15,7 +15,8 @@ from liex_lab.geometry import SE3, so3
 Array = NDArray[np.float64]
 
 _DAMPING = (1e-3, 1e-9, 1e6)  # first, least and largest share of the curvature that is added to it
-_REST_MM = 1.0  # a joint bent by a radian costs as much as a point this far off: decides what the points leave open
+# a joint bent by a radian costs as much as a point this far off: decides what the points leave open
+_REST_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -35,15 +36,19 @@ def fit_poses(
     n_steps: int = 60,
     keep_scale: bool = False,
 ) -> Fit:
-    """Poses whose points come nearest, in the sense of least squares, to measured ones (n, M, 3) mm.
+    """Poses whose points come nearest, in the sense of least squares, to measured ones (n, M, 3)
+    mm.
 
-    points_of_joints (M, J): each point as a weighted mean of joints. start (n): where the search begins; its angles
-    should be within the limits. Levenberg and Marquardt's method on the manifold, all poses at once: a step turns the
-    base on the right, turns every joint about its free axes, scales all bones, and stops at the limits of the joints.
-    keep_scale leaves the bones as long as they are.
+    points_of_joints (M, J): each point as a weighted mean of joints. start (n): where the search
+    begins; its angles should be within the limits. Levenberg and Marquardt's method on the
+    manifold, all poses at once: a step turns the base on the right, turns every joint about its
+    free axes, scales all bones, and stops at the limits of the joints. keep_scale leaves the bones
+    as long as they are.
     """
-    lower, upper = skeleton.limits[..., 0], skeleton.limits[..., 1]
-    pose, n = start, len(points)
+    lower = skeleton.limits[..., 0]
+    upper = skeleton.limits[..., 1]
+    pose = start
+    n = len(points)
     damping = np.full(n, _DAMPING[0])
     middle = np.clip(0.0, lower, upper)
     free = _free(skeleton)
@@ -60,17 +65,16 @@ def fit_poses(
         curvature[:, index, index] += _REST_MM**2
         held = np.zeros(gradient.shape, bool)  # at a limit and pushed against it
         for c, (j, k) in enumerate(free, start=6):
-            at, way = pose.angles[:, j, k], gradient[:, c]
+            at = pose.angles[:, j, k]
+            way = gradient[:, c]
             held[:, c] = ((at <= lower[j, k]) & (way > 0)) | ((at >= upper[j, k]) & (way < 0))
         step = _step(curvature, gradient, damping, held)
         tried = _moved(pose, step, free, lower, upper)
         tried_cost, tried_residual = _cost(skeleton, tried, points, points_of_joints, middle)
         better = tried_cost < cost
         pose = _chosen(better, tried, pose)
-        cost, residual = (
-            np.where(better, tried_cost, cost),
-            np.where(better[:, None, None], tried_residual, residual),
-        )
+        cost = np.where(better, tried_cost, cost)
+        residual = np.where(better[:, None, None], tried_residual, residual)
         damping = np.clip(np.where(better, damping / 5.0, damping * 4.0), *_DAMPING[1:])
     return Fit(pose, np.linalg.norm(residual, axis=-1))
 
@@ -92,7 +96,9 @@ def _cost(
 def _jacobian(
     skeleton: Skeleton, pose: Pose, points_of_joints: Array, free: list[tuple[int, int]]
 ) -> Array:
-    """Derivatives (n, 3 M, 7 + free axes) of the points by base twist, joint angles and log scale."""
+    """Derivatives (n, 3 M, 7 + free axes) of the points by base twist, joint angles and log
+    scale.
+    """
     rotation, position = forward_kinematics(skeleton, pose.root, pose.angles, pose.scale)
     n, n_joints = position.shape[:2]
     by = np.zeros((n, n_joints, 3, 7 + len(free)))

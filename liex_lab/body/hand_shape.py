@@ -1,4 +1,6 @@
-"""Hands of many people: how long and thick their fingers are, how broad their palms, and the arm that carries them."""
+"""Hands of many people: how long and thick their fingers are, how broad their palms, and the arm
+that carries them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ Array = NDArray[np.float64]
 
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 ARM_MM = 260.0  # from the wrist to the elbow, at scale 1
-_ELBOW, _SHOULDER = 1, 2
+_ELBOW = 1
+_SHOULDER = 2
 _MOST_AWAY = 0.0  # a forearm's direction points away from the camera by no more than this share
 N_ARM_CAPSULES = 4
 
@@ -28,8 +31,9 @@ N_ARM_CAPSULES = 4
 class HandShape:
     """The hands of n people. Lengths in mm at scale 1.
 
-    offsets (n, J, 3): the joints as in `Skeleton.offsets`; flesh: capsules, a batch (n); arm (n, 4): radii at
-    wrist and elbow, how much wider than thick, and where on the forearm a sleeve begins (1: none), as a share.
+    offsets (n, J, 3): the joints as in `Skeleton.offsets`; flesh: capsules, a batch (n); arm (n,
+    4): radii at wrist and elbow, how much wider than thick, and where on the forearm a sleeve
+    begins (1: none), as a share.
     """
 
     offsets: Array
@@ -44,7 +48,9 @@ class HandShape:
         return HandShape(self.offsets[index], self.flesh[index], self.arm[index])
 
     def joints(self, skeleton: Skeleton, pose: Pose) -> tuple[Array, Array]:
-        """Rotations (n, J, 3, 3) and positions (n, J, 3) mm of each person's own hand in a pose (n)."""
+        """Rotations (n, J, 3, 3) and positions (n, J, 3) mm of each person's own hand in a pose
+        (n).
+        """
         rotations = pose.frames(skeleton).rotation
         positions = np.empty(self.offsets.shape)
         positions[:, 0] = pose.root.translation
@@ -58,8 +64,8 @@ class HandShape:
 def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> HandShape:
     """Draw the hands of n people of a family.
 
-    'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds hands that no model is trained
-    on: short and plump ones, and long and slender ones.
+    'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds hands that no
+    model is trained on: short and plump ones, and long and slender ones.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
@@ -68,7 +74,9 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
     def draw(sd: float, *shape: int) -> Array:
         return np.exp(wide * sd * np.clip(rng.standard_normal((n, *shape)), -2.0, 2.0))
 
-    lengths, girth, breadth = draw(0.03, 5), draw(0.09), draw(0.05)
+    lengths = draw(0.03, 5)
+    girth = draw(0.09)
+    breadth = draw(0.05)
     if family == "other":
         plump = rng.random(n) < 0.5
         lengths *= np.where(plump, rng.uniform(0.82, 0.9, n), rng.uniform(1.1, 1.18, n))[:, None]
@@ -103,11 +111,12 @@ def forearms(
     scale: Array,
     bent: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Frames (n, 3, 3) of forearms, x from the elbow to the wrist, and elbows (n, 3) mm of hands in the camera frame.
+    """Frames (n, 3, 3) of forearms, x from the elbow to the wrist, and elbows (n, 3) mm of hands in
+    the camera frame.
 
-    rotations (n, J, 3, 3), positions (n, J, 3) mm; scale (n,). The wrist bends as wrists do, and further where the arm
-    would otherwise come from the camera's side: who holds out a hand stands behind it. bent (n, 3) rad: the wrists'
-    bends where they are known; else each is drawn.
+    rotations (n, J, 3, 3), positions (n, J, 3) mm; scale (n,). The wrist bends as wrists do, and
+    further where the arm would otherwise come from the camera's side: who holds out a hand stands
+    behind it. bent (n, 3) rad: the wrists' bends where they are known; else each is drawn.
     """
     n = len(scale)
     bend = np.zeros((n, 3))
@@ -115,7 +124,8 @@ def forearms(
         bent = np.radians(
             np.stack([np.zeros(n), rng.normal(0.0, 22.0, n), rng.normal(0.0, 12.0, n)], axis=1)
         )
-    bend[:, 1], bend[:, 2] = np.clip(bent[:, 1], -1.0, 1.0), np.clip(bent[:, 2], -0.4, 0.4)
+    bend[:, 1] = np.clip(bent[:, 1], -1.0, 1.0)
+    bend[:, 2] = np.clip(bent[:, 2], -0.4, 0.4)
     turned = rotations[:, 0] @ so3.exp(bend)
     forward = turned[:, :, 0].copy()
     forward[:, 2] = np.minimum(forward[:, 2], _MOST_AWAY)
@@ -124,15 +134,16 @@ def forearms(
 
 
 def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm: Array) -> Array:
-    """Meshes (n, V, 3) mm of forearm, sleeve and upper arm; frame and elbow from `forearms`, shoulder (n, 3) mm,
-    scale (n,), arm (n, 4) as in `HandShape`.
+    """Meshes (n, V, 3) mm of forearm, sleeve and upper arm; frame and elbow from `forearms`,
+    shoulder (n, 3) mm, scale (n,), arm (n, 4) as in `HandShape`.
     """
     n = len(scale)
     wrist = elbow + (scale * ARM_MM)[:, None] * frame[:, :, 0]
     joints = np.stack([wrist, elbow, shoulder], axis=1)
     # two tubes beside one another make an arm that is wider than thick
     side = 0.5 * arm[:, 0] * (arm[:, 2] - 1.0) * 2.0
-    offsets, radii = np.zeros((n, 4, 2, 3)), np.zeros((n, 4, 2))
+    offsets = np.zeros((n, 4, 2, 3))
+    radii = np.zeros((n, 4, 2))
     for c, sign in enumerate((1.0, -1.0)):
         offsets[:, c, :, 1] = sign * side[:, None]
         offsets[:, c, 0, 0] = 12.0

@@ -14,15 +14,18 @@ Array = NDArray[np.float64]
 def forward_kinematics(
     skeleton: Skeleton, root: SE3, angles: Array, scale: Array
 ) -> tuple[Array, Array]:
-    """Joint rotations (..., J, 3, 3) and positions (..., J, 3) mm by the product of exponentials (Lie-X section 3).
+    """Joint rotations (..., J, 3, 3) and positions (..., J, 3) mm by the product of exponentials
+    (Lie-X section 3).
 
-    root: T_frame_root (...); angles (..., J, 3) rad relative to the parent; scale (...) of the bones.
+    root: T_frame_root (...); angles (..., J, 3) rad relative to the parent; scale (...) of the
+    bones.
     """
     local = skeleton.rest @ so3.exp(angles)
     n_joints = skeleton.n_joints
     rotation = np.empty((*root.translation.shape[:-1], n_joints, 3, 3))
     position = np.empty((*root.translation.shape[:-1], n_joints, 3))
-    rotation[..., 0, :, :], position[..., 0, :] = root.rotation, root.translation
+    rotation[..., 0, :, :] = root.rotation
+    position[..., 0, :] = root.translation
     size = np.asarray(scale, float)[..., None]
     for j in range(1, n_joints):
         parent = skeleton.parents[j]
@@ -33,11 +36,13 @@ def forward_kinematics(
 
 
 def aim(direction_from: Array, direction_to: Array) -> Array:
-    """The smallest rotation vectors (..., 3) rad that turn directions (..., 3) onto others (..., 3).
+    """The smallest rotation vectors (..., 3) rad that turn directions (..., 3) onto others (...,
+    3).
 
     Opposite directions have no smallest rotation; they turn by pi about some perpendicular axis.
     """
-    a, b = _unit(direction_from), _unit(direction_to)
+    a = _unit(direction_from)
+    b = _unit(direction_to)
     cross = so3.cross(a, b)
     sine = _length(cross)
     angle = np.arctan2(sine, np.sum(a * b, axis=-1, keepdims=True))
@@ -61,10 +66,11 @@ def _unit(v: Array) -> Array:
 
 
 def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3, Array, Array]:
-    """Root (...), angles (..., J, 3) and scale (...) of the chain through joint positions (..., J, 3) mm.
+    """Root (...), angles (..., J, 3) and scale (...) of the chain through joint positions (..., J,
+    3) mm.
 
-    up (3,) or (..., 3) is where the base's z axis should point as far as its bone allows. Serves skeletons of one chain
-    (mouse, fish): every joint but the last has exactly one child.
+    up (3,) or (..., 3) is where the base's z axis should point as far as its bone allows. Serves
+    skeletons of one chain (mouse, fish): every joint but the last has exactly one child.
     """
     children = skeleton.next_joint
     along = joints[..., 1:, :] - joints[..., skeleton.parents[1:], :]

@@ -1,4 +1,6 @@
-"""A body made of a user's own triangle mesh: bound to the bones at home, it follows them in every pose."""
+"""A body made of a user's own triangle mesh: bound to the bones at home, it follows them in every
+pose.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,13 @@ _SHARPNESS = 4  # a bone's pull falls off with the distance to this power
 
 @dataclass(frozen=True)
 class MeshBody:
-    """A mesh of V vertices that moves with a skeleton by linear blending; one body, or a batch (n). mm at scale 1.
+    """A mesh of V vertices that moves with a skeleton by linear blending; one body, or a batch (n).
+    mm at scale 1.
 
-    faces (F, 3); bones (V, B): the joints that end the bones which a vertex follows; weight (V, B), of sum 1; along and
-    across (V, B, 3): where the vertex lies in the frame that carries the bone, along it and across; width (..., J): the
-    girth at each joint over the file's; fur (...) as in `BodyShape`.
+    faces (F, 3); bones (V, B): the joints that end the bones which a vertex follows; weight (V, B),
+    of sum 1; along and across (V, B, 3): where the vertex lies in the frame that carries the bone,
+    along it and across; width (..., J): the girth at each joint over the file's; fur (...) as in
+    `BodyShape`.
     """
 
     faces: NDArray[np.int32]
@@ -56,7 +60,8 @@ class MeshBody:
     def of(skeleton: Skeleton) -> MeshBody:
         """The mesh of a skeleton's [surface] table, bound to the bones that are nearest at home."""
         table = skeleton.surface
-        vertices, faces = np.array(table["vertices_mm"], float), np.array(table["faces"], np.int64)
+        vertices = np.array(table["vertices_mm"], float)
+        faces = np.array(table["faces"], np.int64)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
             raise LiexError(
                 f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm"
@@ -68,12 +73,14 @@ class MeshBody:
             or faces.max() >= len(vertices)
         ):
             raise LiexError(
-                f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its vertices"
+                f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its "
+                "vertices"
             )
         home = Pose.home(skeleton).frames(skeleton)
         ends = np.arange(1, skeleton.n_joints)
         carriers = skeleton.parents[ends]
-        start, stop = home.translation[carriers], home.translation[ends]
+        start = home.translation[carriers]
+        stop = home.translation[ends]
         bone = stop - start
         length2 = np.maximum(np.sum(bone**2, axis=-1), 1e-12)
         share = np.clip(

@@ -1,7 +1,8 @@
 """The file of a user's own triangle mesh.
 
-Open3D reads the file and thins it out when a skeleton's TOML is loaded; from then on the mesh is part of the skeleton's
-table, so that a trained model carries its body with it and needs neither the file nor Open3D.
+Open3D reads the file and thins it out when a skeleton's TOML is loaded; from then on the mesh is
+part of the skeleton's table, so that a trained model carries its body with it and needs neither the
+file nor Open3D.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ import numpy as np
 
 from liex_lab.errors import LiexError
 
-_MOST_FACES, _FEWEST_FACES = 4000, 4
+_MOST_FACES = 4000
+_FEWEST_FACES = 4
 
 
 def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
-    """The entries of a [surface] table for the mesh of a file (.stl, .obj, .ply, .glb ...), thinned out to what a depth
-    picture shows. unit_mm: how many mm one unit of the file is; origin names the TOML in errors. Raises LiexError.
+    """The entries of a [surface] table for the mesh of a file (.stl, .obj, .ply, .glb ...), thinned
+    out to what a depth picture shows. unit_mm: how many mm one unit of the file is; origin names
+    the TOML in errors. Raises LiexError.
     """
     if not path.is_file():
         raise LiexError(
@@ -28,7 +31,8 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
         import open3d
     except (ImportError, OSError) as error:
         raise LiexError(
-            f"{origin}: reading {path.name} needs Open3D ({error}); install it with: pip install 'liex_lab[mesh]'"
+            f"{origin}: reading {path.name} needs Open3D ({error}); install it with: pip install "
+            "'liex_lab[mesh]'"
         ) from None
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         mesh = open3d.io.read_triangle_mesh(path)
@@ -37,10 +41,11 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
         if len(mesh.triangles) > _MOST_FACES:
             mesh = mesh.simplify_quadric_decimation(_MOST_FACES)
         mesh.remove_unreferenced_vertices()
-    vertices, faces = np.asarray(mesh.vertices) * unit_mm, np.asarray(mesh.triangles)
+    vertices = np.asarray(mesh.vertices) * unit_mm
+    faces = np.asarray(mesh.triangles)
     if len(faces) < _FEWEST_FACES or not np.isfinite(vertices).all():
         raise LiexError(
-            f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} holds {len(faces)} of "
-            "them; export it as STL, OBJ or PLY"
+            f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} "
+            f"holds {len(faces)} of them; export it as STL, OBJ or PLY"
         )
     return {"vertices_mm": np.round(vertices, 3).tolist(), "faces": faces.tolist()}

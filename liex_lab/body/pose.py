@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 class Pose:
     """Skeleton coordinates, one pose or a batch (...).
 
-    root: T_frame_root, the base joint in the frame in which the pose lives; angles (..., J, 3) rad, rotation vectors
-    of each joint relative to its parent, zero at the base and on axes that are not free; scale (...) of all bones.
+    root: T_frame_root, the base joint in the frame in which the pose lives; angles (..., J, 3) rad,
+    rotation vectors of each joint relative to its parent, zero at the base and on axes that are not
+    free; scale (...) of all bones.
     """
 
     root: SE3
@@ -75,8 +76,9 @@ class Pose:
     def from_joints(skeleton: Skeleton, joints: ArrayLike, up: ArrayLike) -> Pose:
         """The pose (...) whose bones point along given joint positions (..., J, 3) mm of one chain.
 
-        Each joint turns by the smallest rotation that aims its bone; the base's roll is chosen so that its z axis lies
-        as near to `up` (3,) as its bone allows. Bones keep their proportions; the scale comes from the total length.
+        Each joint turns by the smallest rotation that aims its bone; the base's roll is chosen so
+        that its z axis lies as near to `up` (3,) as its bone allows. Bones keep their proportions;
+        the scale comes from the total length.
         """
         root, angles, scale = chain_from_joints(
             skeleton, np.asarray(joints, float), np.asarray(up, float)

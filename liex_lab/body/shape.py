@@ -1,4 +1,6 @@
-"""Body shapes: the girth, limbs, tail and fur around a skeleton, and the families from which animals are drawn."""
+"""Body shapes: the girth, limbs, tail and fur around a skeleton, and the families from which
+animals are drawn.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,13 @@ _HULL_SHARE = 0.5  # of the wild ones
 
 @dataclass(frozen=True)
 class BodyShape:
-    """What stands around a tubular animal's mid-axis, one shape or a batch (...). Lengths in mm at scale 1.
+    """What stands around a tubular animal's mid-axis, one shape or a batch (...). Lengths in mm at
+    scale 1.
 
-    half_width, half_height (..., R) at the tube's stations; power (...) of the superellipse across (2 is an ellipse);
-    blobs (..., B, 6): station, left, up of the centre, radii forward, left, up; tail (..., 3): length, radius at the
-    rump, radius at the tip; fur (...) from 0 (sleek) to 1 (long and soft): how much a sensor loses at the outline.
+    half_width, half_height (..., R) at the tube's stations; power (...) of the superellipse across
+    (2 is an ellipse); blobs (..., B, 6): station, left, up of the centre, radii forward, left, up;
+    tail (..., 3): length, radius at the rump, radius at the tip; fur (...) from 0 (sleek) to 1
+    (long and soft): how much a sensor loses at the outline.
     """
 
     half_width: Array
@@ -40,14 +44,12 @@ class BodyShape:
         table = skeleton.surface
         if not skeleton.is_chain:
             raise LiexError(
-                f"the [surface] of '{skeleton.name}' has stations, but its joints are not one chain, each the parent "
-                "of the next; give radii_mm instead"
+                f"the [surface] of '{skeleton.name}' has stations, but its joints are not one "
+                "chain, each the parent of the next; give radii_mm instead"
             )
         try:
-            width, height = (
-                np.array(table["half_width_mm"], float),
-                np.array(table["half_height_mm"], float),
-            )
+            width = np.array(table["half_width_mm"], float)
+            height = np.array(table["half_height_mm"], float)
             blobs = [
                 [pair["station"], side * pair["left_mm"], pair["up_mm"], *pair["radii_mm"]]
                 for pair in table.get("pairs", [])
@@ -60,15 +62,17 @@ class BodyShape:
             ) from None
         if not len(width) == len(height) == len(table["stations"]) >= 4:
             raise LiexError(
-                f"the [surface] of '{skeleton.name}' needs equally many stations, half_width_mm and half_height_mm, "
-                "at least 4"
+                f"the [surface] of '{skeleton.name}' needs equally many stations, half_width_mm "
+                "and half_height_mm, at least 4"
             )
         return BodyShape(
             width, height, np.array(2.0), np.array(blobs, float).reshape(-1, 6), tail, np.array(0.5)
         )
 
     def bare(self) -> BodyShape:
-        """The same trunk without ears, feet and tail: what a model of unknown limbs should be drawn with."""
+        """The same trunk without ears, feet and tail: what a model of unknown limbs should be drawn
+        with.
+        """
         return replace(self, blobs=_with_radii(self.blobs, 0.0), tail=np.zeros_like(self.tail))
 
     def __len__(self) -> int:
@@ -88,8 +92,9 @@ class BodyShape:
 def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> BodyShape:
     """Draw n animals of a family.
 
-    'train' varies the default animal as mice vary; most of 'augmented' varies more than mice do, so that no forest
-    relies on one exact profile; 'other' holds bodies of another build, which no model is trained on.
+    'train' varies the default animal as mice vary; most of 'augmented' varies more than mice do, so
+    that no forest relies on one exact profile; 'other' holds bodies of another build, which no
+    model is trained on.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
@@ -103,10 +108,8 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
     if family == "augmented":
         free = wild & (rng.random(n) < _HULL_SHARE)
         hull_width, hull_height = _hulls(rng, default, stations, n)
-        width, height = (
-            np.where(free[:, None], hull_width, width),
-            np.where(free[:, None], hull_height, height),
-        )
+        width = np.where(free[:, None], hull_width, width)
+        height = np.where(free[:, None], hull_height, height)
     names = [pair["name"] for pair in skeleton.surface.get("pairs", []) for _ in range(2)]
     blobs = np.broadcast_to(default.blobs, (n, *default.blobs.shape)).copy()
     for b in range(len(names)):
@@ -124,7 +127,9 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
 
 
 def draw_tail_bends(rng: np.random.Generator, n: int) -> Array:
-    """How n tails lie: the turn in rad at each ring (n, TAIL_RINGS), slow waves and a little of every ring's own."""
+    """How n tails lie: the turn in rad at each ring (n, TAIL_RINGS), slow waves and a little of
+    every ring's own.
+    """
     ring = np.arange(TAIL_RINGS) / TAIL_RINGS
     first, second = rng.normal(0.0, 0.12, (2, n, 1))
     phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
@@ -143,9 +148,11 @@ def _bump(stations: Array, centre: Array, spread: float) -> Array:
 def _varied(
     rng: np.random.Generator, default: BodyShape, stations: Array, wild: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Half widths and heights (n, R): the default profile, made fatter, blunter, ... by smooth factors.
+    """Half widths and heights (n, R): the default profile, made fatter, blunter, ... by smooth
+    factors.
 
-    wild (n, 1): which animals leave the range of mice, with ranges twice as wide and waves that no factor names.
+    wild (n, 1): which animals leave the range of mice, with ranges twice as wide and waves that no
+    factor names.
     """
     n = len(wild)
 
@@ -175,8 +182,8 @@ def _varied(
 def _hulls(
     rng: np.random.Generator, default: BodyShape, stations: Array, n: int
 ) -> tuple[Array, Array]:
-    """Half widths and heights (n, R) of bodies that owe the default profile nothing: any smooth closed outline whose
-    rear is broader than its snout, with a waist, a neck, both or neither.
+    """Half widths and heights (n, R) of bodies that owe the default profile nothing: any smooth
+    closed outline whose rear is broader than its snout, with a waist, a neck, both or neither.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -184,7 +191,8 @@ def _hulls(
     knots = np.array([0.0, 0.06, 0.18, 0.32, 0.46, 0.60, 0.72, 0.82, 0.92, 1.0])
     low = np.array([0.0, 0.30, 0.65, 0.80, 0.75, 0.60, 0.45, 0.35, 0.18, 0.0])
     high = np.array([0.0, 0.75, 1.00, 1.05, 1.05, 1.05, 1.00, 0.85, 0.55, 0.0])
-    # one draw for the whole body and one for each place: fat noses go with fat necks, but not always
+    # one draw for the whole body and one for each place: fat noses go with fat necks, but not
+    # always
     whole = rng.random((n, 1))
     share = np.clip(0.6 * whole + 0.4 * rng.random((n, len(knots))), 0.0, 1.0)
     # square roots are drawn through the knots, so that both ends close round as an ellipse does
@@ -201,8 +209,11 @@ def _hulls(
 
 
 def _reread(stations: Array, snout: Array, rump: Array) -> Array:
-    """Where (n, R) on the default profile a station reads: powers above 1 make a fat snout or a thin rump."""
-    low, high = stations[0], 0.10
+    """Where (n, R) on the default profile a station reads: powers above 1 make a fat snout or a
+    thin rump.
+    """
+    low = stations[0]
+    high = 0.10
     rear = low + (high - low) * np.clip((stations - low) / (high - low), 0.0, 1.0) ** rump
     front = 0.70 + 0.30 * np.clip((stations - 0.70) / 0.30, 0.0, 1.0) ** snout
     return np.where(stations < high, rear, np.where(stations > 0.70, front, stations))
@@ -224,17 +235,20 @@ def _foreign(
 ) -> tuple[Array, Array]:
     """Half widths and heights (n, R) of builds that 'train' does not hold.
 
-    Every mouse is blunt behind and pointed in front; beyond that nothing is shared with 'train'. Half of them are long
-    and slim and widest at the shoulders: a blunt rump, a flank that widens forward in a straight line, then a cone to
-    the nose. The other half are obese: an egg without a neck that runs into a short cone of a snout.
+    Every mouse is blunt behind and pointed in front; beyond that nothing is shared with 'train'.
+    Half of them are long and slim and widest at the shoulders: a blunt rump, a flank that widens
+    forward in a straight line, then a cone to the nose. The other half are obese: an egg without a
+    neck that runs into a short cone of a snout.
     """
     u = (stations - stations[0]) / (stations[-1] - stations[0])
-    shoulder, rear = rng.uniform(0.42, 0.55, (n, 1)), rng.uniform(0.72, 0.92, (n, 1))
+    shoulder = rng.uniform(0.42, 0.55, (n, 1))
+    rear = rng.uniform(0.72, 0.92, (n, 1))
     blunt = np.clip(u / 0.12, 0.0, 1.0) ** 0.5
     flank = rear + (1.0 - rear) * np.clip(u / shoulder, 0.0, 1.0)
     cone = np.clip((1.0 - u) / (1.0 - shoulder), 0.0, 1.0) ** rng.uniform(0.65, 0.9, (n, 1))
     slim = blunt * flank * cone
-    power, warp = rng.uniform(2.2, 3.0, (n, 1)), rng.uniform(0.75, 1.05, (n, 1))
+    power = rng.uniform(2.2, 3.0, (n, 1))
+    warp = rng.uniform(0.75, 1.05, (n, 1))
     egg = np.maximum(1.0 - np.abs(2.0 * u**warp - 1.0) ** power, 0.0) ** (1.0 / power)
     egg = egg * np.clip((1.0 - u) / rng.uniform(0.28, 0.42, (n, 1)), 0.0, 1.0) ** 0.75
     obese = rng.random((n, 1)) < 0.5
@@ -263,9 +277,11 @@ def _vary_pair(
             [rng.uniform(0.7, 1.6, n), rng.uniform(0.8, 1.1, n), rng.uniform(0.45, 1.1, n)], axis=-1
         )
     else:
-        size, present = rng.uniform(0.7, 1.3, n), rng.random(n) < 0.6
+        size = rng.uniform(0.7, 1.3, n)
+        present = rng.random(n) < 0.6
         factors = rng.uniform(0.85, 1.15, (n, 3))
-    spread, lift = rng.uniform(0.85, 1.2, n), rng.uniform(0.85, 1.1, n)
+    spread = rng.uniform(0.85, 1.2, n)
+    lift = rng.uniform(0.85, 1.1, n)
     for b in rows:
         blobs[:, b, 1] *= spread
         blobs[:, b, 2] *= lift

@@ -1,4 +1,6 @@
-"""A skeleton: a kinematic tree of joints and bones of fixed proportions, described by a TOML file."""
+"""A skeleton: a kinematic tree of joints and bones of fixed proportions, described by a
+TOML file.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ REFERENCE_MM = (
 )
 VIEWS = ("floor", "camera")
 FOREGROUNDS = ("background", "nearest")
-_BEHIND_MM, _SMOOTH_MM = 120.0, 2.0  # of an animal of the reference length
+# of an animal of the reference length
+_BEHIND_MM = 120.0
+_SMOOTH_MM = 2.0
 _MIN_HEIGHT_MM = 7.0
 _AREA = (0.12, 1.3)
 _HUGE = 1e9  # no number of a skeleton is as large
@@ -38,12 +42,13 @@ _HUGE = 1e9  # no number of a skeleton is as large
 class View:
     """How an animal is looked at: the [view] table of its TOML.
 
-    frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the optical axis from
-    behind_mm behind its mean depth, for one that swims (the same for all sizes, or the height map would tell the size
-    for which it was cut) or is held up (at home size). smooth_mm: readings this near to one another, at home size, are
-    averaged. area: the smallest and the largest area seen from above, of the squared length. min_height_mm: what stands
-    out from the background by less is not the animal. foreground: 'background', it stands out from a still scene,
-    or 'nearest', nothing is nearer to the camera.
+    frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the
+    optical axis from behind_mm behind its mean depth, for one that swims (the same for all sizes,
+    or the height map would tell the size for which it was cut) or is held up (at home size).
+    smooth_mm: readings this near to one another, at home size, are averaged. area: the smallest and
+    the largest area seen from above, of the squared length. min_height_mm: what stands out from the
+    background by less is not the animal. foreground: 'background', it stands out from a still
+    scene, or 'nearest', nothing is nearer to the camera.
     """
 
     frame: str = VIEWS[0]
@@ -64,11 +69,13 @@ class View:
                 raise LiexError(
                     f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}"
                 )
-        frame, area = table.get("frame", VIEWS[0]), table.get("area", list(_AREA))
+        frame = table.get("frame", VIEWS[0])
+        area = table.get("area", list(_AREA))
         foreground = table.get("foreground", FOREGROUNDS[0])
         if foreground not in FOREGROUNDS:
             raise LiexError(
-                f"{origin}: [view] foreground is one of {', '.join(FOREGROUNDS)}, got {foreground!r}"
+                f"{origin}: [view] foreground is one of {', '.join(FOREGROUNDS)}, got "
+                f"{foreground!r}"
             )
         if frame not in VIEWS:
             raise LiexError(f"{origin}: [view] frame is one of {', '.join(VIEWS)}, got {frame!r}")
@@ -78,7 +85,8 @@ class View:
             and 0 < area[0] < area[1]
         ):
             raise LiexError(
-                f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got {area}"
+                f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got "
+                f"{area}"
             )
         lengths = {
             "behind_mm": _BEHIND_MM * relative_size,
@@ -102,11 +110,11 @@ MOUSE_VIEW = View()
 class Skeleton:
     """Joints of an animal in its home pose: straight, seen from above, base joint at the origin.
 
-    Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a joint away from
-    its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame into the joint's at home; `axes`
-    (J, 3) says which of roll, pitch and yaw the joint can do; `limits` (J, 3, 2) rad. The base joint, 0, has all six
-    degrees of freedom. Parents precede their children. surface: the [surface] table, see `Surface.of`; table: the whole
-    TOML.
+    Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a
+    joint away from its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame
+    into the joint's at home; `axes` (J, 3) says which of roll, pitch and yaw the joint can do;
+    `limits` (J, 3, 2) rad. The base joint, 0, has all six degrees of freedom. Parents precede their
+    children. surface: the [surface] table, see `Surface.of`; table: the whole TOML.
     """
 
     name: str
@@ -122,7 +130,9 @@ class Skeleton:
 
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
-        """The skeleton of a preset ('fish', 'mouse', 'hand') or of a TOML file that a user wrote."""
+        """The skeleton of a preset ('fish', 'mouse', 'hand') or of a TOML file that a user
+        wrote.
+        """
         path = PRESETS / f"{animal}.toml"
         if not path.is_file():
             path = Path(animal)
@@ -144,7 +154,8 @@ class Skeleton:
     @staticmethod
     def from_table(table: dict[str, Any], origin: str) -> Skeleton:
         """A skeleton from the content of its TOML; `origin` names the file in errors."""
-        joints, surface = table.get("joints"), table.get("surface", {})
+        joints = table.get("joints")
+        surface = table.get("surface", {})
         if not isinstance(table.get("name"), str) or not isinstance(joints, list) or not joints:
             raise LiexError(f"{origin}: a skeleton needs a name and at least one [[joints]] table")
         if not isinstance(surface, dict):
@@ -159,7 +170,8 @@ class Skeleton:
                 )
             if k > 0 and row.parent not in names[:k]:
                 raise LiexError(
-                    f"{origin}: the parent '{row.parent}' of '{row.name}' must be a joint listed before it"
+                    f"{origin}: the parent '{row.parent}' of '{row.name}' must be a joint listed "
+                    "before it"
                 )
             parents.append(names.index(row.parent) if k else -1)
         if len(set(names)) != len(names):
@@ -207,7 +219,9 @@ class Skeleton:
 
     @cached_property
     def length(self) -> float:
-        """Length of the longest chain from the base at home, mm: the spine of a mouse, the body of a fish."""
+        """Length of the longest chain from the base at home, mm: the spine of a mouse, the body of
+        a fish.
+        """
         return _length(self.parents, self.offsets)
 
     @cached_property
@@ -225,7 +239,9 @@ class Skeleton:
 
     @cached_property
     def tip(self) -> int:
-        """The joint whose direction from the base says which way the animal lies: a chain's last, a tree's second."""
+        """The joint whose direction from the base says which way the animal lies: a chain's last, a
+        tree's second.
+        """
         return self.n_joints - 1 if self.is_chain else int(self.next_joint[0])
 
     @cached_property
@@ -235,17 +251,20 @@ class Skeleton:
 
 
 def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The table of the TOML at `path`; where its [surface] names the file of a mesh, with the mesh in its place."""
+    """The table of the TOML at `path`; where its [surface] names the file of a mesh, with the mesh
+    in its place.
+    """
     surface = table.get("surface")
     if not isinstance(surface, dict) or "mesh" not in surface:
         return table
     from liex_lab.body.mesh_file import read_mesh
 
-    name, unit_mm = surface["mesh"], surface.get("mesh_unit_mm", 1.0)
+    name = surface["mesh"]
+    unit_mm = surface.get("mesh_unit_mm", 1.0)
     if not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0):
         raise LiexError(
-            f"{path}: [surface] mesh is the name of a file and mesh_unit_mm the mm that one of its units is long, got "
-            f"{name!r} and {unit_mm!r}"
+            f"{path}: [surface] mesh is the name of a file and mesh_unit_mm the mm that one of its "
+            f"units is long, got {name!r} and {unit_mm!r}"
         )
     others = {key: value for key, value in surface.items() if key not in ("mesh", "mesh_unit_mm")}
     return table | {"surface": others | read_mesh(path.parent / name, float(unit_mm), str(path))}
@@ -287,7 +306,8 @@ class _Joint:
         for key in table:
             if key not in _JOINT_KEYS:
                 raise LiexError(
-                    f"{where} has an unknown key '{key}'; known are {', '.join(sorted(_JOINT_KEYS))}"
+                    f"{where} has an unknown key '{key}'; known are "
+                    f"{', '.join(sorted(_JOINT_KEYS))}"
                 )
         axes = table.get("axes", [])
         if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
@@ -301,7 +321,8 @@ class _Joint:
         )
         if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
             raise LiexError(
-                f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}"
+                f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got "
+                f"{limits_deg}"
             )
         return _Joint(
             name,

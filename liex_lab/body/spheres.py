@@ -1,4 +1,6 @@
-"""A body as a heap of balls that move with its joints: coarse, but quickly held against a picture."""
+"""A body as a heap of balls that move with its joints: coarse, but quickly held against a
+picture.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,10 @@ _SPACING = 1.3  # radii between the middles of two balls
 class Balls:
     """B balls. Each lies between two points that two joints carry; lengths in mm at scale 1.
 
-    joints (B, 2); offsets (B, 2, 3) of the points in the joints' frames; share (B,) of the way from the first point to
-    the second; radius (B,). The first n_own balls are the body; the others lie where something may go on that is not
-    the body, as an arm behind a hand, and what is seen there says nothing about it.
+    joints (B, 2); offsets (B, 2, 3) of the points in the joints' frames; share (B,) of the way from
+    the first point to the second; radius (B,). The first n_own balls are the body; the others lie
+    where something may go on that is not the body, as an arm behind a hand, and what is seen there
+    says nothing about it.
     """
 
     joints: NDArray[np.int64]
@@ -44,9 +47,12 @@ class Balls:
             ends, offsets, radii = _tube(skeleton)
         else:
             body = Capsules.of(skeleton)
-            ends, offsets, radii = body.joints, body.offsets, body.radii
+            ends = body.joints
+            offsets = body.offsets
+            radii = body.radii
         rows = _along(skeleton, ends, offsets, radii)
-        n_own, more = len(rows), Capsules.listed(skeleton, PARTS[1])
+        n_own = len(rows)
+        more = Capsules.listed(skeleton, PARTS[1])
         rows += _along(skeleton, more.joints, more.offsets, more.radii)
         return Balls(
             np.array([row[:2] for row in rows], np.int64),
@@ -60,8 +66,11 @@ class Balls:
 def _along(
     skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array
 ) -> list[tuple[Any, ...]]:
-    """Balls along capsules, so near to one another at home that they make a body: rows of the fields of `Balls`."""
-    home, rows = _home(skeleton), []
+    """Balls along capsules, so near to one another at home that they make a body: rows of the
+    fields of `Balls`.
+    """
+    home = _home(skeleton)
+    rows = []
     bones = {(p, j) for p, j in skeleton.edges}
     for (a, b), (at_a, at_b), (first, last) in zip(ends, offsets, radii, strict=True):
         length = float(np.linalg.norm(home[b] + at_b - home[a] - at_a))
@@ -77,8 +86,11 @@ def _along(
 
 
 def _tube(skeleton: Skeleton) -> tuple[NDArray[np.int64], Array, Array]:
-    """Ends, offsets and radii of capsules that fill a tubular body: as thick as it is where it is thinner."""
-    shape, stations = BodyShape.default(skeleton), np.array(skeleton.surface["stations"], float)
+    """Ends, offsets and radii of capsules that fill a tubular body: as thick as it is where it is
+    thinner.
+    """
+    shape = BodyShape.default(skeleton)
+    stations = np.array(skeleton.surface["stations"], float)
     reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
     thick = np.interp(reach / reach[-1], stations, np.minimum(shape.half_width, shape.half_height))
     thick = np.maximum(thick, 0.05 * thick.max())
@@ -88,7 +100,8 @@ def _tube(skeleton: Skeleton) -> tuple[NDArray[np.int64], Array, Array]:
 
 def _home(skeleton: Skeleton) -> Array:
     """Joint positions (J, 3) mm at home."""
-    turned, at = [np.eye(3)], [np.zeros(3)]
+    turned = [np.eye(3)]
+    at = [np.zeros(3)]
     for j in range(1, skeleton.n_joints):
         p = int(skeleton.parents[j])
         at.append(at[p] + turned[p] @ skeleton.offsets[j])

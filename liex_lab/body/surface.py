@@ -1,8 +1,8 @@
 """The surface around a skeleton, as a triangle mesh, and its picture in a depth camera.
 
-A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a tube along one chain
-of joints (the mouse), `radii_mm` a capsule around every bone and `capsules` further ones (anything else), `mesh` is the
-file of a body of one's own.
+A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a
+tube along one chain of joints (the mouse), `radii_mm` a capsule around every bone and `capsules`
+further ones (anything else), `mesh` is the file of a body of one's own.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from liex_lab.runtime.threads import threads
 Array = NDArray[np.float64]
 Body = BodyShape | Capsules | MeshBody
 Window = tuple[int, int, int, int]
-_FAR, _SILHOUETTE_PX = (
-    50.0,
-    400,
-)  # a silhouette is seen from so many times its reach, in a picture of so many pixels
+# a silhouette is seen from so many times its reach, in a picture of so many pixels
+_FAR = 50.0
+_SILHOUETTE_PX = 400
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh of fixed topology that follows a skeleton: `faces` (F, 3) index the vertices (V, 3) of every pose.
+    """A mesh of fixed topology that follows a skeleton: `faces` (F, 3) index the vertices (V, 3) of
+    every pose.
 
-    shape: the default animal of a tubular body; capsules: a capsule body; mesh: that of a file. The others are None.
+    shape: the default animal of a tubular body; capsules: a capsule body; mesh: that of a file. The
+    others are None.
     """
 
     skeleton: Skeleton
@@ -49,7 +50,9 @@ class Surface:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Surface:
-        """The surface that the skeleton's TOML describes. Raises LiexError where it describes none."""
+        """The surface that the skeleton's TOML describes. Raises LiexError where it
+        describes none.
+        """
         try:
             with np.errstate(all="raise", under="ignore"):
                 return Surface._of(skeleton)
@@ -62,8 +65,8 @@ class Surface:
             ArithmeticError,
         ) as error:
             raise LiexError(
-                f"the [surface] of '{skeleton.name}' cannot be read ({type(error).__name__}: {one_line(error)}); "
-                "compare it with that of a bundled skeleton"
+                f"the [surface] of '{skeleton.name}' cannot be read ({type(error).__name__}: "
+                f"{one_line(error)}); compare it with that of a bundled skeleton"
             ) from None
 
     @staticmethod
@@ -121,7 +124,9 @@ class Surface:
         )
 
     def _silhouette_mm2(self) -> float:
-        """The area of the home pose from straight above, counted in a picture from very far away."""
+        """The area of the home pose from straight above, counted in a picture from very far
+        away.
+        """
         mesh = self.vertices(Pose.home(self.skeleton))
         reach = float(np.abs(mesh).max())
         camera = Camera(
@@ -146,9 +151,9 @@ class Surface:
     ) -> Array:
         """Mesh vertices (..., V, 3) mm of poses (...), in the poses' frame.
 
-        shape: the animal; None is the default animal without ears, feet and tail. girth (...) multiplies all lengths
-        across the body; None takes the pose's scale. bends (n, TAIL_RINGS) rad: how the tail lies. A tail needs poses
-        in the arena frame: it sinks to z = 0.
+        shape: the animal; None is the default animal without ears, feet and tail. girth (...)
+        multiplies all lengths across the body; None takes the pose's scale. bends (n, TAIL_RINGS)
+        rad: how the tail lies. A tail needs poses in the arena frame: it sinks to z = 0.
         """
         frames = pose.frames(self.skeleton)
         batch = frames.translation.shape[:-2]
@@ -199,7 +204,9 @@ class Surface:
         T_camera_pose: SE3 | None = None,
         **skinning: Array | float | None,
     ) -> NDArray[np.float32]:
-        """Depth (H, W) mm of one pose alone, 0 where it is not; see `vertices` and `render_mesh`."""
+        """Depth (H, W) mm of one pose alone, 0 where it is not; see `vertices` and
+        `render_mesh`.
+        """
         mesh = self.vertices(pose, shape, **skinning)  # type: ignore[arg-type]
         return render_mesh(mesh, self.faces, camera, window, T_camera_pose)
 
@@ -213,12 +220,13 @@ def render_mesh(
 ) -> NDArray[np.float32]:
     """Depth (H, W) mm of one closed mesh; 0 where it is not.
 
-    vertices (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there; window: (u0, v0, width, height)
-    of the picture, None the whole of it.
+    vertices (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there; window: (u0,
+    v0, width, height) of the picture, None the whole of it.
     """
     T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
     u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
-    inverse, depth = np.zeros((height, width)), np.empty((height, width), np.float32)
+    inverse = np.zeros((height, width))
+    depth = np.empty((height, width), np.float32)
     _render.draw(
         np.ascontiguousarray(vertices),
         faces,
@@ -247,8 +255,8 @@ def render_meshes(
 ) -> NDArray[np.float32]:
     """Depth (n, H, W) mm of meshes (n, V, 3), each seen by its own camera in its own window.
 
-    T_camera_mesh (n); intrinsics (n, 4): fx, fy, cx, cy; origin (n, 2): the picture's pixel at the window's top left;
-    size: (width, height) of the windows.
+    T_camera_mesh (n); intrinsics (n, 4): fx, fy, cx, cy; origin (n, 2): the picture's pixel at the
+    window's top left; size: (width, height) of the windows.
     """
     depth = np.empty((len(vertices), size[1], size[0]), np.float32)
     drive = _render.draw_batch_parallel if parallel else _render.draw_batch

@@ -1,4 +1,6 @@
-"""Bodies of any animal, varied: the girth and the proportions around a skeleton whose species nobody described."""
+"""Bodies of any animal, varied: the girth and the proportions around a skeleton whose species
+nobody described.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,9 @@ _WAVES = (0.5, 1.0, 1.5, 2.0)  # cycles along the body
 def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> Body:
     """Draw n animals of a family around the body that a skeleton's TOML describes.
 
-    'train' varies it as individuals vary; most of 'augmented' varies more than individuals do, so that no forest relies
-    on one exact profile; 'other' holds builds that neither of them reaches: far slimmer or stouter, with the mass far
-    forward or far back.
+    'train' varies it as individuals vary; most of 'augmented' varies more than individuals do, so
+    that no forest relies on one exact profile; 'other' holds builds that neither of them reaches:
+    far slimmer or stouter, with the mass far forward or far back.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
@@ -71,16 +73,18 @@ def _factors(rng: np.random.Generator, along: Array, family: str, n: int) -> tup
     size, slope, flat, belly = rng.uniform(0.0, 1.0, (4, n, 1))
     at = rng.uniform(0.2, 0.5, (n, 1))
     if family == "other":
-        log_girth, tilt = sign[0] * (0.24 + 0.12 * size), sign[1] * (0.40 + 0.25 * slope)
-        squeeze, bulge, rough = sign[2] * (0.10 + 0.12 * flat), 0.25 * belly, np.full((n, 1), 0.05)
+        log_girth = sign[0] * (0.24 + 0.12 * size)
+        tilt = sign[1] * (0.40 + 0.25 * slope)
+        squeeze = sign[2] * (0.10 + 0.12 * flat)
+        bulge = 0.25 * belly
+        rough = np.full((n, 1), 0.05)
     else:
         more = np.where(wild, 2.0, 1.0)
-        log_girth, tilt = more * sign[0] * 0.12 * size, more * sign[1] * 0.15 * slope
-        squeeze, bulge, rough = (
-            more * sign[2] * 0.08 * flat,
-            more * (0.2 * belly - 0.05),
-            np.where(wild, 0.08, 0.03),
-        )
+        log_girth = more * sign[0] * 0.12 * size
+        tilt = more * sign[1] * 0.15 * slope
+        squeeze = more * sign[2] * 0.08 * flat
+        bulge = more * (0.2 * belly - 0.05)
+        rough = np.where(wild, 0.08, 0.03)
     log_width = (
         log_girth + tilt * (along - 0.4) + np.log1p(bulge * np.exp(-(((along - at) / 0.18) ** 2)))
     )

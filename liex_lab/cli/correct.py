@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from liex_lab.sessions.corrections import Correction
 
 correct = typer.Typer(
-    help="Correct a session: kept beside it, applied whenever it is read; tables and report follow.",
+    help=(
+        "Correct a session: kept beside it, applied whenever it is read; tables and report follow."
+    ),
     no_args_is_help=True,
 )
 
@@ -106,12 +108,14 @@ def bout(
     new_word: NewWord = False,
     by: Author = "",
 ) -> None:
-    """Rename a bout (--at, --action), cut it anew (--at, --from, --to), delete it (--at, --delete), add one (--action,
-    --from, --to), or take the whole ethogram from a file (--labels). The name that it has confirms it.
+    """Rename a bout (--at, --action), cut it anew (--at, --from, --to), delete it (--at, --delete),
+    add one (--action, --from, --to), or take the whole ethogram from a file (--labels). The name
+    that it has confirms it.
     """
     from liex_lab.sessions import correcting as ask
 
-    opened, span = _opened(session), (start_s, stop_s)
+    opened = _opened(session)
+    span = (start_s, stop_s)
     match (at_s, action, span, delete, labels):
         case (None, None, (None, None), False, Path()):
             from liex_lab.pipelines.training.action_model import read_any_labels
@@ -127,8 +131,8 @@ def bout(
             wanted = [ask.delete_bout(opened, at_s)]
         case _:
             raise SessionError(
-                "one edit at a time: --at S with --action, with --from and --to, or with --delete; --action with "
-                "--from and --to; or --labels FILE"
+                "one edit at a time: --at S with --action, with --from and --to, or with "
+                "--delete; --action with --from and --to; or --labels FILE"
             )
     _do(session, wanted, by)
 
@@ -155,8 +159,8 @@ def list_corrections(session: SessionPath) -> None:
     Console().print(table)
     if log.standing and not applies(log, opened.path, opened.metadata):
         typer.echo(
-            "note: they were made on another measurement of this recording and are not applied; `liex correct redo` "
-            f"applies them, and without the folder {FOLDER} they are gone"
+            "note: they were made on another measurement of this recording and are not applied; "
+            f"`liex correct redo` applies them, and without the folder {FOLDER} they are gone"
         )
 
 
@@ -179,7 +183,9 @@ def undo(
 
 @correct.command()
 def redo(session: SessionPath) -> None:
-    """Make the corrected tables and the report again, from what was measured and all corrections that stand."""
+    """Make the corrected tables and the report again, from what was measured and all corrections
+    that stand.
+    """
     _do(session, [], "")
 
 

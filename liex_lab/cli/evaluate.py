@@ -68,7 +68,9 @@ def evaluate_speed(
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Frames per second on one and two cores, stage by stage, and the ratio to the paper's variant."""
+    """Frames per second on one and two cores, stage by stage, and the ratio to the paper's
+    variant.
+    """
     with progress_bar() as progress:
         if recordings:
             from liex_lab.pipelines.evaluation.decoding import evaluate_recordings
@@ -154,8 +156,9 @@ def evaluate_actions(
 ) -> None:
     """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
 
-    The recordings are rendered and measured first, which takes about half an hour for all 30 minutes on two cores. What
-    has been measured is kept in the cache folder (LIEX_CACHE), so that a job that was stopped goes on where it was.
+    The recordings are rendered and measured first, which takes about half an hour for all 30
+    minutes on two cores. What has been measured is kept in the cache folder (LIEX_CACHE), so that a
+    job that was stopped goes on where it was.
     """
     from liex_lab.api import evaluate_actions as measure
 
@@ -187,7 +190,9 @@ def evaluate_tracking(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and smoothed."""
+    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and
+    smoothed.
+    """
     from liex_lab.api import evaluate_tracking as measure
 
     with progress_bar() as progress:
@@ -223,7 +228,9 @@ def evaluate_statistics(
     ] = 1.0,
     json_file: JsonFile = None,
 ) -> None:
-    """How often the comparison of groups is wrong on studies without an effect, and how often it finds one."""
+    """How often the comparison of groups is wrong on studies without an effect, and how often it
+    finds one.
+    """
     from liex_lab.pipelines.evaluation.statistics import evaluate_statistics as measure
 
     with progress_bar() as progress:
@@ -239,7 +246,9 @@ def evaluate_report(
     ] = 60.0,
     json_file: JsonFile = None,
 ) -> None:
-    """How long the report of a long session takes, and its memory: SESSION repeated until it is so long."""
+    """How long the report of a long session takes, and its memory: SESSION repeated until it is so
+    long.
+    """
     from liex_lab.pipelines.evaluation.report import evaluate_report as measure
 
     with progress_bar() as progress:
@@ -262,7 +271,9 @@ def evaluate_nyu(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and ours."""
+    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and
+    ours.
+    """
     from liex_lab.pipelines.evaluation.nyu import evaluate_nyu as measure
     from liex_lab.pipelines.evaluation.nyu import in_short
 
@@ -299,10 +310,11 @@ def evaluate_scale(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """What a study costs: sessions per hour by workers, memory by length of recording, and where the time goes.
+    """What a study costs: sessions per hour by workers, memory by length of recording, and where
+    the time goes.
 
-    Takes about eleven minutes on two cores, and wants a machine without other work; with --minutes 10 alone, half
-    of that.
+    Takes about eleven minutes on two cores, and wants a machine without other work; with --minutes
+    10 alone, half of that.
     """
     from liex_lab.api import run_scale
 

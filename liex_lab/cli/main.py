@@ -1,4 +1,6 @@
-"""`liex`: a table of verbs. Each brings its job along when it is asked for, so that `liex --help` stays quick."""
+"""`liex`: a table of verbs. Each brings its job along when it is asked for, so that `liex --help`
+stays quick.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import progress_bar
 
-FAULT = 70  # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
+# the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
+FAULT = 70
 _USERS_TO_MEND = {
     errno.EACCES,
     errno.EPERM,
@@ -183,7 +186,9 @@ def convert(
         bool, typer.Option("--overwrite", help="Replace what is there under this name.")
     ] = False,
 ) -> None:
-    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG pictures."""
+    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG
+    pictures.
+    """
     from liex_lab.pipelines.convert import convert as job
 
     with progress_bar() as progress:
@@ -244,10 +249,12 @@ def train(
         ),
     ] = None,
 ) -> None:
-    """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is run.
+    """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
+    run.
 
-    `liex train actions` makes the model that names actions: from sessions that people labelled, or, without any, from
-    virtual animals that act. `liex train tracking` measures how far off an animal's tracks may be (tunings.toml).
+    `liex train actions` makes the model that names actions: from sessions that people labelled, or,
+    without any, from virtual animals that act. `liex train tracking` measures how far off an
+    animal's tracks may be (tunings.toml).
     """
     if animal == "actions":
         from liex_lab.pipelines.training.action_model import train_actions
@@ -292,7 +299,9 @@ def suggest(
     ] = None,
     n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
 ) -> None:
-    """List the stretches of a session most worth labelling next: where the recogniser is least sure."""
+    """List the stretches of a session most worth labelling next: where the recogniser is least
+    sure.
+    """
     from liex_lab.pipelines.training.action_model import suggest as job
 
     table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
@@ -357,12 +366,15 @@ def show(
         return
     if not web and not has_screen():
         raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has one, or add --web"
+            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
+            "one, or add --web"
         )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser does not heed it
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
+    # does not heed it
     if web:
         typer.echo(
-            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the window does not"
+            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
+            "window does not"
         )
     shown = [str(file) for file in replays_with(replay)]
     command = [
@@ -385,7 +397,9 @@ def info(
         str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
     ] = None,
 ) -> None:
-    """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of your own."""
+    """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of
+    your own.
+    """
     from liex_lab.plan import Plan, known_plans
 
     if plan is not None:
@@ -407,7 +421,9 @@ def info(
 
 
 def main() -> None:
-    """The command line. What the user can put right is one sentence and exit code 1; a fault of ours shows itself."""
+    """The command line. What the user can put right is one sentence and exit code 1; a fault of
+    ours shows itself.
+    """
     try:
         app()
     except LiexError as error:
@@ -417,7 +433,8 @@ def main() -> None:
             _fault()
         where = f" {error.filename}" if error.filename else ""
         _fail(
-            f"the system refused{where}: {error.strerror}; make room, correct the permissions or name another place"
+            f"the system refused{where}: {error.strerror}; make room, correct the permissions or "
+            "name another place"
         )
     except Exception:
         _fault()

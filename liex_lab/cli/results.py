@@ -1,4 +1,6 @@
-"""The verbs of `liex` for sessions that are there: compare their groups, write them for other programs."""
+"""The verbs of `liex` for sessions that are there: compare their groups, write them for other
+programs.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ def compare(
     ] = None,
     engine: Annotated[str, typer.Option("--engine", help="auto, permutation or mixed.")] = "auto",
 ) -> None:
-    """Compare groups of animals: the test that the design allows, effect sizes, and n at every level."""
+    """Compare groups of animals: the test that the design allows, effect sizes, and n at every
+    level.
+    """
     from liex_lab.pipelines.compare import compare_sessions
 
     with progress_bar() as progress:
@@ -43,7 +47,10 @@ def compare(
             progress=progress,
         )
     for row in found["stats"].to_dict("records"):
-        numbers = f"{row['estimate']:.4g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}], g {row['effect_size']:.2g}"
+        numbers = (
+            f"{row['estimate']:.4g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}], g "
+            f"{row['effect_size']:.2g}"
+        )
         p = (
             f"p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}"
             if row["test"]
@@ -82,7 +89,9 @@ def export(
         bool, typer.Option("--overwrite", help="Replace what is there under this name.")
     ] = False,
 ) -> None:
-    """Write a session for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, or every table as CSV."""
+    """Write a session for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, or every table
+    as CSV.
+    """
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session
 

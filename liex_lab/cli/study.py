@@ -52,7 +52,9 @@ def cohort(
         bool, typer.Option("--overwrite", help="With init: replace a study file.")
     ] = False,
 ) -> None:
-    """Measure every session of a study; what is done is left out, what fails stops no other (exit code 3)."""
+    """Measure every session of a study; what is done is left out, what fails stops no other (exit
+    code 3).
+    """
     if study == "init":
         from liex_lab.pipelines.study.init import begin_study
 
@@ -121,7 +123,9 @@ def verify(
         typer.Option("--recording", help="Measure this recording again and compare the tables."),
     ] = None,
 ) -> None:
-    """Check a session: its hashes, what it says of its origin and, with --recording, whether it comes out again."""
+    """Check a session: its hashes, what it says of its origin and, with --recording, whether it
+    comes out again.
+    """
     from liex_lab.api import verify_session
 
     with progress_bar() as progress:
@@ -133,7 +137,9 @@ def verify(
 
 
 def _tell_study(standings: list[Standing], all_of_them: bool) -> int:
-    """Every session that is not simply done, and how many are in each state; returns how many failed."""
+    """Every session that is not simply done, and how many are in each state; returns how many
+    failed.
+    """
     counts: dict[str, int] = {}
     for one in standings:
         counts[one.state] = counts.get(one.state, 0) + 1

@@ -1,7 +1,8 @@
-"""Numba kernels of Algorithm 1: all candidates of a few frames through the cascade, the pruner and the metric.
+"""Numba kernels of Algorithm 1: all candidates of a few frames through the cascade, the pruner and
+the metric.
 
-A thread takes `FRAMES` frames at once. Their candidates walk down each tree together, LANES at a time, so that a tree
-stays in the cache and no vector register idles.
+A thread takes `FRAMES` frames at once. Their candidates walk down each tree together, LANES at a
+time, so that a tree stays in the cache and no vector register idles.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ _SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these
 
 
 class Chain(NamedTuple):
-    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3), axes (J, 3) bool, solved joints in order."""
+    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3), axes (J, 3) bool, solved
+    joints in order.
+    """
 
     parents: Any
     offsets: Any
@@ -39,8 +42,8 @@ class Chain(NamedTuple):
 
 
 class Trees(NamedTuple):
-    """Forests in one node array: nodes (N, 4), roots (F, T), leaves flat, and of each forest where its leaves begin
-    bases (F,) and how many values a leaf has widths (F,).
+    """Forests in one node array: nodes (N, 4), roots (F, T), leaves flat, and of each forest where
+    its leaves begin bases (F,) and how many values a leaf has widths (F,).
     """
 
     nodes: Any
@@ -51,8 +54,9 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C, of the base and of the other joints; reach (J,) mm of the offsets from each joint; levers (3,) of base,
-    joints and scale; bandwidth mm of the mean shift, 0 for the mean; how many candidates outlive the base joint.
+    """Rounds C, of the base and of the other joints; reach (J,) mm of the offsets from each joint;
+    levers (3,) of base, joints and scale; bandwidth mm of the mean shift, 0 for the mean; how many
+    candidates outlive the base joint.
     """
 
     base_rounds: int
@@ -64,7 +68,9 @@ class Tuning(NamedTuple):
 
 
 class _Lanes(NamedTuple):
-    """What n candidates, one to a lane, see: see `forests._walk`. frame (n,) and pose (n,) say whose they are."""
+    """What n candidates, one to a lane, see: see `forests._walk`. frame (n,) and pose (n,) say
+    whose they are.
+    """
 
     pixels: Any
     base: Any
@@ -100,8 +106,10 @@ def mode_of_votes(votes, bandwidth, out):
 @njit(cache=True)
 def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
     """A forest's prediction for n lanes into out (n, width)."""
-    width, leaf_base = trees.widths[forest], trees.bases[forest]
-    n_trees, n_lanes = trees.roots.shape[1], lanes.base.size
+    width = trees.widths[forest]
+    leaf_base = trees.bases[forest]
+    n_trees = trees.roots.shape[1]
+    n_lanes = lanes.base.size
     votes = np.empty((n if bandwidth > 0 else 1, n_trees, width), np.float32)
     for k in range(n):
         for d in range(width):
@@ -164,9 +172,11 @@ def _write_scalars(lanes, k, first, scalars):
 def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, scales):
     """Fill the lanes' only view, from a joint, and their scalars."""
     n_lanes = lanes.base.size
-    view, scalars = np.empty(VIEW, np.float32), np.empty(N_SCALARS, np.float32)
+    view = np.empty(VIEW, np.float32)
+    scalars = np.empty(N_SCALARS, np.float32)
     for s in range(n):
-        i, k = lanes.frame[s], lanes.pose[s]
+        i = lanes.frame[s]
+        k = lanes.pose[s]
         fill_view(
             rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view
         )
@@ -180,15 +190,16 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
 
 @njit(cache=True)
 def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, positions, scales):
-    """Fill the lanes' views from all joints, and their scalars from the base and from the posed body."""
+    """Fill the lanes' views from all joints, and their scalars from the base and from the posed
+    body.
+    """
     n_joints = positions.shape[2]
-    view, scalars, fit = (
-        np.empty(VIEW, np.float32),
-        np.empty(N_SCALARS, np.float32),
-        np.empty(N_FIT, np.float32),
-    )
+    view = np.empty(VIEW, np.float32)
+    scalars = np.empty(N_SCALARS, np.float32)
+    fit = np.empty(N_FIT, np.float32)
     for s in range(n):
-        i, k = lanes.frame[s], lanes.pose[s]
+        i = lanes.frame[s]
+        k = lanes.pose[s]
         for joint in range(n_joints):
             fill_view(
                 rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view
@@ -216,12 +227,19 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
 
 @njit(cache=True)
 def _lanes_for(heights, frames, n_poses, n_joints, size):
-    """Lanes for n_poses candidates of each of the frames, with the frames' height maps beside one another."""
-    side, n = heights.shape[1], frames.size * n_poses
-    area, n_lanes, n_scalars = side * side, LANES * ((n + LANES - 1) // LANES), N_SCALARS + N_FIT
+    """Lanes for n_poses candidates of each of the frames, with the frames' height maps beside one
+    another.
+    """
+    side = heights.shape[1]
+    n = frames.size * n_poses
+    area = side * side
+    n_lanes = LANES * ((n + LANES - 1) // LANES)
+    n_scalars = N_SCALARS + N_FIT
     pixels = np.zeros(frames.size * area + n_lanes * n_scalars, np.int16)
-    base, scalar_base = np.zeros(n_lanes, np.int32), np.zeros(n_lanes, np.int32)
-    frame, pose = np.zeros(n_lanes, np.int64), np.zeros(n_lanes, np.int64)
+    base = np.zeros(n_lanes, np.int32)
+    scalar_base = np.zeros(n_lanes, np.int32)
+    frame = np.zeros(n_lanes, np.int64)
+    pose = np.zeros(n_lanes, np.int64)
     for m in range(frames.size):
         for r in range(side):
             for c in range(side):
@@ -229,7 +247,9 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
     for s in range(n_lanes):
         scalar_base[s] = frames.size * area + s * n_scalars
         if s < n:
-            base[s], frame[s], pose[s] = (s // n_poses) * area, frames[s // n_poses], s % n_poses
+            base[s] = (s // n_poses) * area
+            frame[s] = frames[s // n_poses]
+            pose[s] = s % n_poses
     inverse = np.full(n_lanes, 1.0 / size, np.float32)
     views = np.zeros(VIEW * n_lanes * n_joints, np.float32)
     return _Lanes(
@@ -239,12 +259,14 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
 
 @njit(cache=True)
 def choose_survivors(rotations, scores, chosen):
-    """Which candidates (n_keep,) of K go on, best first: those with the lowest scores (K,), and in any case the best
-    one that points the other way, for the whole chain tells head from tail better than the base alone.
+    """Which candidates (n_keep,) of K go on, best first: those with the lowest scores (K,), and in
+    any case the best one that points the other way, for the whole chain tells head from tail better
+    than the base alone.
 
     rotations (K, 3, 3) of the base.
     """
-    keep, order = chosen.size, np.empty(scores.size, np.int64)
+    keep = chosen.size
+    order = np.empty(scores.size, np.int64)
     for k in range(scores.size):  # by insertion: they are few
         place = k
         while place > 0 and scores[order[place - 1]] > scores[k]:
@@ -287,7 +309,8 @@ def _solve_joint(
     """All rounds of one joint, the j-th solved one, for n lanes."""
     for s in range(n):
         if joint > 0:
-            i, k = lanes.frame[s], lanes.pose[s]
+            i = lanes.frame[s]
+            k = lanes.pose[s]
             place_joint(
                 joint,
                 chain.parents,
@@ -303,7 +326,8 @@ def _solve_joint(
         _see(lanes, n, joint, looks, moments, size, tuning.reach, rotations, positions, scales)
         _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
         for s in range(n):
-            i, k = lanes.frame[s], lanes.pose[s]
+            i = lanes.frame[s]
+            k = lanes.pose[s]
             if joint > 0:
                 correct_joint(
                     rotations[i, k, joint], chain.axes[joint], values[s], tuning.levers[1]
@@ -333,17 +357,20 @@ def _estimate_block(
     starts,
     poses,
 ):
-    """Candidates of a few frames: `starts` (rotations, positions, scales) of their bases in, `poses` and scores out."""
+    """Candidates of a few frames: `starts` (rotations, positions, scales) of their bases in,
+    `poses` and scores out.
+    """
     start_rotations, start_positions, start_scales = starts
     rotations, positions, scales, scores = poses
-    side, n_joints, n_starts = heights.shape[1], positions.shape[2], start_scales.shape[1]
+    side = heights.shape[1]
+    n_joints = positions.shape[2]
+    n_starts = start_scales.shape[1]
     lanes = _lanes_for(heights, frames, n_starts, 1, size)
     n = frames.size * n_starts
     values = np.empty((lanes.base.size, 7))
-    first, no_view = (
-        np.int64(0),
-        np.int64(0),
-    )  # typed as numbers: a kernel is compiled anew for every literal
+    # typed as numbers: a kernel is compiled anew for every literal
+    first = np.int64(0)
+    no_view = np.int64(0)
     _solve_joint(
         chain.solved[0],
         first,
@@ -375,7 +402,8 @@ def _estimate_block(
             start_scales,
         )
         _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
-    chosen, early = np.arange(tuning.keep), np.empty(n_starts)
+    chosen = np.arange(tuning.keep)
+    early = np.empty(n_starts)
     for m in range(frames.size):
         i = frames[m]
         if tuning.keep < n_starts:
@@ -409,7 +437,8 @@ def _estimate_block(
             values,
         )
     for s in range(n):
-        i, k = lanes.frame[s], lanes.pose[s]
+        i = lanes.frame[s]
+        k = lanes.pose[s]
         place_rest(
             chain.solved,
             chain.parents,
@@ -445,8 +474,9 @@ def estimate_all(
 ):
     """Algorithm 1 for the frames `seen`, in which an animal was found.
 
-    starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it moves; poses: rotations
-    (n, P, J, 3, 3), positions (n, P, J, 3), scales (n, P) and scores (n, P) of the P survivors, which it fills.
+    starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it
+    moves; poses: rotations (n, P, J, 3, 3), positions (n, P, J, 3), scales (n, P) and scores (n, P)
+    of the P survivors, which it fills.
     """
     n_blocks = (seen.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):

@@ -1,8 +1,9 @@
 """Numba kernels of the estimation: what a candidate sees, and how a correction moves it.
 
-A look, 17 float64, is how one height map was cut: fx fy cx cy, rotation (9, row-major) of T_view_camera, distance of
-the camera above the view's origin (its translation is (0, 0, distance)), crop origin u v, and crop step. Candidates
-live in that view frame: the arena frame, or the upright camera frame of the paper's variant.
+A look, 17 float64, is how one height map was cut: fx fy cx cy, rotation (9, row-major) of
+T_view_camera, distance of the camera above the view's origin (its translation is (0, 0, distance)),
+crop origin u v, and crop step. Candidates live in that view frame: the arena frame, or the upright
+camera frame of the paper's variant.
 """
 
 from __future__ import annotations
@@ -12,19 +13,25 @@ from numba import njit, prange
 
 LOOK = 17
 N_SCALARS = 11
-_LOG_UNIT = 500.0  # a threshold is an integer: logarithms and sines are scaled up to resolve a few thousandths
+# a threshold is an integer: logarithms and sines are scaled up to resolve a few thousandths
+_LOG_UNIT = 500.0
 _MM_UNIT = 16.0
 
 
 @njit(cache=True)
 def fill_view(rotation, position, look, size, reach, view):
-    """View (9,) of a joint with rotation (3, 3) and position (3,) mm; reach mm of the offsets at home size."""
-    x0, y0, z0 = position[0], position[1], position[2] - look[13]
+    """View (9,) of a joint with rotation (3, 3) and position (3,) mm; reach mm of the offsets at
+    home size.
+    """
+    x0 = position[0]
+    y0 = position[1]
+    z0 = position[2] - look[13]
     x = look[4] * x0 + look[7] * y0 + look[10] * z0
     y = look[5] * x0 + look[8] * y0 + look[11] * z0
     z = max(look[6] * x0 + look[9] * y0 + look[12] * z0, 1.0)
     per_px = 1.0 / look[16]
-    iu, iv = look[0] / z * per_px, look[1] / z * per_px
+    iu = look[0] / z * per_px
+    iv = look[1] / z * per_px
     view[0] = (look[0] * x / z + look[2] - look[14]) * per_px
     view[1] = (look[1] * y / z + look[3] - look[15]) * per_px
     unit = reach * size / 127.0
@@ -40,22 +47,27 @@ def fill_view(rotation, position, look, size, reach, view):
 @njit(cache=True)
 def fill_scalars(rotation, position, scale, moments, size, scalars):
     """Numbers (N_SCALARS,) that describe the whole animal as a joint sees it, at home size."""
-    area, volume = max(moments[1], 1.0), max(moments[2], 1.0)
+    area = max(moments[1], 1.0)
+    volume = max(moments[2], 1.0)
     scalars[0] = _LOG_UNIT * np.log(area / (size * size))
     scalars[1] = _LOG_UNIT * np.log(volume / (size * size * size))
     scalars[2] = _MM_UNIT * moments[6] / size
     scalars[3] = _MM_UNIT * moments[7] / size
-    dx, dy = moments[3] - position[0], moments[4] - position[1]
+    dx = moments[3] - position[0]
+    dy = moments[4] - position[1]
     scalars[4] = _MM_UNIT * (rotation[0, 0] * dx + rotation[1, 0] * dy) / size
     scalars[5] = _MM_UNIT * (rotation[0, 1] * dx + rotation[1, 1] * dy) / size
     scalars[6] = _MM_UNIT * position[2] / size
-    c, s = rotation[0, 0], rotation[1, 0]
+    c = rotation[0, 0]
+    s = rotation[1, 0]
     norm = max(c * c + s * s, 1e-12)
-    # how steeply the joint rises, over the back where its slope along the long axis is known (else 0)
+    # how steeply the joint rises, over the back where its slope along the long axis is known (else
+    # 0)
     rise = moments[8] * (np.cos(moments[5]) * c + np.sin(moments[5]) * s) / np.sqrt(norm)
     scalars[7] = _LOG_UNIT * (rotation[2, 0] - rise)
     scalars[8] = _LOG_UNIT * rotation[2, 1]
-    # the sine of twice the angle from the joint's heading to the long axis, without asking for the heading's angle
+    # the sine of twice the angle from the joint's heading to the long axis, without asking for the
+    # heading's angle
     twice = np.sin(2.0 * moments[5]) * (c * c - s * s) - np.cos(2.0 * moments[5]) * 2.0 * s * c
     scalars[9] = (
         _LOG_UNIT * twice / norm * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
@@ -68,51 +80,61 @@ def so3_exp(wx, wy, wz, out):
     """Rotation (3, 3) of a rotation vector, rad; the scalar twin of geometry.so3.exp."""
     th2 = wx * wx + wy * wy + wz * wz
     if th2 < 1e-8:
-        a, b = 1.0 - th2 / 6.0, 0.5 - th2 / 24.0
+        a = 1.0 - th2 / 6.0
+        b = 0.5 - th2 / 24.0
     else:
         th = np.sqrt(th2)
-        a, b = np.sin(th) / th, 2.0 * np.sin(th / 2.0) ** 2 / th2
-    out[0, 0], out[0, 1], out[0, 2] = (
-        1.0 - b * (wy * wy + wz * wz),
-        b * wx * wy - a * wz,
-        b * wx * wz + a * wy,
-    )
-    out[1, 0], out[1, 1], out[1, 2] = (
-        b * wx * wy + a * wz,
-        1.0 - b * (wx * wx + wz * wz),
-        b * wy * wz - a * wx,
-    )
-    out[2, 0], out[2, 1], out[2, 2] = (
-        b * wx * wz - a * wy,
-        b * wy * wz + a * wx,
-        1.0 - b * (wx * wx + wy * wy),
-    )
+        a = np.sin(th) / th
+        b = 2.0 * np.sin(th / 2.0) ** 2 / th2
+    out[0, 0] = 1.0 - b * (wy * wy + wz * wz)
+    out[0, 1] = b * wx * wy - a * wz
+    out[0, 2] = b * wx * wz + a * wy
+    out[1, 0] = b * wx * wy + a * wz
+    out[1, 1] = 1.0 - b * (wx * wx + wz * wz)
+    out[1, 2] = b * wy * wz - a * wx
+    out[2, 0] = b * wx * wz - a * wy
+    out[2, 1] = b * wy * wz + a * wx
+    out[2, 2] = 1.0 - b * (wx * wx + wy * wy)
 
 
 @njit(cache=True)
 def turn(rotation, wx, wy, wz):
-    """Rotation (3, 3) <- rotation exp(w): on the right, for a correction lives in the joint's own frame."""
+    """Rotation (3, 3) <- rotation exp(w): on the right, for a correction lives in the joint's own
+    frame.
+    """
     step = np.empty((3, 3))
     so3_exp(wx, wy, wz, step)
     for i in range(3):
-        a, b, c = rotation[i, 0], rotation[i, 1], rotation[i, 2]
+        a = rotation[i, 0]
+        b = rotation[i, 1]
+        c = rotation[i, 2]
         for k in range(3):
             rotation[i, k] = a * step[0, k] + b * step[1, k] + c * step[2, k]
 
 
 @njit(cache=True)
 def correct_base(rotation, position, scale, twist, size):
-    """G <- g exp(twist) (Eq. 10) for the base; twist (7,) rad, mm at home size, log scale. Returns the new scale."""
-    wx, wy, wz = twist[0], twist[1], twist[2]
+    """G <- g exp(twist) (Eq. 10) for the base; twist (7,) rad, mm at home size, log scale. Returns
+    the new scale.
+    """
+    wx = twist[0]
+    wy = twist[1]
+    wz = twist[2]
     th2 = wx * wx + wy * wy + wz * wz
     if th2 < 1e-6:
-        b, c = 0.5 - th2 / 24.0, 1.0 / 6.0 - th2 / 120.0
+        b = 0.5 - th2 / 24.0
+        c = 1.0 / 6.0 - th2 / 120.0
     else:
         th = np.sqrt(th2)
-        b, c = 2.0 * np.sin(th / 2.0) ** 2 / th2, (th - np.sin(th)) / (th2 * th)
-    nx, ny, nz = twist[3] * size, twist[4] * size, twist[5] * size
+        b = 2.0 * np.sin(th / 2.0) ** 2 / th2
+        c = (th - np.sin(th)) / (th2 * th)
+    nx = twist[3] * size
+    ny = twist[4] * size
+    nz = twist[5] * size
     # A nu = nu + b w x nu + c w x (w x nu), Eq. 5
-    px, py, pz = wy * nz - wz * ny, wz * nx - wx * nz, wx * ny - wy * nx
+    px = wy * nz - wz * ny
+    py = wz * nx - wx * nz
+    pz = wx * ny - wy * nx
     tx = nx + b * px + c * (wy * pz - wz * py)
     ty = ny + b * py + c * (wz * px - wx * pz)
     tz = nz + b * pz + c * (wx * py - wy * px)
@@ -124,7 +146,9 @@ def correct_base(rotation, position, scale, twist, size):
 
 @njit(cache=True)
 def correct_joint(rotation, axes, values, lever):
-    """G <- g exp(r) for a joint that turns about its free axes (3,) only; values are lever * rad, axis by axis."""
+    """G <- g exp(r) for a joint that turns about its free axes (3,) only; values are lever * rad,
+    axis by axis.
+    """
     w = np.zeros(3)
     used = 0
     for k in range(3):
@@ -172,8 +196,8 @@ def place_all(j, parents, offsets, rest, scale, rotations, positions):
 def look_all(
     joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars
 ):
-    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars (n, N_SCALARS) of
-    the first of them, for a batch.
+    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars
+    (n, N_SCALARS) of the first of them, for a batch.
     """
     for s in prange(scale.size):
         i = image[s]
@@ -199,7 +223,9 @@ def look_all(
 
 @njit(cache=True, parallel=True)
 def correct_base_all(rotations, positions, scale, values, levers, size):
-    """`correct_base` for a batch; values (n, 6 or 7) in lever units, levers (2,) of rotation and scale."""
+    """`correct_base` for a batch; values (n, 6 or 7) in lever units, levers (2,) of rotation and
+    scale.
+    """
     for s in prange(scale.size):
         twist = np.zeros(7)
         for k in range(3):

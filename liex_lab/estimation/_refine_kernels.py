@@ -1,8 +1,9 @@
-"""Numba kernels that move a pose until its body of balls lies in the readings: Gauss-Newton steps on the manifold.
+"""Numba kernels that move a pose until its body of balls lies in the readings: Gauss-Newton steps
+on the manifold.
 
-The regressors say where a pose is about; this takes it into the picture. Readings pull the nearest ball's surface onto
-themselves, balls beside the animal are pulled back over it, balls in front of the readings are pushed behind them, and
-all of it is held near the pose it began with.
+The regressors say where a pose is about; this takes it into the picture. Readings pull the nearest
+ball's surface onto themselves, balls beside the animal are pulled back over it, balls in front of
+the readings are pushed behind them, and all of it is held near the pose it began with.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
 _STRIDE = 4  # every so many crop pixels a reading pulls
 _ROOT = 7  # twist of the base and log of the scale come before the angles
 _DAMPING = 0.02
-_MOST_GROWTH, _MOST_TURN = 0.1, 0.5  # of log scale, and of an angle (rad), in one step
+# of log scale, and of an angle (rad), in one step
+_MOST_GROWTH = 0.1
+_MOST_TURN = 0.5
 
 
 class Tree(NamedTuple):
-    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3); free (F, 2) joint and axis of every angle,
-    limits (F, 2) rad, moves (J, F) which of them turn which joint, turns (B, M) those that move each ball, in order and
-    -1 where there are no more.
+    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3); free (F, 2) joint and
+    axis of every angle, limits (F, 2) rad, moves (J, F) which of them turn which joint, turns (B,
+    M) those that move each ball, in order and -1 where there are no more.
     """
 
     parents: Any
@@ -37,9 +40,9 @@ class Tree(NamedTuple):
 
 
 class Wishes(NamedTuple):
-    """What weighs how much. robust mm: readings this far off count a quarter; beside: of a ball beside the animal;
-    prior (4,): what a radian of the base, a millimetre of it, a unit of log scale and a radian of a joint away from the
-    start cost, in squared mm.
+    """What weighs how much. robust mm: readings this far off count a quarter; beside: of a ball
+    beside the animal; prior (4,): what a radian of the base, a millimetre of it, a unit of log
+    scale and a radian of a joint away from the start cost, in squared mm.
     """
 
     robust: float
@@ -49,14 +52,16 @@ class Wishes(NamedTuple):
 
 @njit(cache=True)
 def nearest_reading(heights, r, c, known):
-    """The nearest pixel on the animal to a crop pixel off it: into known[r, c] (2,), row -2 where there is none.
+    """The nearest pixel on the animal to a crop pixel off it: into known[r, c] (2,), row -2 where
+    there is none.
 
-    Few pixels are ever asked for, so they are looked for in growing squares and remembered; known (S, S, 2) comes in
-    as -1.
+    Few pixels are ever asked for, so they are looked for in growing squares and remembered; known
+    (S, S, 2) comes in as -1.
     """
     if known[r, c, 0] != -1:
         return
-    side, least = heights.shape[0], 1 << 30
+    side = heights.shape[0]
+    least = 1 << 30
     known[r, c, 0] = -2
     reach = 1
     while reach < side and reach * reach < least:
@@ -69,7 +74,8 @@ def nearest_reading(heights, r, c, known):
                     off = (a - r) ** 2 + (b - c) ** 2
                     if off < least:
                         least = off
-                        known[r, c, 0], known[r, c, 1] = a, b
+                        known[r, c, 0] = a
+                        known[r, c, 1] = b
         reach += 1
 
 
@@ -87,8 +93,12 @@ def point_of(heights, look, r, c, out):
 
 @njit(cache=True)
 def crop_pixel(look, p):
-    """Row and column (rounded) of a point of the view frame in the crop, and millimetres a crop pixel there."""
-    x0, y0, z0 = p[0], p[1], p[2] - look[13]
+    """Row and column (rounded) of a point of the view frame in the crop, and millimetres a crop
+    pixel there.
+    """
+    x0 = p[0]
+    y0 = p[1]
+    z0 = p[2] - look[13]
     x = look[4] * x0 + look[7] * y0 + look[10] * z0
     y = look[5] * x0 + look[8] * y0 + look[11] * z0
     z = max(look[6] * x0 + look[9] * y0 + look[12] * z0, 1.0)
@@ -100,7 +110,8 @@ def crop_pixel(look, p):
 @njit(cache=True)
 def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
     """Joint frames of a pose, as `body.kinematics.forward_kinematics`."""
-    turn, local = np.empty((3, 3)), np.empty((3, 3))
+    turn = np.empty((3, 3))
+    local = np.empty((3, 3))
     for i in range(3):
         positions[0, i] = root_position[i]
         for k in range(3):
@@ -127,19 +138,29 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
 
 @njit(cache=True)
 def turning_axes(free, angles, rotations, axes):
-    """World axes (F, 3) about which the free angles (F, 2: joint, axis) turn: R J_r(w) e, J_r the right Jacobian."""
+    """World axes (F, 3) about which the free angles (F, 2: joint, axis) turn: R J_r(w) e, J_r the
+    right Jacobian.
+    """
     e = np.empty(3)
     for f in range(len(free)):
-        j, k = free[f, 0], free[f, 1]
-        w0, w1, w2 = angles[j, 0], angles[j, 1], angles[j, 2]
+        j = free[f, 0]
+        k = free[f, 1]
+        w0 = angles[j, 0]
+        w1 = angles[j, 1]
+        w2 = angles[j, 2]
         th2 = w0 * w0 + w1 * w1 + w2 * w2
-        e[0], e[1], e[2] = 0.0, 0.0, 0.0
+        e[0] = 0.0
+        e[1] = 0.0
+        e[2] = 0.0
         e[k] = 1.0
         if th2 > 1e-8:
             th = np.sqrt(th2)
-            b, c = (1.0 - np.cos(th)) / th2, (th - np.sin(th)) / (th2 * th)
+            b = (1.0 - np.cos(th)) / th2
+            c = (th - np.sin(th)) / (th2 * th)
             # w x e and w x (w x e)
-            x, y, z = w1 * e[2] - w2 * e[1], w2 * e[0] - w0 * e[2], w0 * e[1] - w1 * e[0]
+            x = w1 * e[2] - w2 * e[1]
+            y = w2 * e[0] - w0 * e[2]
+            z = w0 * e[1] - w1 * e[0]
             e[0] += c * (w1 * z - w2 * y) - b * x
             e[1] += c * (w2 * x - w0 * z) - b * y
             e[2] += c * (w0 * y - w1 * x) - b * z
@@ -153,26 +174,30 @@ def turning_axes(free, angles, rotations, axes):
 def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
     """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles."""
     slope[:] = 0.0
-    x0, y0, z0 = ball[0] - positions[0, 0], ball[1] - positions[0, 1], ball[2] - positions[0, 2]
+    x0 = ball[0] - positions[0, 0]
+    y0 = ball[1] - positions[0, 1]
+    z0 = ball[2] - positions[0, 2]
     for k in range(3):
-        ax, ay, az = rotations[0, 0, k], rotations[0, 1, k], rotations[0, 2, k]
-        slope[0, k], slope[1, k], slope[2, k] = (
-            ay * z0 - az * y0,
-            az * x0 - ax * z0,
-            ax * y0 - ay * x0,
-        )
-        slope[0, 3 + k], slope[1, 3 + k], slope[2, 3 + k] = ax, ay, az
-    slope[0, 6], slope[1, 6], slope[2, 6] = x0, y0, z0
+        ax = rotations[0, 0, k]
+        ay = rotations[0, 1, k]
+        az = rotations[0, 2, k]
+        slope[0, k] = ay * z0 - az * y0
+        slope[1, k] = az * x0 - ax * z0
+        slope[2, k] = ax * y0 - ay * x0
+        slope[0, 3 + k] = ax
+        slope[1, 3 + k] = ay
+        slope[2, 3 + k] = az
+    slope[0, 6] = x0
+    slope[1, 6] = y0
+    slope[2, 6] = z0
     for e in range(2):
         j = body.joints[b, e]
         share = body.share[b] if e == 1 else 1.0 - body.share[b]
         if share == 0.0:
             continue
-        u, v, w = (
-            scale * body.offsets[b, e, 0],
-            scale * body.offsets[b, e, 1],
-            scale * body.offsets[b, e, 2],
-        )
+        u = scale * body.offsets[b, e, 0]
+        v = scale * body.offsets[b, e, 1]
+        w = scale * body.offsets[b, e, 2]
         ex = (
             positions[j, 0]
             + rotations[j, 0, 0] * u
@@ -197,8 +222,12 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
                 break
             if tree.moves[j, f]:
                 a = tree.free[f, 0]
-                x, y, z = ex - positions[a, 0], ey - positions[a, 1], ez - positions[a, 2]
-                ax, ay, az = axes[f, 0], axes[f, 1], axes[f, 2]
+                x = ex - positions[a, 0]
+                y = ey - positions[a, 1]
+                z = ez - positions[a, 2]
+                ax = axes[f, 0]
+                ay = axes[f, 1]
+                az = axes[f, 2]
                 slope[0, _ROOT + f] += share * (ay * z - az * y)
                 slope[1, _ROOT + f] += share * (az * x - ax * z)
                 slope[2, _ROOT + f] += share * (ax * y - ay * x)
@@ -219,7 +248,9 @@ def _add(row, residual, weight, gradient, curvature):
 
 @njit(cache=True)
 def _solve(curvature, gradient, step):
-    """Solve the positive definite system by Cholesky, lower half given; False where it is not definite."""
+    """Solve the positive definite system by Cholesky, lower half given; False where it is not
+    definite.
+    """
     n = gradient.size
     for i in range(n):
         for k in range(i + 1):
@@ -247,10 +278,11 @@ def _solve(curvature, gradient, step):
 
 @njit(cache=True)
 def _pull(points, balls, radius, slopes, robust, gradient, curvature):
-    """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B, 3) passes through
-    it. slopes (n, 3, P) of the first n balls, which are the body's own.
+    """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B,
+    3) passes through it. slopes (n, 3, P) of the first n balls, which are the body's own.
     """
-    row, gaps = np.empty(gradient.size), np.empty(len(balls))
+    row = np.empty(gradient.size)
+    gaps = np.empty(len(balls))
     for i in range(len(points)):
         best, which = nearest_ball(points[i, 0], points[i, 1], points[i, 2], balls, radius, gaps)
         if which >= len(slopes):
@@ -268,12 +300,16 @@ def _pull(points, balls, radius, slopes, robust, gradient, curvature):
 
 @njit(cache=True)
 def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient, curvature):
-    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal. slopes (n, 3, P)."""
-    row, target = np.empty(gradient.size), np.empty(3)
+    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal.
+    slopes (n, 3, P).
+    """
+    row = np.empty(gradient.size)
+    target = np.empty(3)
     last = heights.shape[0] - 1
     for b in range(len(slopes)):
         r, c = crop_pixel(look, balls[b])
-        r, c = min(max(r, 0), last), min(max(c, 0), last)
+        r = min(max(r, 0), last)
+        c = min(max(c, 0), last)
         if heights[r, c] > 0:
             out = balls[b, 2] + radius[b] - heights[r, c] / 16.0
             if out > 0.0:
@@ -283,7 +319,8 @@ def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient,
                 _add(row, out, weight, gradient, curvature)
             continue
         nearest_reading(heights, r, c, known)
-        a, d = known[r, c, 0], known[r, c, 1]
+        a = known[r, c, 0]
+        d = known[r, c, 1]
         if a < 0:
             continue
         point_of(heights, look, a, d, target)
@@ -296,7 +333,9 @@ def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient,
 
 @njit(cache=True)
 def _hold(tree, prior, moved, growth, turned, gradient, curvature):
-    """What the start wants: not to be left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3)."""
+    """What the start wants: not to be left by a twist `moved` (6,), log scale `growth` and angles
+    `turned` (J, 3).
+    """
     for k in range(3):
         gradient[k] += prior[0] * moved[k]
         gradient[3 + k] += prior[1] * moved[3 + k]
@@ -305,7 +344,8 @@ def _hold(tree, prior, moved, growth, turned, gradient, curvature):
     gradient[6] += prior[2] * growth
     curvature[6, 6] += prior[2]
     for f in range(len(tree.free)):
-        j, k = tree.free[f, 0], tree.free[f, 1]
+        j = tree.free[f, 0]
+        k = tree.free[f, 1]
         gradient[_ROOT + f] += prior[3] * turned[j, k]
         curvature[_ROOT + f, _ROOT + f] += prior[3]
 
@@ -316,12 +356,15 @@ def _go(step, tree, root_rotation, root_position, angles, scale):
     turn = np.empty((3, 3))
     so3_exp(step[0], step[1], step[2], turn)
     for i in range(3):
-        x, y, z = root_rotation[i, 0], root_rotation[i, 1], root_rotation[i, 2]
+        x = root_rotation[i, 0]
+        y = root_rotation[i, 1]
+        z = root_rotation[i, 2]
         root_position[i] += x * step[3] + y * step[4] + z * step[5]
         for k in range(3):
             root_rotation[i, k] = x * turn[0, k] + y * turn[1, k] + z * turn[2, k]
     for f in range(len(tree.free)):
-        j, k = tree.free[f, 0], tree.free[f, 1]
+        j = tree.free[f, 0]
+        k = tree.free[f, 1]
         turned = angles[j, k] + min(max(step[_ROOT + f], -_MOST_TURN), _MOST_TURN)
         angles[j, k] = min(max(turned, tree.limits[f, 0]), tree.limits[f, 1])
     return scale * np.exp(min(max(step[6], -_MOST_GROWTH), _MOST_GROWTH))
@@ -331,7 +374,8 @@ def _go(step, tree, root_rotation, root_position, angles, scale):
 def _readings(heights, look):
     """The points (n, 3) mm of the view frame that every `_STRIDE`-th crop pixel shows."""
     side = heights.shape[0]
-    points, n = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3)), 0
+    points = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3))
+    n = 0
     for r in range(_STRIDE // 2, side, _STRIDE):
         for c in range(_STRIDE // 2, side, _STRIDE):
             if heights[r, c] > 0:
@@ -355,15 +399,21 @@ def refine_one(
     angles,
     scale,
 ):
-    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns the new scale.
+    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns
+    the new scale.
 
     known (S, S, 2) as in `nearest_reading`, points (n, 3) as `_readings` of the height map.
     """
-    n_values, n_joints = _ROOT + len(tree.free), tree.parents.size
-    rotations, positions = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3))
-    balls, axes = np.empty((len(body.joints), 3)), np.empty((len(tree.free), 3))
-    slopes, step = np.empty((body.n_own, 3, n_values)), np.empty(n_values)
-    first_angles, first_scale = angles.copy(), scale
+    n_values = _ROOT + len(tree.free)
+    n_joints = tree.parents.size
+    rotations = np.empty((n_joints, 3, 3))
+    positions = np.empty((n_joints, 3))
+    balls = np.empty((len(body.joints), 3))
+    axes = np.empty((len(tree.free), 3))
+    slopes = np.empty((body.n_own, 3, n_values))
+    step = np.empty(n_values)
+    first_angles = angles.copy()
+    first_scale = scale
     moved = np.zeros(6)  # of the base since the start, step by step
     for _ in range(n_steps):
         forward(tree, root_rotation, root_position, angles, scale, rotations, positions)
@@ -371,11 +421,9 @@ def refine_one(
         turning_axes(tree.free, angles, rotations, axes)
         for b in range(body.n_own):
             ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
-        gradient, curvature, radius = (
-            np.zeros(n_values),
-            np.zeros((n_values, n_values)),
-            body.radius * scale,
-        )
+        gradient = np.zeros(n_values)
+        curvature = np.zeros((n_values, n_values))
+        radius = body.radius * scale
         _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
         _push(
             heights,

@@ -1,5 +1,5 @@
-"""What is learned of a model's own choices, on images that no tree has seen: their last correction, and how far off
-they are in millimetres.
+"""What is learned of a model's own choices, on images that no tree has seen: their last correction,
+and how far off they are in millimetres.
 """
 
 from __future__ import annotations
@@ -26,8 +26,11 @@ from liex_lab.forests.grow import GrowthPlan, boost_forest
 Array = NDArray[np.float64]
 
 _CAP_MM = 25.0  # at the reference length; a lost pose must not decide what an ordinary score means
-# how far off (log) the size of a session is once it has been estimated over many frames, where poses settle, and before
-_SIZE_SD, _SETTLED_SIZE_SD, _GUESS_SD = 0.05, 0.02, 0.08
+# how far off (log) the size of a session is once it has been estimated over many frames, where
+# poses settle, and before
+_SIZE_SD = 0.05
+_SETTLED_SIZE_SD = 0.02
+_GUESS_SD = 0.08
 _DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
 _GROUP = 50  # images share a size guess, as the frames of a recording do
 _EXPECTATION = GrowthPlan(
@@ -41,17 +44,16 @@ _EXPECTATION = GrowthPlan(
     bag_share=0.5,
 )
 _SHRINKAGE = 0.12
-_CORRECTED_MM, _CORRECTION_SHRINKAGE = (
-    12.0,
-    0.1,
-)  # at the reference length: what is farther off is another pose
+# at the reference length: what is farther off is another pose
+_CORRECTED_MM = 12.0
+_CORRECTION_SHRINKAGE = 0.1
 _FOLDS = 4
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A model's own choices for images with known truth: scores (n,), spreads (n,), joint errors (n, J) mm at home
-    size, and what the expectation forest sees of them.
+    """A model's own choices for images with known truth: scores (n,), spreads (n,), joint errors
+    (n, J) mm at home size, and what the expectation forest sees of them.
     """
 
     score: Array
@@ -62,8 +64,9 @@ class Trial:
 
 @dataclass(frozen=True)
 class _Group:
-    """Images that share a guess of the size, as the frames of a recording do: their rows in the set, the guess over
-    home size, the model's choices for them, and the candidates (m, K, J, 3) mm behind these with their scores (m, K).
+    """Images that share a guess of the size, as the frames of a recording do: their rows in the
+    set, the guess over home size, the model's choices for them, and the candidates (m, K, J, 3) mm
+    behind these with their scores (m, K).
     """
 
     rows: NDArray[np.int64]
@@ -77,8 +80,8 @@ class _Group:
 def _choices(
     model: Model, data: TrainingSet, rng: np.random.Generator, size_sd: float = _SIZE_SD
 ) -> Iterator[_Group]:
-    """Let a model choose. Images of animals are taken in order of size, and each group of them shares one guess, off by
-    size_sd (log).
+    """Let a model choose. Images of animals are taken in order of size, and each group of them
+    shares one guess, off by size_sd (log).
     """
     animals = np.flatnonzero(data.animal)
     order = animals[np.argsort(data.size[animals], kind="stable")]
@@ -105,11 +108,15 @@ def _choices(
 def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
     """The choices of a model for the animals among the images, and how far off they are."""
     skeleton = model.skeleton
-    scores_of, spreads, joint_errors, clues = [], [], [], []
+    scores_of = []
+    spreads = []
+    joint_errors = []
+    clues = []
     for group in _choices(
         model, data, rng, _SIZE_SD if model.settler is None else _SETTLED_SIZE_SD
     ):
-        picked, images = group.chosen, group.images
+        picked = group.chosen
+        images = group.images
         off = np.linalg.norm(
             picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1
         )
@@ -135,13 +142,16 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
 def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
     """The model with the last correction of its choices, learned from images that no tree has seen.
 
-    What is off by more than an ordinary error, as a pose that points the other way, teaches nothing. Skeletons that
-    branch have no such correction: their poses do not follow from the places of their joints.
+    What is off by more than an ordinary error, as a pose that points the other way, teaches
+    nothing. Skeletons that branch have no such correction: their poses do not follow from the
+    places of their joints.
     """
-    plan, worst = model.method.corrector, _CORRECTED_MM * model.skeleton.relative_size
+    plan = model.method.corrector
+    worst = _CORRECTED_MM * model.skeleton.relative_size
     if plan is None or not model.skeleton.is_chain:
         return model
-    parts, moves = [], []
+    parts = []
+    moves = []
     for group in _choices(model, data, rng):
         true = data.truth.positions[group.rows]
         off = np.linalg.norm(group.chosen.pose.joints(model.skeleton) - true, axis=-1).mean(axis=1)
@@ -166,7 +176,9 @@ def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) ->
 
 
 def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
-    """The model with how its choices settle, where the method has them settle, from images that no tree has seen."""
+    """The model with how its choices settle, where the method has them settle, from images that no
+    tree has seen.
+    """
     if not model.method.settle:
         return model
     groups = list(_choices(model, data, rng, _GUESS_SD))
@@ -180,13 +192,14 @@ def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> M
 
 
 def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
-    """The model with what tells head from tail, where the method has it, learned from candidates for images that no
-    tree has seen: the best one of each way.
+    """The model with what tells head from tail, where the method has it, learned from candidates
+    for images that no tree has seen: the best one of each way.
     """
     skeleton = model.skeleton
     if not model.method.tells_facing:
         return model
-    pictures, right = [], []
+    pictures = []
+    right = []
     for group in _choices(model, data, np.random.default_rng(seed)):
         true = data.truth.positions[group.rows]
         along = true[:, skeleton.tip] - true[:, 0]
@@ -221,18 +234,22 @@ def _rows(samples: Samples, index: NDArray[np.int64]) -> Samples:
 def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
     """The model with its expectation forest and calibration, from held-out images.
 
-    The forest predicts the true error of the chosen pose. The ratios of true to predicted error that bound 90 % of the
-    images, and the limit of what is doubtful, come from predictions for images that their forest has not seen.
+    The forest predicts the true error of the chosen pose. The ratios of true to predicted error
+    that bound 90 % of the images, and the limit of what is doubtful, come from predictions for
+    images that their forest has not seen.
     """
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
     capped = np.minimum(error, _CAP_MM * model.skeleton.relative_size)
-    # errors differ by factors: in millimetres the few that are lost would decide what the forest looks at
+    # errors differ by factors: in millimetres the few that are lost would decide what the forest
+    # looks at
     target = (LOG_UNIT * np.log(capped))[:, None].astype(np.float32)
     n = len(error)
-    fold, predicted = rng.permutation(n) % _FOLDS, np.empty(n)
+    fold = rng.permutation(n) % _FOLDS
+    predicted = np.empty(n)
     for k in range(_FOLDS):
-        seen, unseen = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+        seen = np.flatnonzero(fold != k)
+        unseen = np.flatnonzero(fold == k)
         forest = boost_forest(_rows(trial.clues, seen), target[seen], _EXPECTATION, _SHRINKAGE, rng)
         predicted[unseen] = np.exp(predict(forest, _rows(trial.clues, unseen))[:, 0] / LOG_UNIT)
     gain = capped.mean() / predicted.mean()  # from the middle of what to expect to its mean

@@ -1,4 +1,6 @@
-"""The cascade: regressors joint by joint and round by round, and the candidates they move (Lie-X Algorithm 1)."""
+"""The cascade: regressors joint by joint and round by round, and the candidates they move (Lie-X
+Algorithm 1).
+"""
 
 from __future__ import annotations
 
@@ -24,10 +26,11 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Candidates:
-    """Poses under way, n of them on a set of images: all joints' frames, in the view frame of their image.
+    """Poses under way, n of them on a set of images: all joints' frames, in the view frame of their
+    image.
 
-    image (n,) int32; rotations (n, J, 3, 3); positions (n, J, 3) mm; scale (n,) of the bones; size (n,) of the animal
-    over home size, by which features are normalised.
+    image (n,) int32; rotations (n, J, 3, 3); positions (n, J, 3) mm; scale (n,) of the bones; size
+    (n,) of the animal over home size, by which features are normalised.
     """
 
     image: NDArray[np.int32]
@@ -46,9 +49,12 @@ class Candidates:
         size: Array,
     ) -> Candidates:
         """Candidates with only their base in place."""
-        n, j = len(image), skeleton.n_joints
-        rotations, positions = np.zeros((n, j, 3, 3)), np.zeros((n, j, 3))
-        rotations[:, 0], positions[:, 0] = rotation, position
+        n = len(image)
+        j = skeleton.n_joints
+        rotations = np.zeros((n, j, 3, 3))
+        positions = np.zeros((n, j, 3))
+        rotations[:, 0] = rotation
+        positions[:, 0] = position
         return Candidates(image, rotations, positions, scale.copy(), size)
 
     def __len__(self) -> int:
@@ -69,13 +75,17 @@ class ImageSet:
 
 
 def mm_per_px(looks: Array) -> Array:
-    """How many mm (m,) a pixel of each height map covers at the distance of its view's origin; looks (m, 17)."""
+    """How many mm (m,) a pixel of each height map covers at the distance of its view's origin;
+    looks (m, 17).
+    """
     return looks[:, 16] * looks[:, 13] / looks[:, 0]
 
 
 @dataclass(frozen=True)
 class Cascade:
-    """A skeleton, a method, and one forest per solved joint and round, in order; proposals say where to start."""
+    """A skeleton, a method, and one forest per solved joint and round, in order; proposals say
+    where to start.
+    """
 
     skeleton: Skeleton
     method: Method
@@ -83,7 +93,9 @@ class Cascade:
     proposals: Forest | None = None
 
     def n_values(self, joint: int) -> int:
-        """Length of a joint's correction: base 6, or 7 with the scale; others one for each free axis."""
+        """Length of a joint's correction: base 6, or 7 with the scale; others one for each free
+        axis.
+        """
         if joint == 0:
             return 7 if self.method.regress_scale else 6
         return int(self.skeleton.axes[joint].sum())
@@ -102,8 +114,8 @@ class Cascade:
         )
 
     def steps(self, images: ImageSet, candidates: Candidates) -> Iterator[tuple[int, int]]:
-        """Algorithm 1 as it is written: move the candidates, each by itself, by one forest after the other; yields the
-        joint and the round of each.
+        """Algorithm 1 as it is written: move the candidates, each by itself, by one forest after
+        the other; yields the joint and the round of each.
         """
         for joint, rounds in zip(self.skeleton.solved, self.forests, strict=True):
             if joint:
@@ -148,7 +160,9 @@ class Cascade:
         return Balls.of(self.skeleton)
 
     def metric_samples(self, images: ImageSet, candidates: Candidates) -> Samples:
-        """What the learned metric sees of finished candidates: all joints, and how well they explain the picture."""
+        """What the learned metric sees of finished candidates: all joints, and how well they
+        explain the picture.
+        """
         samples = self.samples(images, candidates, list(range(self.skeleton.n_joints)))
         if not self.method.explains:
             return samples
@@ -192,12 +206,14 @@ class Cascade:
     def labels(
         self, candidates: Candidates, joint: int, truth: Truth
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Corrections (n, n_values) that lead to the truth, in lever units, and which samples are worth learning from.
+        """Corrections (n, n_values) that lead to the truth, in lever units, and which samples are
+        worth learning from.
 
-        Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size. Other joints: the rotation about the free axes
-        that remains, or the one that aims the bone at the true next joint.
+        Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size. Other joints: the rotation
+        about the free axes that remains, or the one that aims the bone at the true next joint.
         """
-        method, i = self.method, candidates.image
+        method = self.method
+        i = candidates.image
         estimate = SE3(candidates.rotations[:, joint], candidates.positions[:, joint])
         true = SE3(truth.rotations[i, joint], truth.positions[i, joint])
         if joint == 0:
@@ -232,7 +248,9 @@ def body_of(balls: Balls) -> explaining.Body:
 
 @dataclass(frozen=True)
 class Truth:
-    """True poses of m images in their view frames: rotations (m, J, 3, 3), positions (m, J, 3) mm, scale (m,)."""
+    """True poses of m images in their view frames: rotations (m, J, 3, 3), positions (m, J, 3) mm,
+    scale (m,).
+    """
 
     rotations: Array
     positions: Array
@@ -240,9 +258,11 @@ class Truth:
 
 
 def aim_about(bone: Array, wanted: Array, axes: NDArray[np.bool_]) -> Array:
-    """Rotation vectors (n, 3) about the free axes that turn `bone` (3,) towards directions `wanted` (n, 3).
+    """Rotation vectors (n, 3) about the free axes that turn `bone` (3,) towards directions `wanted`
+    (n, 3).
 
-    A hinge turns by the angle seen along its axis; a joint with more axes takes the smallest rotation's share of them.
+    A hinge turns by the angle seen along its axis; a joint with more axes takes the smallest
+    rotation's share of them.
     """
     if axes.sum() > 1:
         return aim(bone, wanted)

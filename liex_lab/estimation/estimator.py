@@ -1,4 +1,6 @@
-"""PoseEstimator: depth frames in, a pose with its expected error for each of them out (Lie-X Algorithm 1)."""
+"""PoseEstimator: depth frames in, a pose with its expected error for each of them out (Lie-X
+Algorithm 1).
+"""
 
 from __future__ import annotations
 
@@ -37,13 +39,16 @@ _START_SEED = 20170125
 _SIZE_PASSES = (
     8  # of estimating the size with the size just found; each goes about a third of the way
 )
-_MM_PER_MISFIT = 0.5  # what a squared standard deviation of area or volume weighs against the predicted error, at
+# what a squared standard deviation of area or volume weighs against the predicted error, at
+_MM_PER_MISFIT = 0.5
 # the reference length
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as `Chosen`; found (n,)."""
+    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as
+    `Chosen`; found (n,).
+    """
 
     chosen: Chosen
     found: NDArray[np.bool_]
@@ -55,8 +60,8 @@ class Estimates:
 
 @dataclass(frozen=True)
 class _Sight:
-    """A thing in each of n frames and its candidates: looks (n, 17); rotations (n, K, J, 3, 3), positions (n, K, J, 3)
-    mm, scores (n, K), infinite where there is no such candidate.
+    """A thing in each of n frames and its candidates: looks (n, 17); rotations (n, K, J, 3, 3),
+    positions (n, K, J, 3) mm, scores (n, K), infinite where there is no such candidate.
     """
 
     crops: Crops
@@ -99,14 +104,13 @@ class _Sight:
         return nothing
 
     def opposite(self, usable: NDArray[np.bool_], tip: int) -> _Sight:
-        """The same with only the candidates that point away from where the one with the lowest score does, in frames
-        `usable`, from base to `tip`; the best of them takes the others' places, so that their number stays.
+        """The same with only the candidates that point away from where the one with the lowest
+        score does, in frames `usable`, from base to `tip`; the best of them takes the others'
+        places, so that their number stays.
         """
         _, other, _, away = both_ways(self.positions, self.scores, tip)
-        rows, scores = (
-            np.arange(len(self.scores)),
-            np.where(away & usable[:, None], self.scores, np.inf),
-        )
+        rows = np.arange(len(self.scores))
+        scores = np.where(away & usable[:, None], self.scores, np.inf)
         taken = np.where(away, np.arange(scores.shape[1]), other[:, None])
         some = away.any(axis=1) & usable
         return _Sight(
@@ -132,7 +136,9 @@ class PoseEstimator:
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
-        """An estimator from a bundled model's name or the path of a model file. Raises ModelError."""
+        """An estimator from a bundled model's name or the path of a model file. Raises
+        ModelError.
+        """
         return PoseEstimator(Model.load(find_model(name)))
 
     @property
@@ -189,11 +195,14 @@ class PoseEstimator:
     def candidates(
         self, crops: Crops, looks: Array, size: float, parallel: bool = True
     ) -> tuple[Array, Array, Array, Array]:
-        """The candidates of n frames that outlive the base joint, in their view frames: rotations (n, K, J, 3, 3),
-        positions (n, K, J, 3) mm, scales (n, K), and the metric's scores (n, K), mm at home size.
+        """The candidates of n frames that outlive the base joint, in their view frames: rotations
+        (n, K, J, 3, 3), positions (n, K, J, 3) mm, scales (n, K), and the metric's scores (n, K),
+        mm at home size.
         """
-        method, skeleton = self.model.method, self.skeleton
-        n, k = len(looks), self._starts.shape[1]
+        method = self.model.method
+        skeleton = self.skeleton
+        n = len(looks)
+        k = self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
             crops.moments,
@@ -244,16 +253,18 @@ class PoseEstimator:
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> Estimates:
-        """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home length."""
+        """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home
+        length.
+        """
         size = size if self.model.method.session_size else 1.0
         return self._estimates(self._look(depths, scene, size, parallel)[0], size, parallel)
 
     def hypotheses(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> tuple[Estimates, ...]:
-        """What else the frames (n, H, W) mm may show, each like `estimate`'s answer, which comes first: the best pose
-        that points the other way, and the same two of the second thing of about the animal's size. Rows without such
-        are not found.
+        """What else the frames (n, H, W) mm may show, each like `estimate`'s answer, which comes
+        first: the best pose that points the other way, and the same two of the second thing of
+        about the animal's size. Rows without such are not found.
         """
         size = size if self.model.method.session_size else 1.0
         return self._ways(self._look(depths, scene, size, parallel), size, parallel)
@@ -289,7 +300,9 @@ class PoseEstimator:
     def _look(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
     ) -> tuple[_Sight, _Sight]:
-        """What was taken for the animal, with its candidates, and the next best thing; see `estimate`."""
+        """What was taken for the animal, with its candidates, and the next best thing; see
+        `estimate`.
+        """
         camera_view = self.model.method.camera_view
         crops, others = scene.extract_both(depths, size, parallel, camera_view)
         first = self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
@@ -308,7 +321,8 @@ class PoseEstimator:
 
     def _estimates(self, sight: _Sight, size: float, parallel: bool) -> Estimates:
         """The chosen poses of what was seen, in the camera frame."""
-        crops, usable = sight.crops, sight.usable
+        crops = sight.crops
+        usable = sight.usable
         seen = sight[np.flatnonzero(usable)]
         images = ImageSet(seen.crops.heights, seen.looks, seen.crops.moments)
         picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
@@ -327,9 +341,11 @@ class PoseEstimator:
         scores: Array,
         parallel: bool = True,
     ) -> Chosen:
-        """One pose for each of n height maps out of its candidates, after the last correction, and settled.
+        """One pose for each of n height maps out of its candidates, after the last correction, and
+        settled.
 
-        Where the method takes poses into the picture, it is of the mean and the best ones the one that then fits best.
+        Where the method takes poses into the picture, it is of the mean and the best ones the one
+        that then fits best.
         """
         method = self.model.method
         picked = choose(
@@ -361,7 +377,8 @@ class PoseEstimator:
         first: _Sight,
         second: _Sight,
     ) -> NDArray[np.bool_]:
-        """Where (n,) the second of two things of about the animal's size is the animal, and not the first.
+        """Where (n,) the second of two things of about the animal's size is the animal, and not the
+        first.
 
         Told by area and volume and, where the metric has learned what is no animal, by its scores.
         """
@@ -375,15 +392,18 @@ class PoseEstimator:
         return second.scores.min(axis=1) + likeness[1] < first.scores.min(axis=1) + likeness[0]
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm of the recording.
+        """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm
+        of the recording.
 
-        The area seen from above gives the first guess; the model then measures the spine in every frame, the median of
-        the frames that it trusts most becomes the next guess, a few times over.
+        The area seen from above gives the first guess; the model then measures the spine in every
+        frame, the median of the frames that it trusts most becomes the next guess, a few times
+        over.
         """
         guess = self.size_from_area(scene.area_mm2)
         if not self.model.method.session_size:
             return 1.0
-        # the last correction has learned how long animals of usual shape are: it would pull this one's size to theirs
+        # the last correction has learned how long animals of usual shape are: it would pull this
+        # one's size to theirs
         uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
             estimates = uncorrected.estimate(sample, scene, guess)
@@ -395,8 +415,11 @@ class PoseEstimator:
         return guess
 
     def sizes_told(self, estimates: Estimates) -> Array:
-        """What frames tell of the animal's size over the home size, those of them that the model trusts most."""
-        scale, trust = estimates.chosen.told_scale, estimates.chosen.told_trust
+        """What frames tell of the animal's size over the home size, those of them that the model
+        trusts most.
+        """
+        scale = estimates.chosen.told_scale
+        trust = estimates.chosen.told_trust
         seen = np.flatnonzero(estimates.found)
         n_trusted = (
             len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
@@ -409,8 +432,12 @@ class PoseEstimator:
 
 
 def _pack(forests: list[Forest]) -> kernels.Trees:
-    """Forests of equally many trees in one node array; their leaves, of different widths, in one row of numbers."""
-    nodes, roots, n_nodes = [], [], 0
+    """Forests of equally many trees in one node array; their leaves, of different widths, in one
+    row of numbers.
+    """
+    nodes = []
+    roots = []
+    n_nodes = 0
     for forest in forests:
         shifted = forest.nodes.copy()
         shifted[shifted[:, 2] >= 0, 2] += n_nodes

@@ -1,8 +1,10 @@
-"""The last correction: the chosen pose's joints, all at once, moved by what a forest has learned of chosen poses.
+"""The last correction: the chosen pose's joints, all at once, moved by what a forest has learned of
+chosen poses.
 
-Candidates are moved by forests that were trained on starts as they come; their weighted mean is not one of them, and
-is off in ways of its own. A small boosted forest that is trained on chosen poses of images that no other tree has seen
-takes out what of this can be foretold. It asks about one pose a frame and so costs next to nothing.
+Candidates are moved by forests that were trained on starts as they come; their weighted mean is not
+one of them, and is off in ways of its own. A small boosted forest that is trained on chosen poses
+of images that no other tree has seen takes out what of this can be foretold. It asks about one pose
+a frame and so costs next to nothing.
 """
 
 from __future__ import annotations
@@ -24,10 +26,13 @@ _LOG_UNIT = 500.0  # a threshold is an integer
 
 
 def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Chosen:
-    """The chosen poses of n frames, whose height maps are `images`, after the model's last correction."""
+    """The chosen poses of n frames, whose height maps are `images`, after the model's last
+    correction.
+    """
     if model.corrector is None or not len(chosen.score):
         return chosen
-    skeleton, frames = model.skeleton, chosen.pose.frames(model.skeleton)
+    skeleton = model.skeleton
+    frames = chosen.pose.frames(model.skeleton)
     moves = predict(model.corrector, pose_samples(chosen.pose, model, images, size)).astype(float)
     moves = size * moves.reshape(len(moves), -1, 3)
     joints = frames.translation + np.einsum("nij,nkj->nki", frames.rotation[:, 0], moves)
@@ -35,10 +40,12 @@ def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Ch
 
 
 def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Samples:
-    """What a corrector sees of one pose for each of n height maps: what lies about every joint, and beside the numbers
-    that every forest sees how many mm a pixel covers, for an outline loses about one of them all round.
+    """What a corrector sees of one pose for each of n height maps: what lies about every joint, and
+    beside the numbers that every forest sees how many mm a pixel covers, for an outline loses about
+    one of them all round.
     """
-    frames, n = pose.frames(model.skeleton), len(pose.scale)
+    frames = pose.frames(model.skeleton)
+    n = len(pose.scale)
     candidates = Candidates(
         np.arange(n, dtype=np.int32),
         frames.rotation,
@@ -53,8 +60,8 @@ def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Sam
 
 
 def moves_to(pose: Pose, model: Model, joints: Array, size: float) -> Array:
-    """What a corrector should say (n, 3 J): from the joints of the poses (n) to the true ones (n, J, 3) mm, seen from
-    the base joint, at home size.
+    """What a corrector should say (n, 3 J): from the joints of the poses (n) to the true ones (n,
+    J, 3) mm, seen from the base joint, at home size.
     """
     frames = pose.frames(model.skeleton)
     moves = np.einsum("nji,nkj->nki", frames.rotation[:, 0], joints - frames.translation) / size

@@ -1,7 +1,9 @@
-"""Which way an animal faces, told by a small network that sees the whole of it laid along a candidate.
+"""Which way an animal faces, told by a small network that sees the whole of it laid along a
+candidate.
 
-The learned metric sees two points at a time. On bodies unlike those that it has learned from, head and tail are what it
-confuses; all of the outline, the ears and the slope of the back at once tell them apart where it is unsure.
+The learned metric sees two points at a time. On bodies unlike those that it has learned from, head
+and tail are what it confuses; all of the outline, the ears and the slope of the back at once tell
+them apart where it is unsure.
 """
 
 from __future__ import annotations
@@ -19,12 +21,19 @@ from liex_lab.mlp import Network, descend
 Array = NDArray[np.float64]
 
 # at the reference length: how far the picture reaches along and across the animal, and its step
-_ALONG_MM, _ACROSS_MM, _STEP_MM = 50.0, 25.0, 2.5
+_ALONG_MM = 50.0
+_ACROSS_MM = 25.0
+_STEP_MM = 2.5
 _HEIGHT_MM = 10.0  # what stands for one in the network
 UNSURE_MM = 15.0  # scores of both ways nearer than this, at the reference length, are doubted
 _MM_PER_LOGIT = 4.0  # what the network's word weighs against scores, at the reference length
-_MOST_LOGIT, _DECIMALS = 6.0, 6
-_HIDDEN, _EPOCHS, _BATCH, _RATE, _WEIGHT_DECAY = (128, 32), 15, 256, 1e-3, 1e-2
+_MOST_LOGIT = 6.0
+_DECIMALS = 6
+_HIDDEN = (128, 32)
+_EPOCHS = 15
+_BATCH = 256
+_RATE = 1e-3
+_WEIGHT_DECAY = 1e-2
 
 
 @dataclass(frozen=True)
@@ -36,8 +45,8 @@ class Facing:
 
     @staticmethod
     def fit(pictures: NDArray[np.float32], right: NDArray[np.bool_], seed: int) -> Network:
-        """Learned from pictures (m, A, B), see `laid_along`, and whether the poses point the right way (m,); what an
-        animal looks like in a mirror is learned, too.
+        """Learned from pictures (m, A, B), see `laid_along`, and whether the poses point the right
+        way (m,); what an animal looks like in a mirror is learned, too.
         """
         inputs = np.concatenate([_flat(pictures), _flat(pictures[:, :, ::-1])])
         labels = np.concatenate([right, right])
@@ -61,10 +70,11 @@ class Facing:
         )
 
     def logits(self, images: ImageSet, joints: Array, size: float) -> Array:
-        """How much speaks for it (n,) that poses with these joints (n, J, 3) mm, view frame, point the right way.
+        """How much speaks for it (n,) that poses with these joints (n, J, 3) mm, view frame, point
+        the right way.
 
-        In double precision and then rounded: a product's last bits depend on how many frames are asked about at once,
-        and a frame's pose must not.
+        In double precision and then rounded: a product's last bits depend on how many frames are
+        asked about at once, and a frame's pose must not.
         """
         pictures = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
         views = np.concatenate([pictures, pictures[:, :, ::-1]])
@@ -74,21 +84,21 @@ class Facing:
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
         """The scores (n, K) mm at home size of candidates (n, K, J, 3) mm after the network's word.
 
-        Where both ways have a candidate and their best scores are near, and what the network says outweighs the
-        difference, the candidates of the way that was ahead fall behind, by as much as it is outweighed.
+        Where both ways have a candidate and their best scores are near, and what the network says
+        outweighs the difference, the candidates of the way that was ahead fall behind, by as much
+        as it is outweighed.
         """
         unit = self.skeleton.relative_size
         best, opposite, ahead, away = both_ways(positions, scores, self.skeleton.tip)
         doubted = np.flatnonzero(ahead < UNSURE_MM * unit)
         if not len(doubted):
             return scores
-        seen, poses = (
-            images[np.tile(doubted, 2)],
-            [positions[doubted, k[doubted]] for k in (best, opposite)],
-        )
+        seen = images[np.tile(doubted, 2)]
+        poses = [positions[doubted, k[doubted]] for k in (best, opposite)]
         first, second = np.split(self.logits(seen, np.concatenate(poses), size), 2)
         total = ahead[doubted] + _MM_PER_LOGIT * unit * (first - second)
-        wrong, behind = doubted[total < 0], (ahead[doubted] - total)[total < 0]
+        wrong = doubted[total < 0]
+        behind = (ahead[doubted] - total)[total < 0]
         judged = scores.copy()
         judged[wrong] += np.where(away[wrong], 0.0, behind[:, None])
         return judged
@@ -97,10 +107,12 @@ class Facing:
 def both_ways(
     positions: Array, scores: Array, tip: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Of candidates (n, K, J, 3) mm with scores (n, K): which (n,) is best, which is best of those that point the other
-    way, from base to `tip`, by how much (n,) it is behind, infinite or NaN where there is none, and which (n, K) do.
+    """Of candidates (n, K, J, 3) mm with scores (n, K): which (n,) is best, which is best of those
+    that point the other way, from base to `tip`, by how much (n,) it is behind, infinite or NaN
+    where there is none, and which (n, K) do.
     """
-    rows, best = np.arange(len(scores)), scores.argmin(axis=1)
+    rows = np.arange(len(scores))
+    best = scores.argmin(axis=1)
     way = positions[:, :, tip] - positions[:, :, 0]
     away = np.einsum("nkd,nd->nk", way, way[rows, best]) < 0
     other = np.where(away, scores, np.inf)
@@ -112,9 +124,11 @@ def both_ways(
 def laid_along(
     skeleton: Skeleton, images: ImageSet, joints: Array, size: Array
 ) -> NDArray[np.float32]:
-    """Pictures (n, A, B) of animals laid along poses with joints (n, J, 3) mm, view frame; size (n,) over home size.
+    """Pictures (n, A, B) of animals laid along poses with joints (n, J, 3) mm, view frame; size
+    (n,) over home size.
 
-    The way from base to tip goes up the picture's first axis; heights in units of `_HEIGHT_MM` at home size.
+    The way from base to tip goes up the picture's first axis; heights in units of `_HEIGHT_MM` at
+    home size.
     """
     unit = skeleton.relative_size
     along = np.arange(-_ALONG_MM, _ALONG_MM + 1e-6, _STEP_MM) * unit

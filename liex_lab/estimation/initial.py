@@ -10,9 +10,11 @@ from liex_lab.geometry import so3
 
 Array = NDArray[np.float64]
 
-_BEHIND = 0.42  # of the body length: the base starts this far from the centroid, towards the end it belongs to
+# of the body length: the base starts this far from the centroid, towards the end it belongs to
+_BEHIND = 0.42
 _HIGH = 0.2  # of the body length: the base starts this high above the floor
-_LOW = 0.05  # of the body length: the base of an animal in the camera view starts this far below its mean height
+# of the body length: the base of an animal in the camera view starts this far below its mean height
+_LOW = 0.05
 _JITTER = (
     0.12,
     0.7,
@@ -22,7 +24,9 @@ _JITTER_MM = 2.0  # of the places, for an animal of the reference length
 
 
 def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> Array:
-    """Standard numbers (n_images, n_candidates, 4): heading, size and position of each start; see `start_poses`."""
+    """Standard numbers (n_images, n_candidates, 4): heading, size and position of each start; see
+    `start_poses`.
+    """
     starts = rng.standard_normal((n_images, n_candidates, 4))
     starts[..., 3] = rng.uniform(-1.0, 1.0, (n_images, n_candidates))
     return starts
@@ -38,13 +42,15 @@ def start_poses(
     camera_view: bool = False,
     home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array]:
-    """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n animals.
+    """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n
+    animals.
 
-    moments (n, 9) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of the animal over home.
-    axis_start: along the animal's long axis, every other start the other way round, the more spread out the rounder
-    the animal looks (METHOD lesson 8). Otherwise the paper's start: any heading in (-pi, pi), the base at the centroid
-    and at the animal's mean height, bones scaled by 0.9 to 1.1. camera_view: heights are not those above a floor, and
-    such an animal, started along its axis, rises or sinks as its back does. home_turn: rotation vector by which the
+    moments (n, 9) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of
+    the animal over home. axis_start: along the animal's long axis, every other start the other way
+    round, the more spread out the rounder the animal looks (METHOD lesson 8). Otherwise the paper's
+    start: any heading in (-pi, pi), the base at the centroid and at the animal's mean height, bones
+    scaled by 0.9 to 1.1. camera_view: heights are not those above a floor, and such an animal,
+    started along its axis, rises or sinks as its back does. home_turn: rotation vector by which the
     home pose lies otherwise than seen from above, as a palm that is shown.
     """
     n, k = size.shape
@@ -73,8 +79,10 @@ def start_poses(
         position[..., :2] = centre
         position[..., 2] = mean_height
     rotation = np.zeros((n, k, 3, 3))
-    rotation[..., 0, 0], rotation[..., 0, 1] = np.cos(heading), -np.sin(heading)
-    rotation[..., 1, 0], rotation[..., 1, 1] = np.sin(heading), np.cos(heading)
+    rotation[..., 0, 0] = np.cos(heading)
+    rotation[..., 0, 1] = -np.sin(heading)
+    rotation[..., 1, 0] = np.sin(heading)
+    rotation[..., 1, 1] = np.cos(heading)
     rotation[..., 2, 2] = 1.0
     if axis_start and camera_view:
         rise = (
@@ -92,7 +100,9 @@ def start_poses(
 def _lifted(rise: Array) -> Array:
     """Rotations (..., 3, 3) that lift a body's front by `rise` (...) rad."""
     rotation = np.zeros((*rise.shape, 3, 3))
-    rotation[..., 0, 0], rotation[..., 0, 2] = np.cos(rise), -np.sin(rise)
-    rotation[..., 2, 0], rotation[..., 2, 2] = np.sin(rise), np.cos(rise)
+    rotation[..., 0, 0] = np.cos(rise)
+    rotation[..., 0, 2] = -np.sin(rise)
+    rotation[..., 2, 0] = np.sin(rise)
+    rotation[..., 2, 2] = np.cos(rise)
     rotation[..., 1, 1] = 1.0
     return rotation

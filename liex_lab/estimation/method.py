@@ -1,4 +1,6 @@
-"""The variants of the method: the paper's, and ours. One code reads these numbers; nothing else tells them apart."""
+"""The variants of the method: the paper's, and ours. One code reads these numbers; nothing else
+tells them apart.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,8 @@ class Method:
         0  # rounds of the base joint where they are not as many as the others'; 0: as many
     )
     refine_steps: int = 0  # of taking a pose into the picture
-    refined: int = 0  # candidates that are taken there beside the mean of the best; the one that fits is chosen
+    # candidates that are taken there beside the mean of the best; the one that fits is chosen
+    refined: int = 0
     explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
     tells_facing: bool = (
         False  # a network tells head from tail where the metric is unsure, see `facing`
@@ -92,7 +95,9 @@ class Method:
         return reach
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the model file and its card; what only some animals have is left out where it is unset."""
+        """Plain values, for the model file and its card; what only some animals have is left out
+        where it is unset.
+        """
         return {
             name: value
             for name, value in asdict(self).items()
@@ -180,7 +185,8 @@ METHODS = {
 }
 
 
-# a hand may turn any side to the camera, and its fingers' bones are short beside their distance from the base
+# a hand may turn any side to the camera, and its fingers' bones are short beside their distance
+# from the base
 _HAND: dict[str, Any] = {
     "camera_view": False,
     "rounds": 3,
@@ -209,7 +215,8 @@ _HAND: dict[str, Any] = {
 }
 
 
-# what an animal does otherwise than the mouse: fields of its method at home size, the rest is the mouse's, scaled
+# what an animal does otherwise than the mouse: fields of its method at home size, the rest is the
+# mouse's, scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("mouse", "default"): {"tells_facing": True},
     ("fish", "default"): {
@@ -257,8 +264,8 @@ _LENGTHS = (
 def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
     """The method of a variant's name for an animal; None is the mouse.
 
-    Lengths are the mouse's over its home length times the animal's, unless the animal has its own; where the animal is
-    looked at along the optical axis, every variant does so.
+    Lengths are the mouse's over its home length times the animal's, unless the animal has its own;
+    where the animal is looked at along the optical axis, every variant does so.
     """
     if variant not in METHODS:
         raise PlanError(f"there is no variant '{variant}'; known are {', '.join(METHODS)}")

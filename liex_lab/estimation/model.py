@@ -1,4 +1,6 @@
-"""A trained model: skeleton, method, forests, metric and calibration, as one .npz file without pickle."""
+"""A trained model: skeleton, method, forests, metric and calibration, as one .npz file without
+pickle.
+"""
 
 from __future__ import annotations
 
@@ -50,10 +52,11 @@ _EPOCH = (
 class Calibration:
     """What the metric's score means, learned on images that no tree has seen.
 
-    error = offset + slope * score + spread_slope * spread, mm at home size; quantiles (2,): the ratio of true to
-    predicted error that 5 % and 95 % of the images stay below; joint_share (J,): each joint's error over the mean;
-    doubtful_mm: a predicted error above this, at home size, is flagged; area_mm2: usual area of a home-sized animal
-    seen from above; logarithmic: the expectation forest predicts LOG_UNIT times the logarithm of the error.
+    error = offset + slope * score + spread_slope * spread, mm at home size; quantiles (2,): the
+    ratio of true to predicted error that 5 % and 95 % of the images stay below; joint_share (J,):
+    each joint's error over the mean; doubtful_mm: a predicted error above this, at home size, is
+    flagged; area_mm2: usual area of a home-sized animal seen from above; logarithmic: the
+    expectation forest predicts LOG_UNIT times the logarithm of the error.
     """
 
     offset: float = 0.0
@@ -70,9 +73,10 @@ class Calibration:
 class Model:
     """Everything an estimator needs.
 
-    expectation turns what is known of a chosen pose into its expected error; card says how the model was made; pruner
-    is the small metric that sees the base joint only; corrector moves the joints of the chosen pose once more; settler:
-    the table of `settle.Settler`, where the method settles; facing: what tells head from tail, see `facing`.
+    expectation turns what is known of a chosen pose into its expected error; card says how the
+    model was made; pruner is the small metric that sees the base joint only; corrector moves the
+    joints of the chosen pose once more; settler: the table of `settle.Settler`, where the method
+    settles; facing: what tells head from tail, see `facing`.
     """
 
     cascade: Cascade
@@ -135,14 +139,17 @@ class Model:
 
     @staticmethod
     def load(path: Path) -> Model:
-        """Read a model file. Raises ModelError where it is not one, is damaged, or is newer than this program."""
+        """Read a model file. Raises ModelError where it is not one, is damaged, or is newer than
+        this program.
+        """
         try:
             # opened here, for numpy leaves a damaged archive open
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 head = json.loads(archive["head"].tobytes())
                 if head.get("schema", 0) > SCHEMA:
                     raise ModelError(
-                        f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade liex_lab"
+                        f"{path} was made by a newer liex_lab (schema {head['schema']}); upgrade "
+                        "liex_lab"
                     )
                 names = sorted({name[:3] for name in archive.files if name[0].isdigit()})
                 forests = [
@@ -155,7 +162,8 @@ class Model:
             for name in ("quantiles", "joint_share"):
                 values[name] = tuple(values[name])
             calibration = Calibration(**values)
-            table, card = head["skeleton"], head["card"]
+            table = head["skeleton"]
+            card = head["card"]
         except FileNotFoundError:
             raise ModelError(
                 f"there is no model file {path}; name a bundled model or the path of an .npz"
@@ -170,7 +178,8 @@ class Model:
         extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
             raise ModelError(
-                f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it again"
+                f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it "
+                "again"
             )
         named = dict(zip(extra, forests[n_regressors:], strict=True))
         stops = np.cumsum(rounds).tolist()
@@ -227,7 +236,9 @@ _PARTS = ("tests", "threshold", "kind", "is_leaf", "roots", "leaves")
 
 
 def _split(forest: Forest) -> dict[str, NDArray[Any]]:
-    """A forest as arrays that compress well: the child pointers follow from which nodes are leaves."""
+    """A forest as arrays that compress well: the child pointers follow from which nodes are
+    leaves.
+    """
     words = forest.nodes
     inner = words[:, 2] >= 0
     tests = np.ascontiguousarray(words[inner, :2]).view(np.int8).reshape(-1, 8)
@@ -244,10 +255,12 @@ def _split(forest: Forest) -> dict[str, NDArray[Any]]:
 def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     """The inverse of `_split`.
 
-    Growth numbers nodes and leaves in one order: a tree's children are appended as a pair when their parent splits, the
-    left side of the stack first, so walking the trees again in that order gives every pointer back.
+    Growth numbers nodes and leaves in one order: a tree's children are appended as a pair when
+    their parent splits, the left side of the stack first, so walking the trees again in that order
+    gives every pointer back.
     """
-    n_inner, n_leaves = len(parts["threshold"]), parts["leaves"].shape[1]
+    n_inner = len(parts["threshold"])
+    n_leaves = parts["leaves"].shape[1]
     n_nodes = n_inner + n_leaves
     is_leaf = np.unpackbits(parts["is_leaf"], count=n_nodes).astype(bool)
     nodes = np.zeros((n_nodes, 4), np.int32)

@@ -1,7 +1,9 @@
-"""Initial poses that are seen and not drawn: every tree of a forest says how the animal may lie, from one look at it.
+"""Initial poses that are seen and not drawn: every tree of a forest says how the animal may lie,
+from one look at it.
 
-An animal that turns any side to the camera has no usual orientation to start from. Trees are asked one by one and their
-answers never averaged: two orientations that look alike have no useful mean, but both are worth a candidate.
+An animal that turns any side to the camera has no usual orientation to start from. Trees are asked
+one by one and their answers never averaged: two orientations that look alike have no useful mean,
+but both are worth a candidate.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ def views_along_axis(
 ) -> tuple[Samples, Array, Array]:
     """Each of m animals as seen from its centre, x along its long axis, one way and the other.
 
-    size (m,) over home size. Samples (2 m), an image's two in a row, and the frames: (2 m, 3, 3) and (2 m, 3) mm.
+    size (m,) over home size. Samples (2 m), an image's two in a row, and the frames: (2 m, 3, 3)
+    and (2 m, 3) mm.
     """
     m = len(size)
     image = np.repeat(np.arange(m, dtype=np.int32), N_WAYS)
@@ -73,7 +76,8 @@ def train_proposals(
     method: Method,
     rng: np.random.Generator,
 ) -> tuple[Forest, NDArray[np.bool_]]:
-    """A forest from the true bases of m images, (m, 3, 3) and (m, 3) mm, and which images each tree saw (T, m).
+    """A forest from the true bases of m images, (m, 3, 3) and (m, 3) mm, and which images each tree
+    saw (T, m).
 
     keep (m,): the images to learn from.
     """

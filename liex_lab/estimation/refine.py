@@ -1,4 +1,6 @@
-"""A pose taken into the picture: the last step, after the regressors and the learned metric have said about where."""
+"""A pose taken into the picture: the last step, after the regressors and the learned metric have
+said about where.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,12 @@ Array = NDArray[np.float64]
 
 _ROBUST_MM = 10.0  # in tenths of the balls' usual radius: a reading this far off counts a quarter
 _BESIDE = 0.3  # what a ball beside the animal weighs against a reading
-_FIRST_STEPS, _GO_ON = (
-    1,
-    2,
-)  # that all poses take, and how many of them take the others: those that then lie best
+# that all poses take, and how many of them take the others: those that then lie best
+_FIRST_STEPS = 1
+_GO_ON = 2
 _BESIDE_MM = 4.0  # in that unit: what it weighs in the choice, if all balls were beside it
-# what it costs to leave the pose that the regressors found, in squares of that unit: a radian of the base, a unit of
+# what it costs to leave the pose that the regressors found, in squares of that unit: a radian of
+# the base, a unit of
 # place, of log scale, and a radian of a joint
 _PRIOR = np.array([1e4, 0.5, 1e4, 60.0])
 
@@ -63,10 +65,14 @@ class Refiner:
     def refine(
         self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float, n_steps: int
     ) -> Pose:
-        """Poses (n, K) in their view frames, each moved into its height map (n, S, S) cut as looks (n, 17) say."""
+        """Poses (n, K) in their view frames, each moved into its height map (n, S, S) cut as looks
+        (n, 17) say.
+        """
         unit = self.body.unit_mm * size
-        rotation, position = pose.root.rotation.copy(), pose.root.translation.copy()
-        angles, scale = pose.angles.copy(), pose.scale.copy()
+        rotation = pose.root.rotation.copy()
+        position = pose.root.translation.copy()
+        angles = pose.angles.copy()
+        scale = pose.scale.copy()
         wishes = kernels.Wishes(
             _ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2])
         )
@@ -96,16 +102,19 @@ class Refiner:
         return out.reshape(n, k, -1).astype(float)
 
     def best(self, poses: Pose, images: ImageSet, size: float, n_steps: int) -> tuple[Pose, Array]:
-        """The one of poses (n, K) that lies best in the picture once it was taken there (n), and its fit (n, N_FIT).
+        """The one of poses (n, K) that lies best in the picture once it was taken there (n), and
+        its fit (n, N_FIT).
 
         A first step tells which are worth the others.
         """
-        kept, rows = poses, np.arange(len(poses.scale))[:, None]
+        kept = poses
+        rows = np.arange(len(poses.scale))[:, None]
         for n_more in (min(_FIRST_STEPS, n_steps), max(n_steps - _FIRST_STEPS, 0)):
             moved = self.refine(kept, images.heights, images.looks, size, n_more)
             fit = self.fit(moved, images.heights, images.looks, images.moments, size)
             order = rows, np.argsort(_apart(fit), axis=1, kind="stable")[:, :_GO_ON]
-            kept, fit = moved[order], fit[order]
+            kept = moved[order]
+            fit = fit[order]
         return kept[:, 0], fit[:, 0]
 
 

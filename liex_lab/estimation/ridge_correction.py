@@ -1,8 +1,10 @@
-"""The last step of an animal that is one chain, seen along the optical axis: its pose settles under its back.
+"""The last step of an animal that is one chain, seen along the optical axis: its pose settles under
+its back.
 
-The regressors see a long animal's depth from its base joint, at one end of it. Once the whole chain is in place, all of
-its back can be held against it: a linear map, fitted on pictures that no tree has seen, takes what is seen along the
-mid-line to how much deeper each joint lies, how far the chain has slid along itself, and how much larger the animal is.
+The regressors see a long animal's depth from its base joint, at one end of it. Once the whole chain
+is in place, all of its back can be held against it: a linear map, fitted on pictures that no tree
+has seen, takes what is seen along the mid-line to how much deeper each joint lies, how far the
+chain has slid along itself, and how much larger the animal is.
 """
 
 from __future__ import annotations
@@ -25,18 +27,19 @@ N_OTHERS = 15  # clues that are not of one joint
 _RIDGE = 1e-2  # of the features' variance
 _LEAST_SPREAD = 1e-6
 _TAIL = 0.01  # of what a clue was seen to be: beyond it is taken for the last that was seen
-_DECIMALS = 12  # a product's last bits depend on how many frames are asked about at once, and a frame's pose must not
-_SLID_SHARE, _SIZE_LOG = (
-    0.1,
-    0.25,
-)  # of the length, and in logarithms: poses farther off are not learned from
+# a product's last bits depend on how many frames are asked about at once, and a frame's pose must
+# not
+_DECIMALS = 12
+# of the length, and in logarithms: poses farther off are not learned from
+_SLID_SHARE = 0.1
+_SIZE_LOG = 0.25
 
 
 @dataclass(frozen=True)
 class Settler:
-    """table (F, J + 4): the least and most of each of the `clues`, and the weights that lead from them to the rise of
-    each joint, the slide along the chain (both over the animal's length) and the logarithm of the true over the
-    assumed size.
+    """table (F, J + 4): the least and most of each of the `clues`, and the weights that lead from
+    them to the rise of each joint, the slide along the chain (both over the animal's length) and
+    the logarithm of the true over the assumed size.
     """
 
     skeleton: Skeleton
@@ -56,7 +59,9 @@ class Settler:
         true_joints: Array,
         true_size: Array,
     ) -> Settler:
-        """From chosen poses (n) with their assumed sizes (n,) and the truth, all in the view frame."""
+        """From chosen poses (n) with their assumed sizes (n,) and the truth, all in the
+        view frame.
+        """
         joints = pose.joints(skeleton)
         features = clues(skeleton, pose, joints, images, size)
         length = skeleton.length * size
@@ -67,15 +72,18 @@ class Settler:
         good = (np.linalg.norm(off, axis=-1).mean(axis=1) < _SLID_SHARE) & (
             np.abs(grown) < _SIZE_LOG
         )
-        x, y = features[good], labels[good]
+        x = features[good]
+        y = labels[good]
         bounds = np.quantile(x, [_TAIL, 1.0 - _TAIL], axis=0)
         x = np.clip(x, *bounds)
-        # from all of them: those that see its far end best were mostly taken for smaller than they are
+        # from all of them: those that see its far end best were mostly taken for smaller than they
+        # are
         return Settler(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
     def settle(self, pose: Pose, images: ImageSet, size: float) -> Settled:
         """Poses (n) put right, and what each of them says about the animal's size."""
-        skeleton, n = self.skeleton, len(pose.scale)
+        skeleton = self.skeleton
+        n = len(pose.scale)
         joints = pose.joints(skeleton)
         seen = clues(skeleton, pose, joints, images, np.full(n, size))
         told = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(
@@ -93,8 +101,9 @@ class Settler:
 
 @dataclass(frozen=True)
 class Settled:
-    """Poses (n) under their backs; grown (n,): the logarithm of the animal's true over its assumed size as each tells;
-    clear (n,): how much of the animal's far end it sees, without which no one knows its size.
+    """Poses (n) under their backs; grown (n,): the logarithm of the animal's true over its assumed
+    size as each tells; clear (n,): how much of the animal's far end it sees, without which no one
+    knows its size.
     """
 
     pose: Pose
@@ -103,8 +112,11 @@ class Settled:
 
 
 def _linear(x: Array, y: Array) -> Array:
-    """Ridge regression: weights (F, K) from clues (n, F), of which the first is constant, to labels (n, K)."""
-    middle, spread = x.mean(axis=0), x.std(axis=0)
+    """Ridge regression: weights (F, K) from clues (n, F), of which the first is constant, to labels
+    (n, K).
+    """
+    middle = x.mean(axis=0)
+    spread = x.std(axis=0)
     per = np.where(
         spread > _LEAST_SPREAD, 1.0 / np.maximum(spread, _LEAST_SPREAD), 0.0
     )  # a constant tells nothing
@@ -131,10 +143,12 @@ def tangents(joints: Array) -> Array:
 
 
 def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size: Array) -> Array:
-    """What is seen along the mid-lines of poses (n) with joints (n, J, 3) mm, (n, F), lengths over the animal's own.
+    """What is seen along the mid-lines of poses (n) with joints (n, J, 3) mm, (n, F), lengths over
+    the animal's own.
 
-    A constant, the height of the back over each joint and how much of it is seen, how far the animal reaches past the
-    chain's ends, how the base lies, how much the animal is bent, how large a pixel is, and the bones' scale.
+    A constant, the height of the back over each joint and how much of it is seen, how far the
+    animal reaches past the chain's ends, how the base lies, how much the animal is bent, how large
+    a pixel is, and the bones' scale.
     """
     n, j = joints.shape[:2]
     length = skeleton.length * size
@@ -145,7 +159,8 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     share = np.minimum(seen[:, j : 2 * j] * 2.0, 1.0)
     back = np.clip(seen[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (share > 0)
     ends = seen[:, 2 * j :] / length[:, None]
-    rise, roll = pose.root.rotation[:, 2, 0], pose.root.rotation[:, 2, 1]
+    rise = pose.root.rotation[:, 2, 0]
+    roll = pose.root.rotation[:, 2, 1]
     bent = np.abs(pose.angles[..., 2]).sum(axis=1)
     pixel = mm_per_px(images.looks) / length
     return np.column_stack(

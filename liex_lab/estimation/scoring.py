@@ -1,4 +1,6 @@
-"""From many candidates to one pose: the learned metric's choice, its average, and how far it may be off."""
+"""From many candidates to one pose: the learned metric's choice, its average, and how far it may be
+off.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +21,24 @@ from liex_lab.geometry import SE3, so3
 Array = NDArray[np.float64]
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
-# at the reference length: the least error that is ever expected, and what stands for the score of the opposite
+# at the reference length: the least error that is ever expected, and what stands for the score of
+# the opposite
 # direction where no candidate points there
-LEAST_MM, _NO_OPPOSITE_MM = 0.1, 40.0
+LEAST_MM = 0.1
+_NO_OPPOSITE_MM = 40.0
 
 
 @dataclass(frozen=True)
 class Chosen:
     """One pose for each of n frames, in the view frame of the frame, NaN where no animal was found.
 
-    pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n, J) of each joint;
-    error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home size behind it; doubts (n, 4) mm at
-    home size: best score, the best score of a candidate that points the other way, the spread of the good scores, and
-    how far the candidates of all scores lie from the chosen pose; fit (n, F): how well the pose explains the picture,
-    where that is asked, see `_explain`; told_scale (n,): the animal's size over home size as this frame alone tells it,
-    and told_trust (n,), the higher the better.
+    pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n,
+    J) of each joint; error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home
+    size behind it; doubts (n, 4) mm at home size: best score, the best score of a candidate that
+    points the other way, the spread of the good scores, and how far the candidates of all scores
+    lie from the chosen pose; fit (n, F): how well the pose explains the picture, where that is
+    asked, see `_explain`; told_scale (n,): the animal's size over home size as this frame alone
+    tells it, and told_trust (n,), the higher the better.
     """
 
     pose: Pose
@@ -64,10 +69,11 @@ def choose(
 ) -> Chosen:
     """The weighted mean of the best candidates, on the manifold.
 
-    rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k` candidates with the
-    lowest predicted error that lie near the best one are averaged with weights exp(-(score - best) / tau) (METHOD
-    lesson 3). In a chain each bone then turns by the smallest rotation onto its mean direction, and the scale follows
-    from the total length; a tree is averaged joint by joint, see `mean_pose`.
+    rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k`
+    candidates with the lowest predicted error that lie near the best one are averaged with weights
+    exp(-(score - best) / tau) (METHOD lesson 3). In a chain each bone then turns by the smallest
+    rotation onto its mean direction, and the scale follows from the total length; a tree is
+    averaged joint by joint, see `mean_pose`.
     """
     order = np.argsort(scores, axis=1, kind="stable")[:, : method.top_k]
     score = np.take_along_axis(scores, order, axis=1)
@@ -117,9 +123,10 @@ def choose(
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
     """The weighted mean of poses of a tree, on the group: n means over k poses each.
 
-    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the chordal mean rotation
-    and the mean place; every other joint the mean of its turns relative to its parent about the axes that are free, so
-    bones keep their lengths and hinges their axes; the scale is the mean scale.
+    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the
+    chordal mean rotation and the mean place; every other joint the mean of its turns relative to
+    its parent about the axes that are free, so bones keep their lengths and hinges their axes; the
+    scale is the mean scale.
     """
     root = SE3(
         so3.nearest_rotation(np.einsum("nk,nkab->nab", weight, turned[:, :, 0])),
@@ -144,7 +151,9 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
 def with_best(
     skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array
 ) -> Pose:
-    """Poses (n, 1 + k): the given ones (n), and the k candidates with the lowest scores (n, K) of each frame."""
+    """Poses (n, 1 + k): the given ones (n), and the k candidates with the lowest scores (n, K) of
+    each frame.
+    """
     order = np.argsort(scores, axis=1, kind="stable")[:, :k]
     n, k, j = *order.shape, skeleton.n_joints
     turned = np.take_along_axis(rotations, order[..., None, None, None], axis=1).reshape(
@@ -166,7 +175,9 @@ def with_best(
 def _doubts(
     positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float
 ) -> Array:
-    """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good scores (n, k)."""
+    """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good
+    scores (n, k).
+    """
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
     opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
@@ -177,7 +188,9 @@ def _doubts(
 def with_expected_error(
     chosen: Chosen, model: Model, moments: Array, looks: Array, size: float
 ) -> Chosen:
-    """The same poses with the error that the model's expectation forest predicts for them, from its clues."""
+    """The same poses with the error that the model's expectation forest predicts for them, from its
+    clues.
+    """
     if model.expectation is None or not len(chosen.score):
         return chosen
     n = len(chosen.score)
@@ -194,13 +207,16 @@ def with_expected_error(
 def clue_samples(
     chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Array, size: float
 ) -> Samples:
-    """What the expectation forest sees of n frames: no picture, only numbers, in units of about a hundredth.
+    """What the expectation forest sees of n frames: no picture, only numbers, in units of about a
+    hundredth.
 
-    Lengths are those of an animal of the reference length. Scores and doubts; the posture; how large, round and high
-    the animal looks; how many millimetres a pixel covers; how well the pose explains the picture.
+    Lengths are those of an animal of the reference length. Scores and doubts; the posture; how
+    large, round and high the animal looks; how many millimetres a pixel covers; how well the pose
+    explains the picture.
     """
     pose = chosen.pose
-    unit, whole = skeleton.relative_size, size * skeleton.relative_size
+    unit = skeleton.relative_size
+    whole = size * skeleton.relative_size
     clues = np.stack(
         [
             chosen.score / unit,
@@ -230,7 +246,9 @@ def clue_samples(
 def _spread_of_coordinates(
     skeleton: Skeleton, pose: Pose, turned: Array, joints: Array, weight: Array
 ) -> tuple[Array, Array]:
-    """Standard deviations of the root's twist (n, 6) and of the joints' rotation vectors (n, J, 3) over candidates."""
+    """Standard deviations of the root's twist (n, 6) and of the joints' rotation vectors (n, J, 3)
+    over candidates.
+    """
     root = SE3(pose.root.rotation[:, None], pose.root.translation[:, None])
     twist = (root.inverse() @ SE3(turned[:, :, 0], joints[:, :, 0])).log()
     sd_root = np.sqrt(np.einsum("nk,nkd->nd", weight, twist**2))

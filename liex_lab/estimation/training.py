@@ -1,4 +1,6 @@
-"""Training of the cascade and of its learned metric (Lie-X Algorithm 2 and the internal evaluation metric)."""
+"""Training of the cascade and of its learned metric (Lie-X Algorithm 2 and the internal evaluation
+metric).
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,11 @@ _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """Images with their true poses in the view frame, and the true size (m,) of each animal over home size.
+    """Images with their true poses in the view frame, and the true size (m,) of each animal over
+    home size.
 
-    animal (m,): False where the height map shows something else of about the animal's size; such an image teaches the
-    learned metric what is no animal, and the regressors nothing.
+    animal (m,): False where the height map shows something else of about the animal's size; such an
+    image teaches the learned metric what is no animal, and the regressors nothing.
     """
 
     images: ImageSet
@@ -43,7 +46,8 @@ class TrainingSet:
     @staticmethod
     def join(parts: list[TrainingSet]) -> TrainingSet:
         """The images of several sets, one after the other."""
-        images, truths = [p.images for p in parts], [p.truth for p in parts]
+        images = [p.images for p in parts]
+        truths = [p.truth for p in parts]
         return TrainingSet(
             ImageSet(
                 *(
@@ -63,7 +67,9 @@ class TrainingSet:
 
 
 def base_at_front(skeleton: Skeleton) -> bool:
-    """Whether the base joint is the animal's front, as the fish's head, and not its rear, as the mouse's rump."""
+    """Whether the base joint is the animal's front, as the fish's head, and not its rear, as the
+    mouse's rump.
+    """
     return bool(skeleton.offsets[skeleton.next_joint[0], 0] < 0)
 
 
@@ -91,7 +97,9 @@ class Proposals:
         )
 
     def draw(self, rng: np.random.Generator, m: int, k: int) -> NDArray[np.int64]:
-        """K different candidates (m, k) for every image, of trees that have not seen it as far as these go."""
+        """K different candidates (m, k) for every image, of trees that have not seen it as far as
+        these go.
+        """
         order = rng.random((m, N_WAYS * self.forest.n_trees))
         order += np.repeat(self.in_bag, N_WAYS, axis=0).T
         return np.argsort(order, axis=1)[:, :k]
@@ -106,9 +114,11 @@ def start_candidates(
 ) -> Candidates:
     """K starts for every training image, each with its own guess of the animal's size.
 
-    seen: proposals, where the method starts from them; each start is what a tree says that has not seen the image.
+    seen: proposals, where the method starts from them; each start is what a tree says that has not
+    seen the image.
     """
-    m, k = len(data.size), method.training_candidates
+    m = len(data.size)
+    k = method.training_candidates
     starts = draw_starts(rng, m, k)
     if method.session_size:
         size = data.size[:, None] * np.exp(_SIZE_SD * rng.standard_normal((m, k)))
@@ -143,7 +153,9 @@ def start_candidates(
 def train_cascade(
     data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator, tell: Tell
 ) -> tuple[Cascade, Candidates]:
-    """Algorithm 2: every forest is trained on the state its predecessors left. Also returns that final state."""
+    """Algorithm 2: every forest is trained on the state its predecessors left. Also returns that
+    final state.
+    """
     seen = Proposals.train(data, method, rng) if method.proposals is not None else None
     cascade = Cascade(skeleton, method, [], seen.forest if seen is not None else None)
     candidates = start_candidates(data, skeleton, method, rng, seen)
@@ -172,7 +184,9 @@ def train_cascade(
 
 
 def quantised(forest: Forest) -> Forest:
-    """The forest with its leaves rounded to what the model file holds, so that training moves what a user will get."""
+    """The forest with its leaves rounded to what the model file holds, so that training moves what
+    a user will get.
+    """
     return Forest(forest.nodes, forest.roots, forest.leaves.astype(np.float16).astype(np.float32))
 
 
@@ -185,7 +199,9 @@ def joint_error(candidates: Candidates, truth: Truth) -> Array:
 def perturbed_truth(
     data: TrainingSet, cascade: Cascade, rng: np.random.Generator, n_each: int = 8
 ) -> Candidates:
-    """Randomly perturbed true poses, the paper's metric examples: a twist of the base and a turn of every joint."""
+    """Randomly perturbed true poses, the paper's metric examples: a twist of the base and a turn of
+    every joint.
+    """
     skeleton = cascade.skeleton
     j = skeleton.n_joints
     image = np.repeat(np.flatnonzero(data.animal).astype(np.int32), n_each)
@@ -216,7 +232,8 @@ def perturbed_truth(
 def train_metric(
     data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
 ) -> Forest:
-    """The learned metric: a forest that predicts the mean joint error (mm at home size) of a pose without the truth.
+    """The learned metric: a forest that predicts the mean joint error (mm at home size) of a pose
+    without the truth.
 
     Trained on the cascade's own final candidates, or on perturbed truth as the paper has it.
     """
@@ -226,7 +243,8 @@ def train_metric(
         joint_error(candidates, data.truth), _ERROR_CAP_MM * cascade.skeleton.relative_size
     )
     samples = cascade.metric_samples(data.images, candidates)
-    labels, method = error[:, None].astype(np.float32), cascade.method
+    labels = error[:, None].astype(np.float32)
+    method = cascade.method
     if method.metric_shrinkage > 0:
         return quantised(boost_forest(samples, labels, method.metric, method.metric_shrinkage, rng))
     return quantised(
@@ -237,9 +255,11 @@ def train_metric(
 def train_pruner(
     data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
 ) -> Forest | None:
-    """The small metric that tells from the base joint alone how far off the whole pose will be (METHOD lesson 9).
+    """The small metric that tells from the base joint alone how far off the whole pose will be
+    (METHOD lesson 9).
 
-    The base has not moved since its own rounds, so the cascade's final candidates are its examples, too.
+    The base has not moved since its own rounds, so the cascade's final candidates are its examples,
+    too.
     """
     plan = cascade.method.pruner
     if plan is None:

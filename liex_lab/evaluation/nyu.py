@@ -12,25 +12,31 @@ from liex_lab.recordings.formats.images.nyu_labels import PALM, POINTS
 Array = NDArray[np.float64]
 
 NYU_PROTOCOL = (
-    "Error of a frame: mean over the labelled points of the 3D distance to the true point, mm; mean over frames. 14: "
-    "all points; 13: without the palm. Root estimated: the answer as it is. Root given: the answer moved so that its "
-    "palm lies on the true palm, as the published answer of Lie-X was; its mean over 14 then holds an error of zero, "
-    "so compare it with others over 13, or with theirs moved alike."
+    "Error of a frame: mean over the labelled points of the 3D distance to the true point, mm; "
+    "mean over frames. 14: all points; 13: without the palm. Root estimated: the answer as it is. "
+    "Root given: the answer moved so that its palm lies on the true palm, as the published answer "
+    "of Lie-X was; its mean over 14 then holds an error of zero, so compare it with others over "
+    "13, or with theirs moved alike."
 )
 _MAX_BELOW_MM = (10, 20, 30, 40, 50, 60, 80)
 _MEAN_BELOW_MM = (5, 10, 15, 20, 30, 40)
 
 
 def nyu_errors(answer: Array, truth: Array) -> dict[str, Any]:
-    """The figures of an answer against the truth, points (n, 14, 3) mm; rows with NaN count as lost."""
+    """The figures of an answer against the truth, points (n, 14, 3) mm; rows with NaN count as
+    lost.
+    """
     seen = np.asarray(np.isfinite(answer).all(axis=(1, 2)))
     if not seen.any():
         return {"n_frames": len(truth), "lost_rate": 1.0}
-    answer, truth = answer[seen], truth[seen]
+    answer = answer[seen]
+    truth = truth[seen]
     moved = answer - answer[:, PALM : PALM + 1] + truth[:, PALM : PALM + 1]
-    estimated, given = _distances(answer, truth), _distances(moved, truth)
+    estimated = _distances(answer, truth)
+    given = _distances(moved, truth)
     others = np.arange(len(POINTS)) != PALM
-    worst, frame_mean = estimated.max(axis=1), estimated.mean(axis=1)
+    worst = estimated.max(axis=1)
+    frame_mean = estimated.mean(axis=1)
     return {
         "n_frames": len(seen),
         "lost_rate": float(1.0 - seen.mean()),

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 POSE_PROTOCOL = (
-    "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm; mean, median and 95 % "
-    "over the frames in which an animal was measured. lost_rate: share of frames with no measurement. flip_rate: share "
-    "of the measured frames whose base-to-tip direction is more than 90 degrees from the true one. "
-    "spearman_predicted_error: rank correlation of predicted and true error over frames. interval90_coverage: share of "
-    "frames whose true error lies in the 90 % interval predicted for it."
+    "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm; "
+    "mean, median and 95 % over the frames in which an animal was measured. lost_rate: share of "
+    "frames with no measurement. flip_rate: share of the measured frames whose base-to-tip "
+    "direction is more than 90 degrees from the true one. spearman_predicted_error: rank "
+    "correlation of predicted and true error over frames. interval90_coverage: share of frames "
+    "whose true error lies in the 90 % interval predicted for it."
 )
 _FIGURES = (
     "mean_joint_error_mm",
@@ -31,9 +32,9 @@ _FIGURES = (
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Measured against true poses, n frames: error_mm (n,) mean joint error, NaN where lost; joint_mm (n, J);
-    flipped (n,); predicted_mm (n,), NaN where none is predicted; low_mm and high_mm (n,) the predicted 90 % interval
-    of the error.
+    """Measured against true poses, n frames: error_mm (n,) mean joint error, NaN where lost;
+    joint_mm (n, J); flipped (n,); predicted_mm (n,), NaN where none is predicted; low_mm and
+    high_mm (n,) the predicted 90 % interval of the error.
     """
 
     error_mm: Array
@@ -47,9 +48,12 @@ class PoseErrors:
     def compare(
         joints: Array, true_joints: Array, tip: int, predicted_mm: Array, quantiles: Array
     ) -> PoseErrors:
-        """Errors of joints (n, J, 3) mm, NaN where lost; `tip` is the joint that the base's heading points at."""
+        """Errors of joints (n, J, 3) mm, NaN where lost; `tip` is the joint that the base's heading
+        points at.
+        """
         joint_mm = np.linalg.norm(joints - true_joints, axis=-1)
-        measured, true = joints[:, tip] - joints[:, 0], true_joints[:, tip] - true_joints[:, 0]
+        measured = joints[:, tip] - joints[:, 0]
+        true = true_joints[:, tip] - true_joints[:, 0]
         flipped = np.sum(measured * true, axis=-1) < 0
         return PoseErrors(
             joint_mm.mean(axis=1),
@@ -75,7 +79,8 @@ class PoseErrors:
         seen = np.isfinite(self.error_mm)
         if not seen.any():
             return dict.fromkeys(_FIGURES) | {"lost_rate": 1.0}
-        error, predicted = self.error_mm[seen], self.predicted_mm[seen]
+        error = self.error_mm[seen]
+        predicted = self.predicted_mm[seen]
         inside = (error >= self.low_mm[seen]) & (error <= self.high_mm[seen])
         predicts = bool(np.isfinite(predicted).all())
         return {
@@ -103,7 +108,9 @@ def angle_between_axes(a: Array, b: Array) -> Array:
 
 
 def count_reversals(heading: Array) -> int:
-    """How often a heading (n,) rad turns by more than a right angle between frames; NaN frames are skipped."""
+    """How often a heading (n,) rad turns by more than a right angle between frames; NaN frames are
+    skipped.
+    """
     seen = heading[np.isfinite(heading)]
     return int((np.cos(np.diff(seen)) < 0).sum())
 

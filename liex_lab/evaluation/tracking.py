@@ -1,4 +1,6 @@
-"""How well an animal was followed over a sequence with truth, and the protocol that goes beside the numbers."""
+"""How well an animal was followed over a sequence with truth, and the protocol that goes beside the
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +16,32 @@ from liex_lab.simulation.corruptions import Event
 Array = NDArray[np.float64]
 
 TRACKING_PROTOCOL = (
-    "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm. single: what each "
-    "frame says by itself; algorithm3: the paper's, 200 particles; online: the default tracker, each row told some "
-    "frames late (online_lag_frames); smoothed: the default tracker over the whole sequence. mean and p95: over the "
-    "frames in which the row has a pose, bridged ones included; lost_rate: share of frames without one. "
-    "ratio_to_single and p95_ratio_to_single: over the frames in which this row and the single frames both have a "
-    "pose. in_view_ratio and in_view_p95_ratio: over all frames in which at least half of the animal is seen, where a "
-    "frame without a pose counts as an error of half the animal's length, for both, so that nobody gains by giving up "
-    "frames. longest_flip_frames: most frames in a row whose base-to-tip direction is more than 90 degrees from the "
-    "true one. interval90_coverage: share of joint coordinates within 1.645 sd of the truth. recovery_frames: after "
-    "the end of an occlusion (the bar has passed, or less than half of the animal is hidden again), frames until the "
-    "error is below 0.12 of its length, the worst of them. frames_per_s: on this machine, reading excluded; speed: the "
-    "smoothed row's, timed by itself over the first frames, the best of three times."
+    "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm. "
+    "single: what each frame says by itself; algorithm3: the paper's, 200 particles; online: the "
+    "default tracker, each row told some frames late (online_lag_frames); smoothed: the default "
+    "tracker over the whole sequence. mean and p95: over the frames in which the row has a pose, "
+    "bridged ones included; lost_rate: share of frames without one. ratio_to_single and "
+    "p95_ratio_to_single: over the frames in which this row and the single frames both have a "
+    "pose. in_view_ratio and in_view_p95_ratio: over all frames in which at least half of the "
+    "animal is seen, where a frame without a pose counts as an error of half the animal's length, "
+    "for both, so that nobody gains by giving up frames. longest_flip_frames: most frames in a "
+    "row whose base-to-tip direction is more than 90 degrees from the true one. "
+    "interval90_coverage: share of joint coordinates within 1.645 sd of the truth. "
+    "recovery_frames: after the end of an occlusion (the bar has passed, or less than half of the "
+    "animal is hidden again), frames until the error is below 0.12 of its length, the worst of "
+    "them. frames_per_s: on this machine, reading excluded; speed: the smoothed row's, timed by "
+    "itself over the first frames, the best of three times."
 )
-_NEAR, _LOST = 0.12, 0.5  # of the animal's length
+# of the animal's length
+_NEAR = 0.12
+_LOST = 0.5
 _Z90 = 1.645
 
 
 @dataclass(frozen=True)
 class Followed:
-    """What was made of n frames: joints and true joints (n, J, 3) mm in one frame, sd_mm (n, J) along an axis.
+    """What was made of n frames: joints and true joints (n, J, 3) mm in one frame, sd_mm (n, J)
+    along an axis.
 
     tip: the joint that the base's heading points at.
     """
@@ -66,7 +74,9 @@ class Followed:
         return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)[..., None]]
 
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
-        """Errors, mm, of the frames in which at least half of the animal is seen; half its length without a pose."""
+        """Errors, mm, of the frames in which at least half of the animal is seen; half its length
+        without a pose.
+        """
         seen = np.ones(len(self.joints), np.bool_)
         for event in events:
             if event.kind == "hidden":
@@ -74,8 +84,11 @@ class Followed:
         return np.nan_to_num(self.error_mm, nan=_LOST * length_mm)[seen]
 
     def recovery(self, events: Sequence[Event], length_mm: float) -> list[int]:
-        """After each time that something passed over the animal, or hid it, how many frames until it is found again."""
-        near, found = self.error_mm < _NEAR * length_mm, []
+        """After each time that something passed over the animal, or hid it, how many frames until
+        it is found again.
+        """
+        near = self.error_mm < _NEAR * length_mm
+        found = []
         for event in events:
             if event.kind in ("hidden", "occluder") and event.stop < len(near):
                 again = np.flatnonzero(near[event.stop :])
@@ -91,7 +104,8 @@ def figures(
 ) -> dict[str, Any]:
     """The figures of one row over some sequences; single: the same sequences frame by frame."""
     error, alone = (np.concatenate([row.error_mm for row in some]) for some in (rows, single))
-    seen, both = np.isfinite(error), np.isfinite(error) & np.isfinite(alone)
+    seen = np.isfinite(error)
+    both = np.isfinite(error) & np.isfinite(alone)
     if not both.any():
         return {"lost_rate": 1.0}
     own, others = (

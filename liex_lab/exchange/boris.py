@@ -1,7 +1,8 @@
-"""A BORIS project with one observation: the session's ethogram. Field by field as BORIS 9 writes it, version 7.0.
+"""A BORIS project with one observation: the session's ethogram. Field by field as BORIS 9 writes
+it, version 7.0.
 
-A state event is two rows of the same subject and behaviour, start and stop. BORIS refuses a project that is newer than
-itself, so the oldest version that has all of this is written.
+A state event is two rows of the same subject and behaviour, start and stop. BORIS refuses a project
+that is newer than itself, so the oldest version that has all of this is written.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def project(session: Session) -> dict[str, Any]:
         "time_format": "hh:mm:ss",
         "project_date": _date(session),
         "project_name": session.name,
-        "project_description": f"ethogram by liex_lab {about['versions'].get('liex_lab', '')}".strip(),
+        "project_description": (
+            f"ethogram by liex_lab {about['versions'].get('liex_lab', '')}"
+        ).strip(),
         "project_format_version": VERSION,
         "subjects_conf": {
             "0": {"key": "1", "name": subject, "description": about["animal"]["name"]}
@@ -73,12 +76,11 @@ def _behaviour(word: str, meaning: str, place: int) -> dict[str, Any]:
 
 def _observation(session: Session, subject: str) -> dict[str, Any]:
     """The recording as a media file that BORIS need not find, and two rows per bout."""
-    frames, name = session.metadata["frames"], session.metadata["input"]["name"]
+    frames = session.metadata["frames"]
+    name = session.metadata["input"]["name"]
     bouts = session.bouts
-    times, indices = (
-        bouts[["start_s", "stop_s"]].to_numpy(float),
-        bouts[["start_frame", "stop_frame"]].to_numpy(int),
-    )
+    times = bouts[["start_s", "stop_s"]].to_numpy(float)
+    indices = bouts[["start_frame", "stop_frame"]].to_numpy(int)
     rows = [
         [round(float(time), 6), subject, str(action), "", "", int(index)]
         for action, two_times, two_indices in zip(bouts["action"], times, indices, strict=True)

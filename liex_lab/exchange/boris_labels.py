@@ -1,6 +1,7 @@
 """What people labelled or corrected in BORIS, as labels: from its projects and from its exports.
 
-A project is JSON; state events are pairs of rows, start and stop. `liex export SESSION --to boris` writes one.
+A project is JSON; state events are pairs of rows, start and stop. `liex export SESSION --to boris`
+writes one.
 """
 
 from __future__ import annotations
@@ -34,16 +35,18 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
         ) from None
     if not isinstance(document, dict) or not isinstance(document.get("observations"), dict):
         raise LiexError(
-            f"{source} should be a BORIS project, but holds no observations; save it from BORIS again"
+            f"{source} should be a BORIS project, but holds no observations; save it from BORIS "
+            "again"
         )
     return document
 
 
 def boris_labels(path: str | Path) -> pd.DataFrame:
-    """The state events of a project as labels: session_id (the observation), individual, action, start_s, stop_s.
+    """The state events of a project as labels: session_id (the observation), individual, action,
+    start_s, stop_s.
 
-    The observation's time offset is taken off. An event without its end raises a LiexError that names it; point events
-    have no length and are left out.
+    The observation's time offset is taken off. An event without its end raises a LiexError that
+    names it; point events have no length and are left out.
     """
     document = read_boris_project(path)
     points = {
@@ -82,7 +85,8 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
     lacking = [name for name in wanted if name not in table]
     if lacking:
         raise LiexError(
-            f"{source} should be BORIS's export of aggregated events; it lacks the column {lacking[0]}"
+            f"{source} should be BORIS's export of aggregated events; it lacks the column "
+            f"{lacking[0]}"
         )
     if "Behavior type" in table:
         table = table[table["Behavior type"] == "STATE"]
@@ -117,7 +121,9 @@ def _offset(observation: dict[str, Any], name: str, path: str | Path) -> float:
 def _pairs(
     events: Sequence[Sequence[Any]], points: set[str], name: str, offset: float, path: str | Path
 ) -> list[dict[str, Any]]:
-    """Rows of labels from the events of one observation: state events alternate between start and stop."""
+    """Rows of labels from the events of one observation: state events alternate between start and
+    stop.
+    """
     begun: dict[tuple[str, str, str], float] = {}
     rows = []
     try:
@@ -147,8 +153,8 @@ def _pairs(
     if begun:
         (_, code, _), start = next(iter(begun.items()))
         raise LiexError(
-            f"{path}: in the observation {name}, {code} starts at {start:g} s and never stops; pair it in BORIS "
-            "(Observations, Check state events)"
+            f"{path}: in the observation {name}, {code} starts at {start:g} s and never stops; "
+            "pair it in BORIS (Observations, Check state events)"
         )
     return rows
 

@@ -1,8 +1,8 @@
 """DeepLabCut's tables: three header rows, then one row for every frame.
 
-poses_3d.csv has x, y, z in millimetres of the arena, without likelihood, as DeepLabCut's own 3D tables; poses_2d.csv
-has x, y in pixels of the depth picture and a likelihood. The format has no times: they are in times.csv, row by row;
-the actions are in bouts.csv.
+poses_3d.csv has x, y, z in millimetres of the arena, without likelihood, as DeepLabCut's own 3D
+tables; poses_2d.csv has x, y in pixels of the depth picture and a likelihood. The format has no
+times: they are in times.csv, row by row; the actions are in bouts.csv.
 """
 
 from __future__ import annotations

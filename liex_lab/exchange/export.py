@@ -45,8 +45,9 @@ def export(
 ) -> Path:
     """Write a session in another program's format; returns the file or folder.
 
-    to: a word of `TARGETS`; out: the folder it goes into, by default the session's own. Nothing half-written stays.
-    Raises a SessionError where the format is not known, a file is there already, or packages are missing.
+    to: a word of `TARGETS`; out: the folder it goes into, by default the session's own. Nothing
+    half-written stays. Raises a SessionError where the format is not known, a file is there
+    already, or packages are missing.
     """
     if to not in TARGETS:
         near = difflib.get_close_matches(to, TARGETS, 1)

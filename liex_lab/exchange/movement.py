@@ -1,6 +1,7 @@
 """movement's poses: an xarray data set, and the same as netCDF (`movement.io` and xarray open it).
 
-movement's own loaders make times from one frame rate; here the time coordinate is the frames' true one.
+movement's own loaders make times from one frame rate; here the time coordinate is the frames' true
+one.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
 
 
 def to_movement(session: Session) -> xarray.Dataset:
-    """The session as a movement poses data set: millimetres of the arena, seconds; actions in attrs["actions"]."""
+    """The session as a movement poses data set: millimetres of the arena, seconds; actions in
+    attrs["actions"].
+    """
     import xarray
 
     poses = Poses.of(session)

@@ -1,7 +1,8 @@
-"""Neurodata Without Borders: one animal per file, poses as ndx-pose, true times, actions and gaps as intervals.
+"""Neurodata Without Borders: one animal per file, poses as ndx-pose, true times, actions and gaps
+as intervals.
 
-There is no type for rotations in NWB: each joint's is a TimeSeries of rotation vectors, in radians. Times count from
-the session's beginning, which NWB wants with its time zone.
+There is no type for rotations in NWB: each joint's is a TimeSeries of rotation vectors, in radians.
+Times count from the session's beginning, which NWB wants with its time zone.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 
 _SPECIES = {"mouse": "Mus musculus", "fish": "Danio rerio", "hand": "Homo sapiens"}
 _FRAME = (
-    "the arena: z up from the floor, origin at the foot of the camera's perpendicular, x along the picture's rows; "
-    "joints lie on the body's mid-axis"
+    "the arena: z up from the floor, origin at the foot of the camera's perpendicular, x along "
+    "the picture's rows; joints lie on the body's mid-axis"
 )
 _CONFIDENCE = "probability that the joint lies within 10 % of the spine's length of the truth"
 
@@ -46,7 +47,9 @@ def build(session: Session) -> NWBFile:
     about = session.metadata
     version = about["versions"].get("liex_lab", "unknown")
     made = NWBFile(
-        session_description=f"3D skeleton and actions of one {about['animal']['name']}, from a depth recording",
+        session_description=(
+            f"3D skeleton and actions of one {about['animal']['name']}, from a depth recording"
+        ),
         identifier=str(uuid5(NAMESPACE_URL, f"{session.name}-{about['input']['sha256']}")),
         session_start_time=_start(session),
         session_id=session.name,
@@ -73,8 +76,8 @@ def _start(session: Session) -> datetime:
         moment = None
     if moment is None or moment.tzinfo is None:
         raise SessionError(
-            f"NWB wants to know when a session began, with time zone, and {session.name} does not say; run it again "
-            "with --set session.session_start_time=2026-08-21T10:00:00+02:00"
+            f"NWB wants to know when a session began, with time zone, and {session.name} does not "
+            "say; run it again with --set session.session_start_time=2026-08-21T10:00:00+02:00"
         )
     return moment
 
@@ -82,7 +85,8 @@ def _start(session: Session) -> datetime:
 def _subject(session: Session) -> Any:
     from pynwb.file import Subject
 
-    about, kind = session.metadata["subject"], session.metadata["animal"]["name"]
+    about = session.metadata["subject"]
+    kind = session.metadata["animal"]["name"]
     sex = str(about.get("sex", ""))[:1].upper()
     return Subject(
         subject_id=about.get("subject_id") or session.metadata["individual"],
@@ -166,11 +170,10 @@ def _add_intervals(made: NWBFile, session: Session) -> None:
     actions = TimeIntervals(name="actions", description="the ethogram: half-open intervals")
     actions.add_column("label", "the action's name")
     actions.add_column("score", "how well the bout fits its action, 0 to 1")
-    bouts, missing = session.bouts, session.gaps
-    spans, scores = (
-        bouts[["start_s", "stop_s"]].to_numpy(float).tolist(),
-        bouts["score"].to_numpy(float).tolist(),
-    )
+    bouts = session.bouts
+    missing = session.gaps
+    spans = bouts[["start_s", "stop_s"]].to_numpy(float).tolist()
+    scores = bouts["score"].to_numpy(float).tolist()
     for (start, stop), action, score in zip(spans, bouts["action"], scores, strict=True):
         actions.add_row(
             start_time=start, stop_time=stop, label=str(action), score=score, check_ragged=False

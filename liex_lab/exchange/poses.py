@@ -29,7 +29,8 @@ _COLUMNS = [
 class Poses:
     """One row for every recorded frame: frame_index (n,), time_s (n,); NaN where there is no pose.
 
-    joints: their names; xyz_mm (n, J, 3) in the arena; uv_px (n, J, 2) in the depth picture; score and sd_mm (n, J).
+    joints: their names; xyz_mm (n, J, 3) in the arena; uv_px (n, J, 2) in the depth picture; score
+    and sd_mm (n, J).
     """
 
     individual: str
@@ -48,7 +49,8 @@ class Poses:
         about = session.metadata
         joints = tuple(about["animal"]["joints"])
         table = session.table("poses", _COLUMNS)
-        n, shape = len(joints), (-1, len(joints))
+        n = len(joints)
+        shape = (-1, len(joints))
 
         def array(*names: str) -> Array:
             columns = [table[name].to_numpy(float).reshape(shape) for name in names]

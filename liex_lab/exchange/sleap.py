@@ -1,7 +1,7 @@
 """SLEAP's analysis file (HDF5), in its own order of axes, which is Matlab's.
 
-The format has two coordinates: joints are in pixels of the depth picture. It has no times and no actions: true times
-stand beside SLEAP's own data sets as `time_s`, which its readers leave alone.
+The format has two coordinates: joints are in pixels of the depth picture. It has no times and no
+actions: true times stand beside SLEAP's own data sets as `time_s`, which its readers leave alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from liex_lab.sessions import Session
 
 
 def write(session: Session, path: Path) -> None:
-    """One track, every recorded frame; pixels as SLEAP counts them, from the centre of the top-left one."""
+    """One track, every recorded frame; pixels as SLEAP counts them, from the centre of the top-left
+    one.
+    """
     import h5py
 
     poses = Poses.of(session)
@@ -55,4 +57,5 @@ def write(session: Session, path: Path) -> None:
         file.create_dataset(
             "provenance", data=json.dumps({"software": "liex_lab"}), dtype=h5py.string_dtype()
         )
-        file.attrs["preset"], file.attrs["format"] = "matlab", "analysis"
+        file.attrs["preset"] = "matlab"
+        file.attrs["format"] = "analysis"

@@ -1,4 +1,6 @@
-"""Every table of a session as CSV, for those who would rather not read parquet. Units are in the columns' names."""
+"""Every table of a session as CSV, for those who would rather not read parquet. Units are in the
+columns' names.
+"""
 
 from __future__ import annotations
 

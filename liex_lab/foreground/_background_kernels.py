@@ -10,9 +10,10 @@ from numba import njit, prange
 def far_mode(values, window):
     """Depth and spread of the farthest cluster in sorted readings (n,) mm; (0, 0) without one.
 
-    An animal is always nearer than what it covers, so the background is the farthest depth that comes back, not the
-    most frequent: a pixel covered nine tenths of the time still shows it. A cluster needs a twentieth of the
-    readings (at least 3) within `window` mm, which lone outliers beyond the floor do not reach.
+    An animal is always nearer than what it covers, so the background is the farthest depth that
+    comes back, not the most frequent: a pixel covered nine tenths of the time still shows it. A
+    cluster needs a twentieth of the readings (at least 3) within `window` mm, which lone outliers
+    beyond the floor do not reach.
     """
     n = values.size
     need = max(3, (n + 19) // 20)
@@ -25,7 +26,8 @@ def far_mode(values, window):
             while low > 0 and values[top] - values[low - 1] <= window:
                 low -= 1
             middle = values[(low + top) // 2]
-            # re-centre on the cluster's own middle, so that a few far readings do not cut its near half off
+            # re-centre on the cluster's own middle, so that a few far readings do not cut its near
+            # half off
             low = top
             while low > 0 and middle - values[low - 1] <= window:
                 low -= 1

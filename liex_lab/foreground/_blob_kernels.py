@@ -6,29 +6,33 @@ import numpy as np
 from numba import njit
 
 BLOCK = 4  # pixels a side; blobs are connected in blocks
-_ROW_STEP = 2  # every other row is looked at: reading a picture takes longer than anything that is done with it
+# every other row is looked at: reading a picture takes longer than anything that is done with it
+_ROW_STEP = 2
 _MIN_IN_BLOCK = 3  # of the 8 pixels looked at
 MAX_BLOBS = 32
 _MIN_UNREAD = 9  # of 16 pixels
 N_MOMENTS = 9
-_SLOPE_PASSES, _LEVEL_PASSES = 5, 3
+_SLOPE_PASSES = 5
+_LEVEL_PASSES = 3
 
 
 @njit(cache=True)
 def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
-    """Connected blobs of pixels nearer than `limit` (H, W), in blocks; up to `bridge` blocks without readings do not
-    part them.
+    """Connected blobs of pixels nearer than `limit` (H, W), in blocks; up to `bridge` blocks
+    without readings do not part them.
 
-    labels (H // BLOCK, W // BLOCK) int32 gets the blob of each block, -1 for none. blobs (MAX_BLOBS, 7) gets pixels,
-    first and last block row and column, the sum of depths, and the pixels that cover the floor `on_floor` (H, W).
-    Returns the number of blobs (the largest ones when there are more than fit).
+    labels (H // BLOCK, W // BLOCK) int32 gets the blob of each block, -1 for none. blobs
+    (MAX_BLOBS, 7) gets pixels, first and last block row and column, the sum of depths, and the
+    pixels that cover the floor `on_floor` (H, W). Returns the number of blobs (the largest ones
+    when there are more than fit).
     """
     n_rows, n_columns = labels.shape
     hits = np.empty(n_columns * BLOCK, np.uint8)
     for i in range(n_rows):
         hits[:] = 0
         for r in range(0, BLOCK, _ROW_STEP):
-            row_depth, row_limit = depth[i * BLOCK + r], limit[i * BLOCK + r]
+            row_depth = depth[i * BLOCK + r]
+            row_limit = limit[i * BLOCK + r]
             for c in range(hits.size):
                 z = row_depth[c]
                 hits[c] += (z > 0) & (z < row_limit[c])
@@ -55,12 +59,13 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
 
 @njit(cache=True)
 def layers(depth, limit, labels, slot, blob, apart):
-    """The depth mm that parts a blob into a near and a far layer which nothing joins for `apart` mm, 0 for none; and
-    the sums of the squared depths of the pixels in each.
+    """The depth mm that parts a blob into a near and a far layer which nothing joins for `apart`
+    mm, 0 for none; and the sums of the squared depths of the pixels in each.
 
     Blocks count with their middle depth: one that an edge goes through belongs to one side of it.
     """
-    found, values = np.empty(labels.size, np.float32), np.empty(BLOCK * BLOCK, np.float32)
+    found = np.empty(labels.size, np.float32)
+    values = np.empty(BLOCK * BLOCK, np.float32)
     n = 0
     for i in range(int(blob[1]), int(blob[2]) + 1):
         for j in range(int(blob[3]), int(blob[4]) + 1):
@@ -76,11 +81,14 @@ def layers(depth, limit, labels, slot, blob, apart):
                 found[n] = np.sort(values[:m])[m // 2]
                 n += 1
     ordered = np.sort(found[:n])
-    gap, cut = apart, 0.0
+    gap = apart
+    cut = 0.0
     for k in range(1, n):
         if ordered[k] - ordered[k - 1] > gap:
-            gap, cut = ordered[k] - ordered[k - 1], 0.5 * (ordered[k] + ordered[k - 1])
-    near, far = 0.0, 0.0
+            gap = ordered[k] - ordered[k - 1]
+            cut = 0.5 * (ordered[k] + ordered[k - 1])
+    near = 0.0
+    far = 0.0
     for z in ordered:
         near += BLOCK * BLOCK * z * z * (z < cut)
         far += BLOCK * BLOCK * z * z * (z >= cut)
@@ -107,14 +115,26 @@ def _is_unread(depth, row, column):
 
 @njit(cache=True)
 def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
-    """Give every block connected with (i, j) the label `slot`, and count the blob's pixels into `blob` (7,)."""
-    blob[0], blob[1], blob[2], blob[3], blob[4], blob[5], blob[6] = 0, i, i, j, j, 0.0, 0
+    """Give every block connected with (i, j) the label `slot`, and count the blob's pixels into
+    `blob` (7,).
+    """
+    blob[0] = 0
+    blob[1] = i
+    blob[2] = i
+    blob[3] = j
+    blob[4] = j
+    blob[5] = 0.0
+    blob[6] = 0
     top = 1
-    stack[0, 0], stack[0, 1], stack[0, 2] = i, j, 0
+    stack[0, 0] = i
+    stack[0, 1] = j
+    stack[0, 2] = 0
     labels[i, j] = slot
     while top > 0:
         top -= 1
-        row, column, gone = stack[top, 0], stack[top, 1], stack[top, 2]
+        row = stack[top, 0]
+        column = stack[top, 1]
+        gone = stack[top, 2]
         if gone == 0:
             blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
             blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
@@ -127,13 +147,16 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
                     blob[6] += on_floor[v, u]
         for di in range(-1, 2):
             for dj in range(-1, 2):
-                a, b = row + di, column + dj
+                a = row + di
+                b = column + dj
                 if not (0 <= a < labels.shape[0] and 0 <= b < labels.shape[1]):
                     continue
                 on = labels[a, b] == -2
                 if on or (labels[a, b] == -1 and gone < bridge and _is_unread(depth, a, b)):
                     labels[a, b] = slot
-                    stack[top, 0], stack[top, 1], stack[top, 2] = a, b, 0 if on else gone + 1
+                    stack[top, 0] = a
+                    stack[top, 1] = b
+                    stack[top, 2] = 0 if on else gone + 1
                     top += 1
 
 
@@ -146,7 +169,8 @@ def is_animal_block(labels, row, column, slot):
         return labels[row, column] == slot
     for di in range(-1, 2):
         for dj in range(-1, 2):
-            a, b = row + di, column + dj
+            a = row + di
+            b = column + dj
             if 0 <= a < labels.shape[0] and 0 <= b < labels.shape[1] and labels[a, b] == slot:
                 return True
     return False
@@ -154,15 +178,19 @@ def is_animal_block(labels, row, column, slot):
 
 @njit(cache=True)
 def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
-    """Height above the floor, mm, of the blob's pixels into raw (S, S) float32: -1 background, -2 without a reading.
+    """Height above the floor, mm, of the blob's pixels into raw (S, S) float32: -1 background, -2
+    without a reading.
 
-    plane (3,): 1 / z of the floor = a u + b v + c; distance mm of the camera from it. A point at depth z seen at
-    (u, v) is `distance * (1 - z (a u + b v + c))` high. Crop pixel (r, c) is picture pixel origin + step * (c, r).
-    The outermost ring stays background, so a probe clamped to the border reads what lies outside.
+    plane (3,): 1 / z of the floor = a u + b v + c; distance mm of the camera from it. A point at
+    depth z seen at (u, v) is `distance * (1 - z (a u + b v + c))` high. Crop pixel (r, c) is
+    picture pixel origin + step * (c, r). The outermost ring stays background, so a probe clamped to
+    the border reads what lies outside.
     """
     size = raw.shape[0]
     height, width = depth.shape
-    a, b, c0 = plane[0], plane[1], plane[2]
+    a = plane[0]
+    b = plane[1]
+    c0 = plane[2]
     for r in range(size):
         v = origin[1] + step * r
         for c in range(size):
@@ -189,39 +217,50 @@ def find_root(parent, k):
 
 @njit(cache=True)
 def keep_largest(raw, runs):
-    """Erase from raw (S, S) all pixels but the largest group, in which no gap is wider than a pixel.
+    """Erase from raw (S, S) all pixels but the largest group, in which no gap is wider than a
+    pixel.
 
-    Blocks join what is a few pixels apart; pixel by pixel a neighbour is told from the animal. Rows are taken as runs
-    of pixels, and runs join those that they touch, or nearly, in the two rows above. runs (S * S, 5) int32 is scratch:
-    row, first and last column, readings, parent.
+    Blocks join what is a few pixels apart; pixel by pixel a neighbour is told from the animal. Rows
+    are taken as runs of pixels, and runs join those that they touch, or nearly, in the two rows
+    above. runs (S * S, 5) int32 is scratch: row, first and last column, readings, parent.
     """
-    size, n = raw.shape[0], 0
+    size = raw.shape[0]
+    n = 0
     parent = runs[:, 4]
-    above, higher = 0, 0  # the first run of the row above, and of the one above that
+    # the first run of the row above, and of the one above that
+    above = 0
+    higher = 0
     for r in range(1, size - 1):
         begin = n
         for c in range(1, size - 1):
             if raw[r, c] == -1.0:
                 continue
             if n == begin or c > runs[n - 1, 2] + 2:
-                runs[n, 0], runs[n, 1], runs[n, 3], parent[n] = r, c, 0, n
+                runs[n, 0] = r
+                runs[n, 1] = c
+                runs[n, 3] = 0
+                parent[n] = n
                 n += 1
             runs[n - 1, 2] = c
             runs[n - 1, 3] += raw[r, c] >= 0.0
         for k in range(begin, n):
             for other in range(higher, begin):
                 if runs[other, 1] <= runs[k, 2] + 2 and runs[k, 1] <= runs[other, 2] + 2:
-                    a, b = find_root(parent, other), find_root(parent, k)
+                    a = find_root(parent, other)
+                    b = find_root(parent, k)
                     parent[max(a, b)] = min(a, b)
-        higher, above = above, begin
-    best, best_count = -1, 0
+        higher = above
+        above = begin
+    best = -1
+    best_count = 0
     for k in range(n):
         root = find_root(parent, k)
         if root != k:
             runs[root, 3] += runs[k, 3]
     for k in range(n):
         if parent[k] == k and runs[k, 3] > best_count:
-            best, best_count = k, runs[k, 3]
+            best = k
+            best_count = runs[k, 3]
     for k in range(n):
         if find_root(parent, k) != best:
             for c in range(runs[k, 1], runs[k, 2] + 1):
@@ -230,18 +269,21 @@ def keep_largest(raw, runs):
 
 @njit(cache=True)
 def level_heights(raw, behind_mm):
-    """Lift all heights of raw (S, S) so that their mean, without what lies farther than behind_mm from it, becomes
-    behind_mm; what is then not above 0 is background. Returns the lift, mm.
+    """Lift all heights of raw (S, S) so that their mean, without what lies farther than behind_mm
+    from it, becomes behind_mm; what is then not above 0 is background. Returns the lift, mm.
     """
-    mean, reach = 0.0, np.inf
+    mean = 0.0
+    reach = np.inf
     for _ in range(_LEVEL_PASSES):
-        total, n = 0.0, 0
+        total = 0.0
+        n = 0
         for r in range(raw.shape[0]):
             for c in range(raw.shape[1]):
                 if raw[r, c] >= 0.0 and abs(raw[r, c] - mean) <= reach:
                     total += raw[r, c]
                     n += 1
-        mean, reach = total / max(n, 1), behind_mm
+        mean = total / max(n, 1)
+        reach = behind_mm
     lift = behind_mm - mean
     for r in range(raw.shape[0]):
         for c in range(raw.shape[1]):
@@ -254,27 +296,31 @@ def level_heights(raw, behind_mm):
 
 @njit(cache=True)
 def smooth_heights(raw, radius, out):
-    """Box-filtered heights in 1/16 mm, int16, into out (S, S): background 0, holes filled from what surrounds them.
+    """Box-filtered heights in 1/16 mm, int16, into out (S, S): background 0, holes filled from what
+    surrounds them.
 
-    A pixel of the animal becomes the mean of the animal's pixels within `radius`; a pixel without reading becomes that
-    mean within one pixel more where at least 5 of the pixels there are the animal and more than twice as many of them
-    as are background. Sums over boxes are differences of running sums.
+    A pixel of the animal becomes the mean of the animal's pixels within `radius`; a pixel without
+    reading becomes that mean within one pixel more where at least 5 of the pixels there are the
+    animal and more than twice as many of them as are background. Sums over boxes are differences of
+    running sums.
     """
     size = raw.shape[0]
-    top, bottom = size, 0
+    top = size
+    bottom = 0
     for r in range(1, size - 1):
         for c in range(1, size - 1):
             if raw[r, c] != -1.0:
-                top, bottom = min(top, r), r
+                top = min(top, r)
+                bottom = r
                 break
     out[:] = 0
     total = np.zeros((size + 1, size + 1))
-    animal, background = (
-        np.zeros((size + 1, size + 1), np.int32),
-        np.zeros((size + 1, size + 1), np.int32),
-    )
+    animal = np.zeros((size + 1, size + 1), np.int32)
+    background = np.zeros((size + 1, size + 1), np.int32)
     for r in range(max(top - radius - 1, 0), min(bottom + radius + 2, size)):
-        row_total, row_animal, row_background = 0.0, 0, 0
+        row_total = 0.0
+        row_animal = 0
+        row_background = 0
         for c in range(size):
             value = raw[r, c]
             row_total += value if value >= 0.0 else 0.0
@@ -289,8 +335,10 @@ def smooth_heights(raw, radius, out):
             if here == -1.0:
                 continue
             reach = radius if here >= 0.0 else radius + 1
-            a, b = max(r - reach, 0), min(r + reach + 1, size)
-            e, f = max(c - reach, 0), min(c + reach + 1, size)
+            a = max(r - reach, 0)
+            b = min(r + reach + 1, size)
+            e = max(c - reach, 0)
+            f = min(c + reach + 1, size)
             n = animal[b, f] - animal[a, f] - animal[b, e] + animal[a, e]
             n_background = background[b, f] - background[a, f] - background[b, e] + background[a, e]
             if here >= 0.0 or (n >= 5 and n > 2 * n_background):
@@ -300,15 +348,26 @@ def smooth_heights(raw, radius, out):
 
 @njit(cache=True)
 def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments):
-    """Mass, area and axes of an animal from its height map, in the arena frame, into moments (N_MOMENTS,).
+    """Mass, area and axes of an animal from its height map, in the arena frame, into moments
+    (N_MOMENTS,).
 
-    moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of the long axis
-    (mod pi), the standard deviations mm along and across it, and 0, where `back_slope` may go. intrinsics (fx, fy, cx,
-    cy); rotation (3, 3) of T_arena_camera, whose translation is (0, 0, distance).
+    moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of
+    the long axis (mod pi), the standard deviations mm along and across it, and 0, where
+    `back_slope` may go. intrinsics (fx, fy, cx, cy); rotation (3, 3) of T_arena_camera, whose
+    translation is (0, 0, distance).
     """
-    n, area, volume = 0, 0.0, 0.0
-    sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    n = 0
+    area = 0.0
+    volume = 0.0
+    sx = 0.0
+    sy = 0.0
+    sxx = 0.0
+    sxy = 0.0
+    syy = 0.0
+    fx = intrinsics[0]
+    fy = intrinsics[1]
+    cx = intrinsics[2]
+    cy = intrinsics[3]
     for r in range(1, heights.shape[0] - 1):
         v = origin[1] + step * r
         for c in range(1, heights.shape[1] - 1):
@@ -317,7 +376,8 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
             u = origin[0] + step * c
             h = heights[r, c] / 16.0
             z = (1.0 - h / distance) / (plane[0] * u + plane[1] * v + plane[2])
-            xc, yc = (u - cx) / fx * z, (v - cy) / fy * z
+            xc = (u - cx) / fx * z
+            yc = (v - cy) / fy * z
             x = rotation[0, 0] * xc + rotation[0, 1] * yc + rotation[0, 2] * z
             y = rotation[1, 0] * xc + rotation[1, 1] * yc + rotation[1, 2] * z
             w = step * step * z * z / (fx * fy)
@@ -333,45 +393,57 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
         moments[k] = 0.0
     if n == 0:
         return
-    mx, my = sx / area, sy / area
-    vxx, vxy, vyy = sxx / area - mx * mx, sxy / area - mx * my, syy / area - my * my
+    mx = sx / area
+    my = sy / area
+    vxx = sxx / area - mx * mx
+    vxy = sxy / area - mx * my
+    vyy = syy / area - my * my
     angle = 0.5 * np.arctan2(2.0 * vxy, vxx - vyy)
-    half, root = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
-    moments[0], moments[1], moments[2], moments[3], moments[4], moments[5] = (
-        n,
-        area,
-        volume,
-        mx,
-        my,
-        angle,
-    )
-    moments[6], moments[7] = np.sqrt(max(half + root, 0.0)), np.sqrt(max(half - root, 0.0))
+    half = 0.5 * (vxx + vyy)
+    root = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+    moments[0] = n
+    moments[1] = area
+    moments[2] = volume
+    moments[3] = mx
+    moments[4] = my
+    moments[5] = angle
+    moments[6] = np.sqrt(max(half + root, 0.0))
+    moments[7] = np.sqrt(max(half - root, 0.0))
 
 
 @njit(cache=True)
 def back_slope(heights, origin, step, intrinsics, distance, moments):
-    """How steeply the back rises along the long axis, of a height map that was cut along the optical axis.
+    """How steeply the back rises along the long axis, of a height map that was cut along the
+    optical axis.
 
-    A straight line through the heights, in which readings far off it count less with every pass (Geman and McClure's
-    weights), for a light field errs grossly in patches. moments: see `blob_moments`.
+    A straight line through the heights, in which readings far off it count less with every pass
+    (Geman and McClure's weights), for a light field errs grossly in patches. moments: see
+    `blob_moments`.
     """
     size = heights.shape[0]
-    along, height = np.empty(size * size), np.empty(size * size)
-    c, s, n = np.cos(moments[5]), np.sin(moments[5]), 0
+    along = np.empty(size * size)
+    height = np.empty(size * size)
+    c = np.cos(moments[5])
+    s = np.sin(moments[5])
+    n = 0
     for r in range(1, size - 1):
         for k in range(1, size - 1):
             if heights[r, k] > 0:
                 z = distance - heights[r, k] / 16.0
                 x = (origin[0] + step * k - intrinsics[2]) / intrinsics[0] * z
                 y = -(origin[1] + step * r - intrinsics[3]) / intrinsics[1] * z
-                along[n], height[n] = (
-                    c * (x - moments[3]) + s * (y - moments[4]),
-                    heights[r, k] / 16.0,
-                )
+                along[n] = c * (x - moments[3]) + s * (y - moments[4])
+                height[n] = heights[r, k] / 16.0
                 n += 1
-    level, slope, scale = 0.0, 0.0, np.inf
+    level = 0.0
+    slope = 0.0
+    scale = np.inf
     for _ in range(_SLOPE_PASSES):
-        sw, sx, sh, sxx, sxh = 0.0, 0.0, 0.0, 0.0, 0.0
+        sw = 0.0
+        sx = 0.0
+        sh = 0.0
+        sxx = 0.0
+        sxh = 0.0
         for i in range(n):
             off = (height[i] - level - slope * along[i]) / scale
             w = 1.0 / (1.0 + off * off) ** 2
@@ -385,7 +457,8 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
             return slope
         slope = (sw * sxh - sx * sh) / spread
         level = (sh - slope * sx) / sw
-        total, weight = 0.0, 0.0
+        total = 0.0
+        weight = 0.0
         for i in range(n):
             off = abs(height[i] - level - slope * along[i])
             w = 1.0 if scale == np.inf else 1.0 / (1.0 + (off / scale) ** 2)

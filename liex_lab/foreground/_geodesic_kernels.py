@@ -1,7 +1,8 @@
 """Numba kernels that find where surfaces end that come into the picture, as an arm does in a hand.
 
-Arrays that all of them share: blocks (h, w) float32, the depth in mm of what is nearest in every block of BLOCK x BLOCK
-pixels, 0 = nothing within range; labels (h, w) int32, which surface a block belongs to, -1 none.
+Arrays that all of them share: blocks (h, w) float32, the depth in mm of what is nearest in every
+block of BLOCK x BLOCK pixels, 0 = nothing within range; labels (h, w) int32, which surface a block
+belongs to, -1 none.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from liex_lab.foreground._blob_kernels import BLOCK, find_root
 
 MAX_SURFACES = 24
 MAX_TIPS = 256
-AROUND_MM = 190.0  # of a home-sized hand: how far its points and the beginning of its arm lie from its middle
+# of a home-sized hand: how far its points and the beginning of its arm lie from its middle
+AROUND_MM = 190.0
 _MIN_IN_BLOCK = 5
 _THICK_MM = 25.0  # readings of one block this far behind its nearest belong to something else
 _JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
 _STICKS_OUT_MM = (
     90.0  # of a home-sized hand: an end of a surface stands out by this, which an elbow does not
 )
-_WORTH_MM, _MOST_OUT = (
-    60.0,
-    3.0,
-)  # sticking out once more as far is worth being nearer by this, up to so often
+# sticking out once more as far is worth being nearer by this, up to so often
+_WORTH_MM = 60.0
+_MOST_OUT = 3.0
 _APART = 0.6  # of that radius: ends that lie nearer to each other show the same hand
 _MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
 
@@ -35,7 +36,8 @@ def block_depths(depth, near, far, blocks):
     nothing = np.float32(1e9)
     for i in range(blocks.shape[0]):
         for j in range(blocks.shape[1]):
-            first, second = nothing, nothing
+            first = nothing
+            second = nothing
             for r in range(i * BLOCK, i * BLOCK + BLOCK):
                 for c in range(j * BLOCK, j * BLOCK + BLOCK):
                     z = np.float32(depth[r, c])
@@ -44,7 +46,8 @@ def block_depths(depth, near, far, blocks):
                         second, max(first, z)
                     )  # no branches: what comes next cannot be foretold
                     first = min(first, z)
-            total, n = 0.0, 0
+            total = 0.0
+            n = 0
             if second < 1e8:
                 for r in range(i * BLOCK, i * BLOCK + BLOCK):
                     for c in range(j * BLOCK, j * BLOCK + BLOCK):
@@ -57,7 +60,8 @@ def block_depths(depth, near, far, blocks):
 
 @njit(cache=True)
 def label_surfaces(blocks, labels, focal2, least_mm2, areas):
-    """Connected surfaces of at least `least_mm2`: labels, and areas (MAX_SURFACES,) mm^2. Returns how many.
+    """Connected surfaces of at least `least_mm2`: labels, and areas (MAX_SURFACES,) mm^2. Returns
+    how many.
 
     focal2: fx * fy. Where there are more than fit, the largest are kept.
     """
@@ -71,11 +75,15 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
         for j in range(n_columns):
             if labels[i, j] != -2:
                 continue
-            stack[0, 0], stack[0, 1] = i, j
+            stack[0, 0] = i
+            stack[0, 1] = j
             labels[i, j] = MAX_SURFACES
-            at, top, area = 0, 1, 0.0
+            at = 0
+            top = 1
+            area = 0.0
             while at < top:
-                r, c = stack[at, 0], stack[at, 1]
+                r = stack[at, 0]
+                c = stack[at, 1]
                 at += 1
                 here = blocks[r, c]
                 area += BLOCK * BLOCK * here * here / focal2
@@ -83,7 +91,8 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
                     for b in range(max(c - 1, 0), min(c + 2, n_columns)):
                         if labels[a, b] == -2 and abs(blocks[a, b] - here) < _JUMP_MM:
                             labels[a, b] = MAX_SURFACES
-                            stack[top, 0], stack[top, 1] = a, b
+                            stack[top, 0] = a
+                            stack[top, 1] = b
                             top += 1
             slot = -1
             if area >= least_mm2:
@@ -103,20 +112,29 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
 
 @njit(cache=True)
 def walk(blocks, labels, slot, position, order, hops):
-    """All blocks of a surface in the order of their distance, in steps, from where it leaves the picture.
+    """All blocks of a surface in the order of their distance, in steps, from where it leaves the
+    picture.
 
-    A surface that does not leave it is walked from its farthest block. order (n, 2) gets the blocks, hops (n,) their
-    distances, position (h, w) where in the order a block is; it comes in as -1. Returns how many blocks there are.
+    A surface that does not leave it is walked from its farthest block. order (n, 2) gets the
+    blocks, hops (n,) their distances, position (h, w) where in the order a block is; it comes in as
+    -1. Returns how many blocks there are.
     """
-    n, deepest, nearest, far_border = 0, np.float32(0.0), np.float32(1e9), np.float32(0.0)
-    far_i, far_j = -1, -1
-    last_i, last_j = labels.shape[0] - 1, labels.shape[1] - 1
+    n = 0
+    deepest = np.float32(0.0)
+    nearest = np.float32(1e9)
+    far_border = np.float32(0.0)
+    far_i = -1
+    far_j = -1
+    last_i = labels.shape[0] - 1
+    last_j = labels.shape[1] - 1
     for i in range(last_i + 1):
         for j in range(last_j + 1):
             if labels[i, j] == slot:
                 nearest = min(nearest, blocks[i, j])
                 if blocks[i, j] > deepest:
-                    deepest, far_i, far_j = blocks[i, j], i, j
+                    deepest = blocks[i, j]
+                    far_i = i
+                    far_j = j
                 if min(i, j, last_i - i, last_j - j) < _MARGIN:
                     far_border = max(far_border, blocks[i, j])
     # a hand may touch the border, too; the arm is farther away
@@ -125,7 +143,10 @@ def walk(blocks, labels, slot, position, order, hops):
         for j in range(last_j + 1):
             on_border = min(i, j, last_i - i, last_j - j) < _MARGIN
             if on_border and labels[i, j] == slot and blocks[i, j] >= arm:
-                order[n, 0], order[n, 1], hops[n], position[i, j] = i, j, 0, n
+                order[n, 0] = i
+                order[n, 1] = j
+                hops[n] = 0
+                position[i, j] = n
                 n += 1
     if n == 0:
         return walk_from(blocks, labels, slot, far_i, far_j, position, order, hops)
@@ -135,7 +156,10 @@ def walk(blocks, labels, slot, position, order, hops):
 @njit(cache=True)
 def walk_from(blocks, labels, slot, i, j, position, order, hops):
     """`walk` from one block of the surface."""
-    order[0, 0], order[0, 1], hops[0], position[i, j] = i, j, 0, 0
+    order[0, 0] = i
+    order[0, 1] = j
+    hops[0] = 0
+    position[i, j] = 0
     return _spread(blocks, labels, slot, 1, position, order, hops)
 
 
@@ -144,12 +168,16 @@ def _spread(blocks, labels, slot, n, position, order, hops):
     """Go on with a walk from its first n blocks. Returns how many there are in the end."""
     at = 0
     while at < n:
-        i, j = order[at, 0], order[at, 1]
+        i = order[at, 0]
+        j = order[at, 1]
         for a in range(max(i - 1, 0), min(i + 2, labels.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, labels.shape[1])):
                 near = abs(blocks[a, b] - blocks[i, j]) < _JUMP_MM
                 if labels[a, b] == slot and position[a, b] < 0 and near:
-                    order[n, 0], order[n, 1], hops[n], position[a, b] = a, b, hops[at] + 1, n
+                    order[n, 0] = a
+                    order[n, 1] = b
+                    hops[n] = hops[at] + 1
+                    position[a, b] = n
                     n += 1
         at += 1
     return n
@@ -157,31 +185,36 @@ def _spread(blocks, labels, slot, n, position, order, hops):
 
 @njit(cache=True)
 def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
-    """The ends of a walked surface, where it stops after having stuck out by `least_mm`: rows of tips (MAX_TIPS, 4).
+    """The ends of a walked surface, where it stops after having stuck out by `least_mm`: rows of
+    tips (MAX_TIPS, 4).
 
-    From the far end of the walk inwards, islands appear and grow together; the lower of two islands that meet has stuck
-    out by the difference (its persistence). A row is depth, less for what sticks out far, block row, block column,
-    depth. Returns how many there are now.
+    From the far end of the walk inwards, islands appear and grow together; the lower of two islands
+    that meet has stuck out by the difference (its persistence). A row is depth, less for what
+    sticks out far, block row, block column, depth. Returns how many there are now.
     """
     parent = np.arange(n)
     for k in range(n - 1, -1, -1):
-        i, j = order[k, 0], order[k, 1]
+        i = order[k, 0]
+        j = order[k, 1]
         for a in range(max(i - 1, 0), min(i + 2, blocks.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, blocks.shape[1])):
                 other = position[a, b]
                 if other <= k or other >= n or order[other, 0] != a or order[other, 1] != b:
                     continue
-                mine, theirs = find_root(parent, k), find_root(parent, other)
+                mine = find_root(parent, k)
+                theirs = find_root(parent, other)
                 if mine == theirs:
                     continue
                 # an island is known by its outermost block, which comes last in the order
-                low, high = min(mine, theirs), max(mine, theirs)
+                low = min(mine, theirs)
+                high = max(mine, theirs)
                 parent[low] = high
                 z = blocks[order[low, 0], order[low, 1]]
                 out_mm = (hops[low] - hops[k]) * BLOCK * z / focal
                 if out_mm >= least_mm:
                     n_tips = _note(tips, n_tips, z, out_mm / least_mm, order[low])
-    i, j = order[n - 1, 0], order[n - 1, 1]
+    i = order[n - 1, 0]
+    j = order[n - 1, 1]
     return _note(
         tips,
         n_tips,
@@ -197,36 +230,47 @@ def _note(tips, n_tips, z, out, block):
     if n_tips == MAX_TIPS:
         return n_tips
     tips[n_tips, 0] = z - _WORTH_MM * min(out, _MOST_OUT)
-    tips[n_tips, 1], tips[n_tips, 2], tips[n_tips, 3] = block[0], block[1], z
+    tips[n_tips, 1] = block[0]
+    tips[n_tips, 2] = block[1]
+    tips[n_tips, 3] = z
     return n_tips + 1
 
 
 @njit(cache=True)
 def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
-    """Up to `len(chosen)` places where a hand may be, the nearest first, no two alike; rows as in `ends`. How many.
+    """Up to `len(chosen)` places where a hand may be, the nearest first, no two alike; rows as in
+    `ends`. How many.
 
-    A surface is walked twice: from where it leaves the picture, and from the end that lies farthest from there, as it
-    may be the hand that lies at the border. What of it is nearest may be a hand before a body that it touches.
+    A surface is walked twice: from where it leaves the picture, and from the end that lies farthest
+    from there, as it may be the hand that lies at the border. What of it is nearest may be a hand
+    before a body that it touches.
     """
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
     n_blocks = blocks.size
     position = np.full(blocks.shape, -1, np.int32)
-    order, hops = np.empty((n_blocks, 2), np.int32), np.empty(n_blocks, np.int32)
-    tips, n_tips = np.empty((MAX_TIPS, 4)), 0
+    order = np.empty((n_blocks, 2), np.int32)
+    hops = np.empty(n_blocks, np.int32)
+    tips = np.empty((MAX_TIPS, 4))
+    n_tips = 0
     for slot in range(n_surfaces):
         n = walk(blocks, labels, slot, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
-        last_i, last_j, nearest = order[n - 1, 0], order[n - 1, 1], 0
+        last_i = order[n - 1, 0]
+        last_j = order[n - 1, 1]
+        nearest = 0
         for k in range(n):
             if blocks[order[k, 0], order[k, 1]] < blocks[order[nearest, 0], order[nearest, 1]]:
                 nearest = k
             position[order[k, 0], order[k, 1]] = -1
-        i, j = order[nearest, 0], order[nearest, 1]
+        i = order[nearest, 0]
+        j = order[nearest, 1]
         n_tips = _note(tips, n_tips, blocks[i, j], 0.5, order[nearest])
         n = walk_from(blocks, labels, slot, last_i, last_j, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
     ranked = np.argsort(tips[:n_tips, 0])
-    p, q, n_chosen = np.empty(3), np.empty(3), 0
+    p = np.empty(3)
+    q = np.empty(3)
+    n_chosen = 0
     for t in ranked:
         if n_chosen == len(chosen):
             break
@@ -252,18 +296,24 @@ def point_of_block(blocks, i, j, intrinsics, out):
 
 @njit(cache=True)
 def box_around(shape, middle, radius, intrinsics, box):
-    """First and last row and column (4,) of the blocks of a grid whose points can lie within `radius` mm of `middle`
-    (3,) mm. All of them, where the camera itself is so near.
+    """First and last row and column (4,) of the blocks of a grid whose points can lie within
+    `radius` mm of `middle` (3,) mm. All of them, where the camera itself is so near.
     """
-    near, far = middle[2] - radius, middle[2] + radius
+    near = middle[2] - radius
+    far = middle[2] + radius
     for axis in range(2):
         last = shape[axis] - 1
-        box[2 * axis], box[2 * axis + 1] = 0, last
+        box[2 * axis] = 0
+        box[2 * axis + 1] = last
         if near <= 0.0:
             continue
-        x, f, c = middle[1 - axis], intrinsics[1 - axis], intrinsics[3 - axis]
-        low, high = x - radius, x + radius
-        low, high = min(low / near, low / far) * f + c, max(high / near, high / far) * f + c
+        x = middle[1 - axis]
+        f = intrinsics[1 - axis]
+        c = intrinsics[3 - axis]
+        low = x - radius
+        high = x + radius
+        low = min(low / near, low / far) * f + c
+        high = max(high / near, high / far) * f + c
         box[2 * axis] = min(max(int(np.floor(low / BLOCK)) - 1, 0), last)
         box[2 * axis + 1] = min(max(int(np.ceil(high / BLOCK)) + 1, 0), last)
 

@@ -1,4 +1,5 @@
-"""Numba kernels that cut the hand at an end of a surface from its arm, and its height map from the picture.
+"""Numba kernels that cut the hand at an end of a surface from its arm, and its height map from the
+picture.
 
 blocks and labels are those of `_ends`.
 """
@@ -26,10 +27,9 @@ _TIP_MM = (
     60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
 )
 _MOST_ENDS = 8  # that are looked at
-_PER_MM_BEHIND, _MOST_BEHIND_MM = (
-    0.012,
-    800.0,
-)  # what it counts to be farther away than another end, in `unlikeness`
+# what it counts to be farther away than another end, in `unlikeness`
+_PER_MM_BEHIND = 0.012
+_MOST_BEHIND_MM = 800.0
 _AS_LIKE = (
     1.0  # a second end is worth a look while it is not more unlike a hand than the first by this
 )
@@ -39,21 +39,28 @@ _SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
 _SHELL_MM2 = 900.0
 _BIN_MM = 5.0
 _RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
-FIELDS = 8  # of a find: middle x y z, direction of the fingers x y z, where along it the arm is cut, area
+# of a find: middle x y z, direction of the fingers x y z, where along it the arm is cut, area
+FIELDS = 8
 
 
 @njit(cache=True)
 def locate(blocks, labels, tip, size, intrinsics, found):
-    """Where the hand at an end of a surface is: fill `found` (FIELDS,), mark its blocks with MAX_SURFACES in labels.
+    """Where the hand at an end of a surface is: fill `found` (FIELDS,), mark its blocks with
+    MAX_SURFACES in labels.
 
-    What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's length long.
+    What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's
+    length long.
     """
-    middle, fingers = np.empty(3), np.zeros(3)
+    middle = np.empty(3)
+    fingers = np.zeros(3)
     slot = labels[int(tip[1]), int(tip[2])]
     point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
     _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
-    around, focal2 = AROUND_MM * size, intrinsics[0] * intrinsics[1]
-    cut, area, base = -1e9, 0.0, 0.0
+    around = AROUND_MM * size
+    focal2 = intrinsics[0] * intrinsics[1]
+    cut = -1e9
+    area = 0.0
+    base = 0.0
     for step in range(3):
         points = _within(blocks, labels, slot, around, intrinsics, middle)
         has_arm = _away_from_arm(points, size, focal2, middle, fingers)
@@ -61,16 +68,22 @@ def locate(blocks, labels, tip, size, intrinsics, found):
         base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
         area = BLOCK * BLOCK * _beyond(points, middle, fingers, cut, labels, step == 2) / focal2
     for k in range(3):
-        found[k], found[3 + k] = middle[k], fingers[k]
-    found[6], found[7] = cut + base, area
+        found[k] = middle[k]
+        found[3 + k] = fingers[k]
+    found[6] = cut + base
+    found[7] = area
 
 
 @njit(cache=True)
 def _within(blocks, labels, slot, radius, intrinsics, middle):
-    """The points of a surface within `radius` mm of the middle, rows of x, y, z, distance, block row, block column."""
-    p, box = np.empty(3), np.empty(4, np.int64)
+    """The points of a surface within `radius` mm of the middle, rows of x, y, z, distance, block
+    row, block column.
+    """
+    p = np.empty(3)
+    box = np.empty(4, np.int64)
     box_around(blocks.shape, middle, radius, intrinsics, box)
-    points, n = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), 6)), 0
+    points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), 6))
+    n = 0
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
             if labels[i, j] != slot:
@@ -78,15 +91,21 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
             point_of_block(blocks, i, j, intrinsics, p)
             off2 = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
             if off2 < radius * radius:
-                points[n, 0], points[n, 1], points[n, 2] = p[0], p[1], p[2]
-                points[n, 3], points[n, 4], points[n, 5] = np.sqrt(off2), i, j
+                points[n, 0] = p[0]
+                points[n, 1] = p[1]
+                points[n, 2] = p[2]
+                points[n, 3] = np.sqrt(off2)
+                points[n, 4] = i
+                points[n, 5] = j
                 n += 1
     return points[:n]
 
 
 @njit(cache=True)
 def _away_from_arm(points, size, focal2, middle, fingers):
-    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm leaves the sphere."""
+    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm
+    leaves the sphere.
+    """
     shell = 0.0
     for k in range(3):
         fingers[k] = 0.0
@@ -106,13 +125,16 @@ def _away_from_arm(points, size, focal2, middle, fingers):
 
 @njit(cache=True)
 def _wrist(points, size, focal2, middle, fingers):
-    """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the fingertips."""
+    """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the
+    fingertips.
+    """
     around = AROUND_MM * size
     along = np.zeros(int(2.0 * around / _BIN_MM) + 2)
     for n in range(len(points)):
         s = _along(points[n], middle, fingers)
         along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
-    b, tip = along.size - 1, 0.0
+    b = along.size - 1
+    tip = 0.0
     while b > 0 and tip < 100.0 * size * size:
         tip += along[b]
         b -= 1
@@ -121,8 +143,13 @@ def _wrist(points, size, focal2, middle, fingers):
 
 @njit(cache=True)
 def _beyond(points, middle, fingers, cut, labels, mark):
-    """Move `middle` (3,) to the middle of what lies beyond the cut, marked in labels if so asked; its sum of z^2."""
-    total, x, y, z = 0.0, 0.0, 0.0, 0.0
+    """Move `middle` (3,) to the middle of what lies beyond the cut, marked in labels if so asked;
+    its sum of z^2.
+    """
+    total = 0.0
+    x = 0.0
+    y = 0.0
+    z = 0.0
     for n in range(len(points)):
         if _along(points[n], middle, fingers) > cut:
             w = points[n, 2] * points[n, 2]
@@ -133,7 +160,9 @@ def _beyond(points, middle, fingers, cut, labels, mark):
             if mark:
                 labels[int(points[n, 4]), int(points[n, 5])] = MAX_SURFACES
     least = max(total, 1e-9)
-    middle[0], middle[1], middle[2] = x / least, y / least, z / least
+    middle[0] = x / least
+    middle[1] = y / least
+    middle[2] = z / least
     return total
 
 
@@ -150,7 +179,10 @@ def _along(p, middle, fingers):
 @njit(cache=True)
 def _settle(blocks, labels, slot, radius, intrinsics, middle):
     """Move `middle` (3,) to the middle of what the surface has within `radius` mm of it."""
-    p, box, total, moved = np.empty(3), np.empty(4, np.int64), 0.0, np.zeros(3)
+    p = np.empty(3)
+    box = np.empty(4, np.int64)
+    total = 0.0
+    moved = np.zeros(3)
     box_around(blocks.shape, middle, radius, intrinsics, box)
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
@@ -169,7 +201,9 @@ def _settle(blocks, labels, slot, radius, intrinsics, middle):
 @njit(cache=True)
 def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
     """How unlike a hand what would be cut at each of the ends is, into unlike (n,)."""
-    depth, found, nearest = np.empty(len(unlike)), np.empty(FIELDS), 1e9
+    depth = np.empty(len(unlike))
+    found = np.empty(FIELDS)
+    nearest = 1e9
     for k in range(len(unlike)):
         slot = labels[int(ends[k, 1]), int(ends[k, 2])]
         locate(blocks, labels, ends[k], size, intrinsics, found)
@@ -184,7 +218,10 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
 @njit(cache=True)
 def box_of(labels, mark, box):
     """First and last row and column of the blocks labelled `mark` into box (4,)."""
-    box[0], box[1], box[2], box[3] = labels.shape[0], -1, labels.shape[1], -1
+    box[0] = labels.shape[0]
+    box[1] = -1
+    box[2] = labels.shape[1]
+    box[3] = -1
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if labels[i, j] == mark:
@@ -194,14 +231,14 @@ def box_of(labels, mark, box):
 
 @njit(cache=True)
 def sight_rotation(x, y, rotation):
-    """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as the camera's."""
+    """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as
+    the camera's.
+    """
     length = np.sqrt(x * x + y * y + 1.0)
     up = np.array([-x / length, -y / length, -1.0 / length])
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
-        1.0 - up[0] * up[0],
-        -up[0] * up[1],
-        -up[0] * up[2],
-    )
+    rotation[0, 0] = 1.0 - up[0] * up[0]
+    rotation[0, 1] = -up[0] * up[1]
+    rotation[0, 2] = -up[0] * up[2]
     norm = np.sqrt(rotation[0, 0] ** 2 + rotation[0, 1] ** 2 + rotation[0, 2] ** 2)
     for k in range(3):
         rotation[0, k] /= norm
@@ -215,7 +252,9 @@ def sight_rotation(x, y, rotation):
 def cut_heights(
     depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw
 ):
-    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2 not read."""
+    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2
+    not read.
+    """
     size = raw.shape[0]
     reaches = np.full((labels.shape[0] + 1, labels.shape[1] + 1), -1.0, np.float32)
     for r in range(size):
@@ -230,7 +269,8 @@ def cut_heights(
                 and 0 <= u < depth.shape[1]
             ):
                 continue
-            row, column = v // BLOCK, u // BLOCK
+            row = v // BLOCK
+            column = u // BLOCK
             if reaches[row, column] < 0.0:
                 reaches[row, column] = _reach(blocks, labels, row, column)
             reach = reaches[row, column]
@@ -240,7 +280,8 @@ def cut_heights(
             if z <= near:
                 raw[r, c] = -2.0
                 continue
-            x, y = (u - intrinsics[2]) / intrinsics[0] * z, (v - intrinsics[3]) / intrinsics[1] * z
+            x = (u - intrinsics[2]) / intrinsics[0] * z
+            y = (v - intrinsics[3]) / intrinsics[1] * z
             if x * found[3] + y * found[4] + z * found[5] <= found[6]:
                 continue
             above = distance * (1.0 - z * (plane[0] * u + plane[1] * v + plane[2]))
@@ -250,7 +291,9 @@ def cut_heights(
 
 @njit(cache=True)
 def _reach(blocks, labels, row, column):
-    """How far, mm, a pixel of this block may be to belong to the hand; 0 where no block near it does."""
+    """How far, mm, a pixel of this block may be to belong to the hand; 0 where no block near it
+    does.
+    """
     farthest = np.float32(0.0)
     for a in range(max(row - 1, 0), min(row + 2, labels.shape[0])):
         for b in range(max(column - 1, 0), min(column + 2, labels.shape[1])):
@@ -279,12 +322,14 @@ def extract_one(
     n_blobs,
     k,
 ):
-    """Find the hand in frame k (H, W) mm and fill row k of the batch; see `NearestScene.extract`. Where n_things is 2,
-    the batch has twice as many rows as there are frames, and the second half gets what may be a hand as well.
+    """Find the hand in frame k (H, W) mm and fill row k of the batch; see `NearestScene.extract`.
+    Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
+    gets what may be a hand as well.
     """
     blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
     labels = np.empty(blocks.shape, np.int32)
-    areas, ends = np.empty(MAX_SURFACES), np.empty((_MOST_ENDS, 4))
+    areas = np.empty(MAX_SURFACES)
+    ends = np.empty((_MOST_ENDS, 4))
     focal2 = intrinsics[0] * intrinsics[1]
     block_depths(depth, near, far, blocks)
     n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
@@ -342,8 +387,11 @@ def cut_end(
     distance,
     k,
 ):
-    """The height map of the hand at an end of a surface, and its moments, into row k; labels stay as they are."""
-    found, box = np.empty(FIELDS), np.empty(4, np.int64)
+    """The height map of the hand at an end of a surface, and its moments, into row k; labels stay
+    as they are.
+    """
+    found = np.empty(FIELDS)
+    box = np.empty(4, np.int64)
     slot = labels[int(end[1]), int(end[2])]
     locate(blocks, labels, end, size, intrinsics, found)
     box_of(labels, MAX_SURFACES, box)
@@ -352,8 +400,10 @@ def cut_end(
     crop = heights.shape[1]
     span = BLOCK * (max(box[1] - box[0], box[3] - box[2]) + 3)
     step = max(1, int(np.ceil(span / (crop - 4))))
-    middle_u, middle_v = 0.5 * BLOCK * (box[2] + box[3] + 1), 0.5 * BLOCK * (box[0] + box[1] + 1)
-    origin[k, 0], origin[k, 1] = int(middle_u - step * crop / 2), int(middle_v - step * crop / 2)
+    middle_u = 0.5 * BLOCK * (box[2] + box[3] + 1)
+    middle_v = 0.5 * BLOCK * (box[0] + box[1] + 1)
+    origin[k, 0] = int(middle_u - step * crop / 2)
+    origin[k, 1] = int(middle_v - step * crop / 2)
     n_steps[k] = step
     rotation = np.empty((3, 3))
     x, y = view_axis(origin[k], step, crop, intrinsics, along_axis)
@@ -394,7 +444,9 @@ def cut_end(
 
 @njit(cache=True)
 def view_axis(origin, step, crop, intrinsics, along_axis):
-    """Where the view's axis goes, (x, y) at z = 1: through the middle of the crop, or along the optical axis."""
+    """Where the view's axis goes, (x, y) at z = 1: through the middle of the crop, or along the
+    optical axis.
+    """
     if along_axis:
         return 0.0, 0.0
     return (
@@ -462,12 +514,10 @@ def fill_looks(intrinsics, origin, step, distance, crop, along_axis, looks):
         sight_rotation(x, y, rotation)
         looks[k, :4] = intrinsics[k]
         looks[k, 4:13] = rotation.ravel()
-        looks[k, 13], looks[k, 14], looks[k, 15], looks[k, 16] = (
-            distance[k],
-            origin[k, 0],
-            origin[k, 1],
-            step[k],
-        )
+        looks[k, 13] = distance[k]
+        looks[k, 14] = origin[k, 0]
+        looks[k, 15] = origin[k, 1]
+        looks[k, 16] = step[k]
 
 
 @njit(cache=True)

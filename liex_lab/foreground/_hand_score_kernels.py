@@ -11,36 +11,43 @@ from numba import njit
 from liex_lab.foreground._blob_kernels import BLOCK
 from liex_lab.foreground._geodesic_kernels import AROUND_MM, box_around, point_of_block, relabel
 
-# what tells rendered hands from elbows, chests and heads by logistic regression, in units of the first: the logarithm
+# what tells rendered hands from elbows, chests and heads by logistic regression, in units of the
+# first: the logarithm
 # of circumference^2 over area, which fingers make large
-_AREA_LOG_MM2, _PER_AREA = (
-    9.55,
-    0.55,
-)  # of a home-sized hand; what the square of the difference counts
+# of a home-sized hand; what the square of the difference counts
+_AREA_LOG_MM2 = 9.55
+_PER_AREA = 0.55
 _PER_BORDER = 0.6  # the share that lies along the border of the picture
-_WRIST_MM, _WIDE_MM, _PER_WIDTH, _MOST_WIDTHS = (
-    50.0,
-    100.0,
-    0.25,
-    4.0,
-)  # how wide it goes on behind the cut
+# how wide it goes on behind the cut
+_WRIST_MM = 50.0
+_WIDE_MM = 100.0
+_PER_WIDTH = 0.25
+_MOST_WIDTHS = 4.0
 _MARGIN = 2  # blocks
-_WITHIN = 2.0  # of `AROUND_MM`, from the hand's middle: all blocks that are marked, and what lies close behind the cut
+# of `AROUND_MM`, from the hand's middle: all blocks that are marked, and what lies close behind the
+# cut
+_WITHIN = 2.0
 _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 @njit(cache=True)
 def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
-    """The mean depth, mm, of the blocks labelled `mark`, and how unlike a hand they are: the less, the more alike.
+    """The mean depth, mm, of the blocks labelled `mark`, and how unlike a hand they are: the less,
+    the more alike.
 
-    slot: the label of the rest of the surface, which the blocks get back; found (FIELDS,) as `_nearest.locate` fills
-    it.
+    slot: the label of the rest of the surface, which the blocks get back; found (FIELDS,) as
+    `_nearest.locate` fills it.
     """
     box = np.empty(4, np.int64)
     box_around(labels.shape, found, _WITHIN * AROUND_MM * size, intrinsics, box)
     n_rows, n_columns = labels.shape
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
-    area, around, behind, on_border, n, depth = 0.0, 0.0, 0.0, 0, 0, 0.0
+    area = 0.0
+    around = 0.0
+    behind = 0.0
+    on_border = 0
+    n = 0
+    depth = 0.0
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
             if labels[i, j] == slot:
@@ -54,12 +61,14 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
             n += 1
             on_border += min(i, j, n_rows - 1 - i, n_columns - 1 - j) < _MARGIN
             for a, b in _ACROSS:
-                r, c = i + a, j + b
+                r = i + a
+                c = j + b
                 inside = 0 <= r < n_rows and 0 <= c < n_columns
                 if not inside or (labels[r, c] != mark and labels[r, c] != slot):
                     around += side
     relabel(labels, box, mark, slot)
-    area, n = max(area, 1.0), max(n, 1)
+    area = max(area, 1.0)
+    n = max(n, 1)
     width = min(behind / (_WRIST_MM * _WIDE_MM * size * size), _MOST_WIDTHS)
     unlike = _PER_AREA * (np.log(area / (size * size)) - _AREA_LOG_MM2) ** 2
     return depth / n, unlike + _PER_BORDER * on_border / n + _PER_WIDTH * width - np.log(
@@ -76,7 +85,8 @@ def _side(depth, focal):
 @njit(cache=True)
 def _behind_cut(blocks, i, j, found, size, intrinsics):
     """Whether a block lies close behind the cut through the arm."""
-    p, off = np.empty(3), 0.0
+    p = np.empty(3)
+    off = 0.0
     point_of_block(blocks, i, j, intrinsics, p)
     along = p[0] * found[3] + p[1] * found[4] + p[2] * found[5] - found[6]
     for k in range(3):

@@ -1,4 +1,6 @@
-"""Numba kernels that find the animal's blob in a frame and cut its height map, over many frames at once."""
+"""Numba kernels that find the animal's blob in a frame and cut its height map, over many frames at
+once.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor 
 
 @njit(cache=True, parallel=True, nogil=True)
 def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
-    """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not stand on the floor."""
+    """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not
+    stand on the floor.
+    """
     for k in prange(depths.shape[0]):
         labels = np.empty(
             (depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32
@@ -37,7 +41,8 @@ def blob_area(blob, mm2_per_px):
 
 @njit(cache=True)
 def order_blobs(blobs, n_blobs, area, mm2_per_px):
-    """The blobs in the order in which their areas come near to the animal's, and how many have about its area.
+    """The blobs in the order in which their areas come near to the animal's, and how many have
+    about its area.
 
     While `area` is 0 the largest comes first.
     """
@@ -57,11 +62,13 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
 
 @njit(cache=True)
 def parted(depth, limit, labels, blobs, area, mm2_per_px):
-    """The picture without what hangs together with the animal in it alone, and whether there is such a thing.
+    """The picture without what hangs together with the animal in it alone, and whether there is
+    such a thing.
 
-    Of two layers far from one another the animal is the one whose area is nearer to its own. What lies before it hides
-    parts of it, and is taken for unread; what lies behind it there is background. Elsewhere nothing is: of a bar and
-    some specks the bar is likest to the animal, which may swim beside them.
+    Of two layers far from one another the animal is the one whose area is nearer to its own. What
+    lies before it hides parts of it, and is taken for unread; what lies behind it there is
+    background. Elsewhere nothing is: of a bar and some specks the bar is likest to the animal,
+    which may swim beside them.
     """
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
@@ -118,11 +125,13 @@ def extract_one(
     n_blobs,
     k,
 ):
-    """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's. Where n_things is 2,
-    the batch has twice as many rows as there are frames, and the second half gets what comes next near.
+    """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's.
+    Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
+    gets what comes next near.
 
-    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind the mean depth. parts:
-    what hangs together with the animal in the picture alone is told apart by its depth, see `parted`.
+    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind
+    the mean depth. parts: what hangs together with the animal in the picture alone is told apart by
+    its depth, see `parted`.
     """
     labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
     blobs = np.empty((segment.MAX_BLOBS, 7))
@@ -183,12 +192,14 @@ def cut_crop(
     distance,
     k,
 ):
-    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k; distance[k] moves to behind
-    the animal where heights are measured along the optical axis.
+    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k;
+    distance[k] moves to behind the animal where heights are measured along the optical axis.
     """
     crop = heights.shape[1]
-    v0, v1 = blob[1] * segment.BLOCK, (blob[2] + 1) * segment.BLOCK
-    u0, u1 = blob[3] * segment.BLOCK, (blob[4] + 1) * segment.BLOCK
+    v0 = blob[1] * segment.BLOCK
+    v1 = (blob[2] + 1) * segment.BLOCK
+    u0 = blob[3] * segment.BLOCK
+    u1 = (blob[4] + 1) * segment.BLOCK
     span = max(v1 - v0, u1 - u0) + 2 * segment.BLOCK
     step = max(1, int(np.ceil(span / (crop - 4))))
     origin[k, 0] = int((u0 + u1) / 2 - step * crop / 2)
@@ -284,10 +295,8 @@ def extract_windows(
     n_blobs,
 ):
     for k in prange(depths.shape[0]):
-        limit, everywhere = (
-            np.empty(depths.shape[1:], np.float32),
-            np.ones(depths.shape[1:], np.bool_),
-        )
+        limit = np.empty(depths.shape[1:], np.float32)
+        everywhere = np.ones(depths.shape[1:], np.bool_)
         for v in range(limit.shape[0]):
             for u in range(limit.shape[1]):
                 behind = float(background[k, v, u])

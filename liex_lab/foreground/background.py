@@ -8,16 +8,19 @@ from numpy.typing import NDArray
 from liex_lab.foreground import _background_kernels as kernels
 from liex_lab.recordings.recording import Recording
 
-_MODE_SHARE, _MODE_MM = (
-    0.012,
-    6.0,
-)  # readings this near to one another, of the depth or in mm, are one surface
+# readings this near to one another, of the depth or in mm, are one surface
+_MODE_SHARE = 0.012
+_MODE_MM = 6.0
 _NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual depth
-_LENGTH_PX, _MAX_STRIDE = 64.0, 4  # an animal of this many pixels is looked at finely enough
+# an animal of this many pixels is looked at finely enough
+_LENGTH_PX = 64.0
+_MAX_STRIDE = 4
 
 
 def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArray[np.float32]:
-    """Every `stride`-th pixel of up to `n_frames` frames (n, H, W) mm spread evenly over the recording."""
+    """Every `stride`-th pixel of up to `n_frames` frames (n, H, W) mm spread evenly over the
+    recording.
+    """
     chosen = np.unique(
         np.linspace(0, len(recording) - 1, min(n_frames, len(recording))).astype(int)
     )
@@ -35,7 +38,9 @@ def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArr
 
 
 def stride_for(recording: Recording, length_mm: float) -> int:
-    """How many pixels apart the picture may be looked at so that an animal of length_mm is still some pixels long."""
+    """How many pixels apart the picture may be looked at so that an animal of length_mm is still
+    some pixels long.
+    """
     for index in {0, len(recording) // 2}:
         depth = recording.frame(index).depth
         if (depth > 0).any():
@@ -47,8 +52,8 @@ def stride_for(recording: Recording, length_mm: float) -> int:
 def learn_background(
     sample: NDArray[np.float32] | Recording,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Background depth, its spread, and the nearest usual depth (H, W) mm of a sample (n, H, W) mm or of a recording;
-    0 = never read.
+    """Background depth, its spread, and the nearest usual depth (H, W) mm of a sample (n, H, W) mm
+    or of a recording; 0 = never read.
     """
     stack = sample if isinstance(sample, np.ndarray) else sample_frames(sample, 96)
     depth, spread, near = np.zeros((3, *stack.shape[1:]), np.float32)

@@ -1,4 +1,6 @@
-"""The scene behind the animal, and the animal in front of it: background, floor, blob, height map."""
+"""The scene behind the animal, and the animal in front of it: background, floor, blob,
+height map.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ __all__ = ["CROP", "Crops", "Scene", "Windows", "floor_region", "learn_backgroun
 Array = NDArray[np.float64]
 
 SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
-_AREA_SD, _VOLUME_SD = 0.25, 0.2  # of the logarithms, from posture to posture of one animal
+# of the logarithms, from posture to posture of one animal
+_AREA_SD = 0.25
+_VOLUME_SD = 0.2
 _TOUCH_SHARE = (
     0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
 )
@@ -34,11 +38,12 @@ _TOUCH_SHARE = (
 class Scene(Cutter):
     """What the camera sees without the animal, and what nearer than that counts as the animal.
 
-    background (H, W) mm; limit (H, W) mm: a reading below it is in front of the background; on_floor (H, W): the floor,
-    under which nothing lies, as far as the picture shows it: an animal stands on it with at least a part of its body;
-    area_mm2 and volume_mm3: the animal's usual area seen from above and volume under its back, 0 while unknown; view:
-    how such animals are looked at; stride: only every so many-th row and column of the picture is looked at, and H, W
-    count those.
+    background (H, W) mm; limit (H, W) mm: a reading below it is in front of the background;
+    on_floor (H, W): the floor, under which nothing lies, as far as the picture shows it: an animal
+    stands on it with at least a part of its body; area_mm2 and volume_mm3: the animal's usual area
+    seen from above and volume under its back, 0 while unknown; view: how such animals are looked
+    at; stride: only every so many-th row and column of the picture is looked at, and H, W count
+    those.
     """
 
     camera: Camera
@@ -78,11 +83,12 @@ class Scene(Cutter):
         min_height_mm: float = 7.0,
         view: View = MOUSE_VIEW,
     ) -> tuple[Scene, NDArray[np.float32]]:
-        """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was learned.
+        """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was
+        learned.
 
-        The background of a pixel is the farthest depth that keeps coming back, which survives an animal that covers it
-        most of the time; where the animal never leaves its place the floor plane takes over. spine_mm: the smallest and
-        the largest animal to expect.
+        The background of a pixel is the farthest depth that keeps coming back, which survives an
+        animal that covers it most of the time; where the animal never leaves its place the floor
+        plane takes over. spine_mm: the smallest and the largest animal to expect.
         """
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
@@ -98,7 +104,8 @@ class Scene(Cutter):
         bare = seen.depth(grid.width, grid.height)
         on_floor = floor_region(background, bare)
         background = np.where((background == 0) & on_floor, bare, background)
-        # the rims and walls around the floor flicker between near and far: there, nearer than ever is what counts
+        # the rims and walls around the floor flicker between near and far: there, nearer than ever
+        # is what counts
         behind = np.where(on_floor, background, near)
         margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
         limit = np.maximum(behind - margin, 0).astype(np.float32)
@@ -115,14 +122,17 @@ class Scene(Cutter):
             )
             still_area, still_share = still.usual_area(sample, spine_mm)
             if still_share > share:
-                scene, area, share = still, still_area, still_share
+                scene = still
+                area = still_area
+                share = still_share
         elif stands:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
         if share == 0.0:
             raise EstimationError(
-                f"no animal was found in {len(sample)} frames spread over the recording: nothing between "
-                f"{view.area[0] * spine_mm[0] ** 2:.0f} and {view.area[1] * spine_mm[1] ** 2:.0f} mm^2 "
-                "stands on the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in the plan"
+                f"no animal was found in {len(sample)} frames spread over the recording: nothing "
+                f"between {view.area[0] * spine_mm[0] ** 2:.0f} and "
+                f"{view.area[1] * spine_mm[1] ** 2:.0f} mm^2 stands on the floor; check the depth "
+                "unit, or set animal.spine_min_mm and spine_max_mm in the plan"
             )
         scene = replace(scene, area_mm2=area)
         return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
@@ -134,10 +144,12 @@ class Scene(Cutter):
         min_height_mm: float,
         area: float,
     ) -> tuple[Scene, float]:
-        """The scene with the floor put under an animal that has left a part of itself in the background.
+        """The scene with the floor put under an animal that has left a part of itself in the
+        background.
 
-        Such a part is a lump on the floor that the moving animal of area mm^2 touches in (nearly) every frame, and with
-        which it is still no larger than an animal. Returns the animal's area, too.
+        Such a part is a lump on the floor that the moving animal of area mm^2 touches in (nearly)
+        every frame, and with which it is still no larger than an animal. Returns the animal's area,
+        too.
         """
         import cv2
 
@@ -150,7 +162,8 @@ class Scene(Cutter):
             rows, columns = np.nonzero(crops.heights[i])
             step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
             moving[k, v + step * rows, u + step * columns] = True
-        best, best_area = self, area
+        best = self
+        best_area = area
         for k in range(1, n):
             part = labels == k
             if stats[k, cv2.CC_STAT_AREA] < 16:
@@ -165,7 +178,8 @@ class Scene(Cutter):
             whole = replace(self, background=floor, limit=limit.astype(np.float32))
             whole_area, share = whole.usual_area(sample, spine_mm)
             if share >= 0.5 and whole_area > best_area:
-                best, best_area = whole, whole_area
+                best = whole
+                best_area = whole_area
         return best, best_area
 
     def usual_area(
@@ -173,14 +187,16 @@ class Scene(Cutter):
     ) -> tuple[float, float]:
         """The area mm^2 that the most frames have a blob of, and the share of frames that do.
 
-        One object of constant size is in (nearly) every frame, the animal; other things come and go or differ.
+        One object of constant size is in (nearly) every frame, the animal; other things come and go
+        or differ.
         """
         areas = np.zeros((len(depths), MAX_BLOBS))
         bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
         kernels.blob_areas(
             depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas
         )
-        low, high = self.view.area[0] * spine_mm[0] ** 2, self.view.area[1] * spine_mm[1] ** 2
+        low = self.view.area[0] * spine_mm[0] ** 2
+        high = self.view.area[1] * spine_mm[1] ** 2
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
             return 0.0, 0.0
@@ -195,20 +211,22 @@ class Scene(Cutter):
         )
 
     def usual_volume(self, depths: NDArray[np.float32]) -> float:
-        """The median volume mm^3 of the animal in the frames (n, H, W) mm in which nothing else has about its area."""
-        volume, n_blobs = np.zeros(len(depths)), np.zeros(len(depths), np.int64)
+        """The median volume mm^3 of the animal in the frames (n, H, W) mm in which nothing else has
+        about its area.
+        """
+        volume = np.zeros(len(depths))
+        n_blobs = np.zeros(len(depths), np.int64)
         for start in range(0, len(depths), 16):
             crops = self.extract(depths[start : start + 16], 1.0)
-            volume[start : start + 16], n_blobs[start : start + 16] = (
-                crops.moments[:, 2],
-                crops.n_blobs,
-            )
+            volume[start : start + 16] = crops.moments[:, 2]
+            n_blobs[start : start + 16] = crops.n_blobs
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
 
     def every(self, step: int) -> Scene:
         """The same with every `step`-th pixel along rows and columns."""
-        camera, cut = self.camera.every(step), (slice(None, None, step), slice(None, None, step))
+        camera = self.camera.every(step)
+        cut = (slice(None, None, step), slice(None, None, step))
         floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
         return replace(
             self,
@@ -220,8 +238,11 @@ class Scene(Cutter):
         )
 
     def misfit(self, crops: Crops) -> Array:
-        """How unlike the animal each crop (n) is in area and volume: the square of a number of standard deviations."""
-        area, volume = np.maximum(crops.moments[:, 1], 1.0), np.maximum(crops.moments[:, 2], 1.0)
+        """How unlike the animal each crop (n) is in area and volume: the square of a number of
+        standard deviations.
+        """
+        area = np.maximum(crops.moments[:, 1], 1.0)
+        volume = np.maximum(crops.moments[:, 2], 1.0)
         if (
             self.view.frame != VIEWS[0]
         ):  # what is below an animal that swims or is held up is not its own
@@ -235,7 +256,9 @@ class Scene(Cutter):
         return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
 
     def planes(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels
+        of the picture.
+        """
         if not camera_view:
             return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
         level = np.zeros((len(crops.step), 3))
@@ -251,7 +274,9 @@ class Scene(Cutter):
         return middle
 
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
-        """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the crop."""
+        """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the
+        crop.
+        """
         looks = np.empty((len(crops.step), 17))
         looks[:, :4] = self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
         looks[:, 4:13] = self.view_rotation(camera_view).ravel()
@@ -268,9 +293,10 @@ class Scene(Cutter):
         camera_view: bool,
         n_things: int,
     ) -> Crops:
-        """See `Cutter`: the blobs whose areas are nearest to the animal's own. depths: whole pictures, or a sample of
-        them with the scene's own stride. camera_view: heights are measured from the view's behind_mm behind the
-        animal's mean depth, as the paper's features see them; otherwise above the floor.
+        """See `Cutter`: the blobs whose areas are nearest to the animal's own. depths: whole
+        pictures, or a sample of them with the scene's own stride. camera_view: heights are measured
+        from the view's behind_mm behind the animal's mean depth, as the paper's features see them;
+        otherwise above the floor.
         """
         if depths.shape[1:] != self.limit.shape:
             depths = depths[:, :: self.stride, :: self.stride]
@@ -308,10 +334,11 @@ def _check_background(sample: NDArray[np.float32], background: NDArray[np.float3
     n = len(sample)
     if not (sample > 0).any():
         raise EstimationError(
-            f"no depth was read in {n} frames spread over the recording; check the camera, its range and its cable"
+            f"no depth was read in {n} frames spread over the recording; check the camera, its "
+            "range and its cable"
         )
     if not (background > 0).any():
         raise EstimationError(
-            f"a background is what keeps coming back, and {n} frame{'' if n == 1 else 's'} cannot tell; record some "
-            "seconds at least"
+            f"a background is what keeps coming back, and {n} frame{'' if n == 1 else 's'} cannot "
+            "tell; record some seconds at least"
         )

@@ -1,4 +1,6 @@
-"""Height maps of one animal, cut out of whole pictures (see `Scene`) or out of windows around it."""
+"""Height maps of one animal, cut out of whole pictures (see `Scene`) or out of windows
+around it.
+"""
 
 from __future__ import annotations
 
@@ -26,13 +28,14 @@ CROP = 96  # pixels a side of a height map
 class Crops:
     """Height maps of one animal, a batch (n), and how the animal's mass lies on the floor.
 
-    heights (n, CROP, CROP) int16, 1/16 mm above the floor, 0 = not the animal; origin (n, 2) picture pixel (u, v) of
-    crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,) readings on the animal, 0 = not found; n_blobs
-    (n,) how many things in the frame have about the animal's size;
-    moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle rad (mod pi), the standard
-    deviation mm along and across it, and (camera_view, else 0) the slope of the back along it, all in the view frame.
-    The view frame is the arena frame, or (camera_view) an upright frame whose z axis is the optical axis backwards; its
-    origin is `distance` (n,) mm in front of the camera.
+    heights (n, CROP, CROP) int16, 1/16 mm above the floor, 0 = not the animal; origin (n, 2)
+    picture pixel (u, v) of crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,)
+    readings on the animal, 0 = not found; n_blobs (n,) how many things in the frame have about the
+    animal's size; moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle
+    rad (mod pi), the standard deviation mm along and across it, and (camera_view, else 0) the slope
+    of the back along it, all in the view frame. The view frame is the arena frame, or (camera_view)
+    an upright frame whose z axis is the optical axis backwards; its origin is `distance` (n,) mm in
+    front of the camera.
     """
 
     heights: NDArray[np.int16]
@@ -88,7 +91,9 @@ class Crops:
 
 
 class Foreground(Protocol):
-    """What finds the animal in the pictures of one camera: `foreground.Scene`, or `nearest.NearestScene`."""
+    """What finds the animal in the pictures of one camera: `foreground.Scene`, or
+    `nearest.NearestScene`.
+    """
 
     @property
     def camera(self) -> Camera:
@@ -118,13 +123,17 @@ class Foreground(Protocol):
         parallel: bool = True,
         camera_view: bool = False,
     ) -> tuple[Crops, Crops]:
-        """The animal of each frame (n, H, W) mm, and what else may be it, found where n_blobs is more than one."""
+        """The animal of each frame (n, H, W) mm, and what else may be it, found where n_blobs is
+        more than one.
+        """
 
     def looks(self, crops: Crops, camera_view: bool = False) -> Array:
         """How each height map was cut (n, 17)."""
 
     def planes(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels of the picture."""
+        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels
+        of the picture.
+        """
 
     def middles(self, crops: Crops, camera_view: bool = False) -> Array:
         """The middle (n, 3) mm of what each crop shows, in the arena frame."""
@@ -137,7 +146,9 @@ class Foreground(Protocol):
 
 
 class Cutter(ABC):
-    """What cuts the animal out of pictures, and what else may be it in the same pass; the part that scenes share."""
+    """What cuts the animal out of pictures, and what else may be it in the same pass; the part that
+    scenes share.
+    """
 
     def extract(
         self,
@@ -146,8 +157,8 @@ class Cutter(ABC):
         parallel: bool = True,
         camera_view: bool = False,
     ) -> Crops:
-        """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home length. camera_view:
-        heights are measured along the optical axis.
+        """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home
+        length. camera_view: heights are measured along the optical axis.
         """
         return self._extract(depths, size, parallel, camera_view, 1)
 
@@ -159,7 +170,8 @@ class Cutter(ABC):
         camera_view: bool = False,
     ) -> tuple[Crops, Crops]:
         """`extract`, and the next thing that may be the animal after all."""
-        crops, n = self._extract(depths, size, parallel, camera_view, 2), len(depths)
+        crops = self._extract(depths, size, parallel, camera_view, 2)
+        n = len(depths)
         return crops[:n], crops[n:]
 
     @abstractmethod
@@ -185,9 +197,9 @@ def view_of(looks: Array) -> SE3:
 class Windows:
     """Parts of pictures from many cameras (n), each around one animal on a known floor.
 
-    depth, background (n, H, W) mm, 0 = unread; intrinsics (n, 4) fx fy cx cy, pixels of the whole picture; origin
-    (n, 2) picture pixel of each window's first; inverse_depth (n, 3): 1 / z of the floor = a u + b v + c in pixels of
-    the whole picture; view: how such animals are looked at.
+    depth, background (n, H, W) mm, 0 = unread; intrinsics (n, 4) fx fy cx cy, pixels of the whole
+    picture; origin (n, 2) picture pixel of each window's first; inverse_depth (n, 3): 1 / z of the
+    floor = a u + b v + c in pixels of the whole picture; view: how such animals are looked at.
     """
 
     depth: NDArray[np.uint16] | NDArray[np.float32]
@@ -210,18 +222,20 @@ class Windows:
         camera_view: bool = False,
         n_things: int = 1,
     ) -> tuple[Crops, Array]:
-        """The blob of each window whose area is nearest to area_mm2 (n,), and its looks (n, 17); see `Scene.extract`
-        and `Scene.looks`. size (n,) of the animals over home; min_height_mm: one, or (n,); n_things: 2 gives as many
-        rows again, of what is next near.
+        """The blob of each window whose area is nearest to area_mm2 (n,), and its looks (n, 17);
+        see `Scene.extract` and `Scene.looks`. size (n,) of the animals over home; min_height_mm:
+        one, or (n,); n_things: 2 gives as many rows again, of what is next near.
         """
         n = len(self.depth)
         distance = np.empty(n)
         # a window is the picture of a camera whose centre is shifted
-        intrinsics, plane = self.intrinsics.copy(), self.inverse_depth.copy()
+        intrinsics = self.intrinsics.copy()
+        plane = self.inverse_depth.copy()
         intrinsics[:, 2:] -= self.origin
         plane[:, 2] += plane[:, 0] * self.origin[:, 0] + plane[:, 1] * self.origin[:, 1]
         margin = np.broadcast_to(np.asarray(min_height_mm, np.float32), (n,)).copy()
-        rotation, of_whom = np.empty((n, 3, 3)), np.hstack([self.inverse_depth, self.intrinsics])
+        rotation = np.empty((n, 3, 3))
+        of_whom = np.hstack([self.inverse_depth, self.intrinsics])
         for k in range(n):
             if (
                 not k or (of_whom[k] != of_whom[k - 1]).any()

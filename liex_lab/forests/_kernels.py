@@ -12,8 +12,9 @@ Tests compare a response with the threshold and go right when it is at least as 
     SCALAR      a number that describes the whole animal from the joint's point of view
 Heights are 1/16 mm of an animal of home size, so one forest serves animals of every size.
 
-A view, 9 float32, is how a joint of a candidate pose looks onto a height map: crop pixel (column, row) of the joint, a
-2x3 matrix from offsets (1/127 of the reach, in the joint's frame) to crop pixels, and the joint's own height.
+A view, 9 float32, is how a joint of a candidate pose looks onto a height map: crop pixel (column,
+row) of the joint, a 2x3 matrix from offsets (1/127 of the reach, in the joint's frame) to crop
+pixels, and the joint's own height.
 """
 
 from __future__ import annotations
@@ -21,18 +22,25 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-TWO_PROBES, ONE_PROBE, SCALAR = 0, 1, 2
+TWO_PROBES = 0
+ONE_PROBE = 1
+SCALAR = 2
 VIEW = 9
 
 
 @njit(cache=True, inline="always")
 def probe(heights, view, a, b, c):
-    """Height in the map (S, S) under offset (a, b, c); a probe outside reads the border, which is background.
+    """Height in the map (S, S) under offset (a, b, c); a probe outside reads the border, which is
+    background.
 
-    In float32, and in this order, as `_walk` has it: a forest then sees the same wherever it is asked.
+    In float32, and in this order, as `_walk` has it: a forest then sees the same wherever it is
+    asked.
     """
     limit = heights.shape[0] - 1
-    x, y, z, half = np.float32(a), np.float32(b), np.float32(c), np.float32(0.5)
+    x = np.float32(a)
+    y = np.float32(b)
+    z = np.float32(c)
+    half = np.float32(0.5)
     column = int(((view[0] + half) + view[2] * x) + view[3] * y + view[4] * z)
     row = int(((view[1] + half) + view[5] * x) + view[6] * y + view[7] * z)
     column = min(max(column, 0), limit)
@@ -52,7 +60,8 @@ def response(heights, inverse_size, views, scalars, word0, word1, word3):
 
     heights (S, S) int16; views (V, 9); scalars (n,); words 0, 1 and 3 of a node.
     """
-    kind, channel = word3 & 3, word3 >> 2
+    kind = word3 & 3
+    channel = word3 >> 2
     if kind == SCALAR:
         return scalars[channel]
     view = views[channel]
@@ -113,16 +122,19 @@ def random_below(state, n):
 
 @njit(cache=True)
 def number_nodes(is_leaf, starts, nodes):
-    """Child pointers of trees, in the order in which growth made them, into word 2 of `nodes` (n, 4).
+    """Child pointers of trees, in the order in which growth made them, into word 2 of `nodes` (n,
+    4).
 
-    is_leaf (n,); starts (trees + 1,): where each tree's nodes begin, and the end. A tree's children are appended as a
-    pair when their parent splits, the left side of the stack first.
+    is_leaf (n,); starts (trees + 1,): where each tree's nodes begin, and the end. A tree's children
+    are appended as a pair when their parent splits, the left side of the stack first.
     """
     leaf = 0
     stack = np.empty(is_leaf.size + 1, np.int64)
     for tree in range(starts.size - 1):
         root = starts[tree]
-        stack[0], n, made = 0, 1, 1
+        stack[0] = 0
+        n = 1
+        made = 1
         while n > 0:
             n -= 1
             at = stack[n]
@@ -131,6 +143,7 @@ def number_nodes(is_leaf, starts, nodes):
                 nodes[root + at, 2] = -leaf
             else:
                 nodes[root + at, 2] = root + made
-                stack[n], stack[n + 1] = made + 1, made
+                stack[n] = made + 1
+                stack[n + 1] = made
                 n += 2
                 made += 2

@@ -1,14 +1,16 @@
 """Sixteen samples down one tree together, in vector registers: the fast twin of `_kernels.descend`.
 
-A test has no branch here: both probes are read, and a selection picks what the node's kind asks for. That alone is
-twice as fast as branching, which the processor cannot foresee; sixteen lanes make it about six times as fast. Numba's
-compiler does not vectorise such a loop by itself, so its body is written as LLVM's portable intermediate code: any
-processor runs it, with vectors as wide as it has. Arithmetic is float32 in the order of `_kernels.probe`, so that the
-answers are the same bit for bit.
+A test has no branch here: both probes are read, and a selection picks what the node's kind asks
+for. That alone is twice as fast as branching, which the processor cannot foresee; sixteen lanes
+make it about six times as fast. Numba's compiler does not vectorise such a loop by itself, so its
+body is written as LLVM's portable intermediate code: any processor runs it, with vectors as wide as
+it has. Arithmetic is float32 in the order of `_kernels.probe`, so that the answers are the same bit
+for bit.
 
-Lanes read from flat arrays. `pixels` int16 holds height maps, and behind them the samples' scalars, rounded down (a
-threshold is an integer, so rounding down changes no answer); `base` int32 (n,) is where a sample's map begins in it,
-`scalar_base` int32 (n,) where its scalars begin. n is a multiple of LANES; lanes without a sample may hold zeros.
+Lanes read from flat arrays. `pixels` int16 holds height maps, and behind them the samples' scalars,
+rounded down (a threshold is an integer, so rounding down changes no answer); `base` int32 (n,) is
+where a sample's map begins in it, `scalar_base` int32 (n,) where its scalars begin. n is a multiple
+of LANES; lanes without a sample may hold zeros.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ from numba.extending import intrinsic
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, VIEW
 
 LANES = 16
-_INTS, _FLOATS, _BITS = f"<{LANES} x i32>", f"<{LANES} x float>", f"<{LANES} x i1>"
+_INTS = f"<{LANES} x i32>"
+_FLOATS = f"<{LANES} x float>"
+_BITS = f"<{LANES} x i1>"
 
 
 def _same(type_: str, value: object) -> str:
@@ -50,32 +54,39 @@ class _Text:
         vector = _INTS if type_ == "i32" else _FLOATS
         self(f"%{name}.one = insertelement {vector} undef, {type_} {value}, i32 0")
         self(
-            f"%{name} = shufflevector {vector} %{name}.one, {vector} undef, <{LANES} x i32> zeroinitializer"
+            f"%{name} = shufflevector {vector} %{name}.one, {vector} undef, <{LANES} x i32> "
+            "zeroinitializer"
         )
 
     def joined(self, names: list[str], type_: str, width: int) -> list[str]:
-        """The rows %names of `width` elements each, joined two by two until rows are LANES or more long."""
+        """The rows %names of `width` elements each, joined two by two until rows are LANES or more
+        long.
+        """
         while width < LANES:
             pairs = [f"{names[i]}.{width}" for i in range(0, len(names), 2)]
             for i, pair in enumerate(pairs):
-                first, second = names[2 * i], names[2 * i + 1]
+                first = names[2 * i]
+                second = names[2 * i + 1]
                 self(
-                    f"%{pair} = shufflevector <{width} x {type_}> %{first}, <{width} x {type_}> %{second}, "
-                    f"{_mask(list(range(2 * width)))}"
+                    f"%{pair} = shufflevector <{width} x {type_}> %{first}, <{width} x {type_}> "
+                    f"%{second}, {_mask(list(range(2 * width)))}"
                 )
-            names, width = pairs, 2 * width
+            names = pairs
+            width = 2 * width
         return names
 
     def column(self, name: str, rows: list[str], type_: str, width: int, index: int) -> None:
-        """%name: element `index` of every lane's record, from rows of LANES / width records of that width each."""
+        """%name: element `index` of every lane's record, from rows of LANES / width records of that
+        width each.
+        """
         each = LANES // width
         parts = []
         for i in range(0, len(rows), 2):
             part = f"{name}.p{i}"
             picked = [width * r + index for r in range(each)]
             self(
-                f"%{part} = shufflevector <{LANES} x {type_}> %{rows[i]}, <{LANES} x {type_}> %{rows[i + 1]}, "
-                f"{_mask(picked + [LANES + p for p in picked])}"
+                f"%{part} = shufflevector <{LANES} x {type_}> %{rows[i]}, <{LANES} x {type_}> "
+                f"%{rows[i + 1]}, {_mask(picked + [LANES + p for p in picked])}"
             )
             parts.append(part)
         last = self.joined(parts, type_, 2 * each)[0]
@@ -99,18 +110,21 @@ class _Text:
                 total = f"{name}.{axis}.s{i}"
             self(f"%{name}.{axis}.int = fptosi {_FLOATS} %{total} to {_INTS}")
             self(
-                f"%{name}.{axis}.low = call {_INTS} @llvm.smax.v{LANES}i32({_INTS} %{name}.{axis}.int, "
-                f"{_INTS} zeroinitializer)"
+                f"%{name}.{axis}.low = call {_INTS} @llvm.smax.v{LANES}i32({_INTS} "
+                f"%{name}.{axis}.int, {_INTS} zeroinitializer)"
             )
             self(
-                f"%{name}.{axis} = call {_INTS} @llvm.smin.v{LANES}i32({_INTS} %{name}.{axis}.low, {_INTS} %limit)"
+                f"%{name}.{axis} = call {_INTS} @llvm.smin.v{LANES}i32({_INTS} %{name}.{axis}.low, "
+                f"{_INTS} %limit)"
             )
         self(f"%{name}.line = mul {_INTS} %{name}.row, %sides")
         self(f"%{name}.in = add {_INTS} %{name}.line, %{name}.column")
         self(f"%{name} = add {_INTS} %{name}.in, %map")
 
     def read(self, name: str, index: str) -> None:
-        """%name: the pixels at an index, as float. One by one: gathers are no faster, and few processors have them."""
+        """%name: the pixels at an index, as float. One by one: gathers are no faster, and few
+        processors have them.
+        """
         before = "undef"
         for k in range(LANES):
             self(f"%{name}.i{k} = extractelement {_INTS} %{index}, i32 {k}")
@@ -175,7 +189,9 @@ def _middle(text: _Text) -> None:
 
 
 def llvm_text(name: str, several: bool) -> str:
-    """The function as LLVM code; several: nodes choose among the samples' views, else there is one view."""
+    """The function as LLVM code; several: nodes choose among the samples' views, else there is one
+    view.
+    """
     text = _Text()
     text.spread("start", "i32", "%root")
     text.spread("sides", "i32", "%side")
@@ -244,8 +260,8 @@ def llvm_text(name: str, several: bool) -> str:
             f"declare {_INTS} @llvm.smin.v{LANES}i32({_INTS}, {_INTS})",
             f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
             f"declare i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS})",
-            f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 %stride, i32 %side, "
-            "ptr noalias %leaf, i64 %first) noinline {",
+            f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 "
+            "%stride, i32 %side, ptr noalias %leaf, i64 %first) noinline {",
             "entry:",
             *text.lines,
             "}",
@@ -261,7 +277,9 @@ def _emit(name: str, several: bool) -> Any:
         library.add_llvm_module(llvm.parse_assembly(llvm_text(name, several)))
         library.finalize()
         context.active_code_library.add_linking_library(library)
-        pointer, i32, i64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
+        pointer = ir.IntType(8).as_pointer()
+        i32 = ir.IntType(32)
+        i64 = ir.IntType(64)
         wanted = [pointer, i32, *[pointer] * 5, i64, i32, pointer, i64]
         function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(ir.VoidType(), wanted), name
@@ -302,8 +320,8 @@ def walk_one_view(
 ) -> Any:
     """Leaves of lanes first .. first + LANES - 1 in the tree at `root`, into leaf (n,) int32.
 
-    nodes (N, 4) int32; inverse (n,) float32 home size over the animal's; views (9, n) float32 and stride n; side of the
-    height maps in pixels. Arrays are contiguous; nothing is checked.
+    nodes (N, 4) int32; inverse (n,) float32 home size over the animal's; views (9, n) float32 and
+    stride n; side of the height maps in pixels. Arrays are contiguous; nothing is checked.
     """
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_one_view", False)
@@ -324,6 +342,8 @@ def walk_views(
     leaf: Any,
     first: Any,
 ) -> Any:
-    """`walk_one_view` for nodes that choose among the views (n, V, 9) of a sample; stride is 9 V."""
+    """`walk_one_view` for nodes that choose among the views (n, V, 9) of a sample; stride
+    is 9 V.
+    """
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_views", True)

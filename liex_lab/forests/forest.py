@@ -15,7 +15,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Forest:
-    """Trees on pose-indexed tests. nodes (n, 4) int32, see `_kernels`; roots (T,); leaves (n_leaves, D) float32."""
+    """Trees on pose-indexed tests. nodes (n, 4) int32, see `_kernels`; roots (T,); leaves
+    (n_leaves, D) float32.
+    """
 
     nodes: NDArray[np.int32]
     roots: NDArray[np.int32]
@@ -36,7 +38,9 @@ class Forest:
     @staticmethod
     def join(forests: list[Forest]) -> Forest:
         """One forest of all the trees of several."""
-        nodes, roots, leaves = [], [], []
+        nodes = []
+        roots = []
+        leaves = []
         n_nodes = n_leaves = 0
         for forest in forests:
             shifted = forest.nodes.copy()
@@ -57,8 +61,9 @@ class Forest:
 class Samples:
     """What a forest is trained on or asked about: n samples on a set of height maps.
 
-    heights (n_images, S, S) int16; image (n,) int32 index of each sample's map; inverse_size (n,) float32 home size
-    over the animal's size; views (n, V, 9) float32; scalars (n, n_scalars) float32.
+    heights (n_images, S, S) int16; image (n,) int32 index of each sample's map; inverse_size (n,)
+    float32 home size over the animal's size; views (n, V, 9) float32; scalars (n, n_scalars)
+    float32.
     """
 
     heights: NDArray[np.int16]
@@ -95,7 +100,8 @@ def predict(
 ) -> NDArray[np.float32]:
     """Mean leaf value (n, D) of each sample.
 
-    in_bag (T, n_images): trees that have seen a sample's image are left out, unless all have (METHOD lesson 6).
+    in_bag (T, n_images): trees that have seen a sample's image are left out, unless all have
+    (METHOD lesson 6).
     """
     out = np.zeros((len(samples), forest.leaves.shape[1]), np.float32)
     bag = np.zeros((forest.n_trees, 1), np.bool_) if in_bag is None else in_bag
@@ -143,7 +149,8 @@ def _predict_each(nodes, roots, leaves, heights, image, inverse_size, views, sca
 
 @njit(cache=True, parallel=True)
 def _predict(nodes, roots, leaves, heights, image, inverse_size, views, scalars, in_bag, out):
-    n_trees, n_values = roots.size, leaves.shape[1]
+    n_trees = roots.size
+    n_values = leaves.shape[1]
     for s in prange(image.size):
         i = image[s]
         column = i if in_bag.shape[1] > 1 else 0

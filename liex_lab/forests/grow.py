@@ -21,19 +21,19 @@ from liex_lab.forests.forest import Forest, Samples, predict
 
 _N_THRESHOLDS = 20
 _TREES_A_STAGE = 2
-_N_FIRST, _N_SECOND, _N_KEPT = (
-    96,
-    1500,
-    12,
-)  # samples of the first and second look at a test; tests that get the second
+# samples of the first and second look at a test; tests that get the second
+_N_FIRST = 96
+_N_SECOND = 1500
+_N_KEPT = 12
 
 
 @dataclass(frozen=True)
 class GrowthPlan:
     """How trees grow. Shares are of the tests tried at a node; the rest compare two probes.
 
-    depth_share: how far offsets reach along the joint's z axis, of their reach across; bag_share: share of the images
-    that a tree sees, drawn without replacement, all samples of an image together (1: every tree sees all).
+    depth_share: how far offsets reach along the joint's z axis, of their reach across; bag_share:
+    share of the images that a tree sees, drawn without replacement, all samples of an image
+    together (1: every tree sees all).
     """
 
     n_trees: int
@@ -55,7 +55,8 @@ def grow_forest(
 ) -> tuple[Forest, NDArray[np.bool_]]:
     """A forest for labels (n, D) of the kept samples, and which images each tree saw (T, n_images).
 
-    Trees grow in parallel from seeds drawn here, so the forest does not depend on the number of threads.
+    Trees grow in parallel from seeds drawn here, so the forest does not depend on the number of
+    threads.
     """
     n_images = len(samples.heights)
     in_bag = np.zeros((plan.n_trees, n_images), np.bool_)
@@ -103,10 +104,12 @@ def boost_forest(
     shrinkage: float,
     rng: np.random.Generator,
 ) -> Forest:
-    """A forest whose trees correct one another: each pair is grown on what the pairs before it left of labels (n, D).
+    """A forest whose trees correct one another: each pair is grown on what the pairs before it left
+    of labels (n, D).
 
-    Stochastic gradient boosting of squared error (Friedman 2002) with two trees a stage, grown in parallel on different
-    images. Leaves are scaled so that the mean over trees, which is how every forest predicts, is the boosted sum.
+    Stochastic gradient boosting of squared error (Friedman 2002) with two trees a stage, grown in
+    parallel on different images. Leaves are scaled so that the mean over trees, which is how every
+    forest predicts, is the boosted sum.
     """
     mean = labels.mean(axis=0)
     left = (labels - mean).astype(np.float32)
@@ -171,12 +174,15 @@ def _grow_all(
 def _draw_test(state, n_views, n_scalars, one_probe_share, scalar_share, depth_share, test):
     """A random test into `test` (3,) int32: words 0, 1 and 3 of a node, threshold still 0."""
     kind_draw = (next_random(state) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-    kind, channel = TWO_PROBES, random_below(state, n_views)
+    kind = TWO_PROBES
+    channel = random_below(state, n_views)
     if kind_draw < scalar_share and n_scalars > 0:
-        kind, channel = SCALAR, random_below(state, n_scalars)
+        kind = SCALAR
+        channel = random_below(state, n_scalars)
     elif kind_draw < scalar_share + one_probe_share:
         kind = ONE_PROBE
-    u, v = np.empty(3, np.int64), np.empty(3, np.int64)
+    u = np.empty(3, np.int64)
+    v = np.empty(3, np.int64)
     deep = max(1, int(127 * depth_share))
     for k in range(3):
         reach = deep if k == 2 else 127
@@ -188,14 +194,19 @@ def _draw_test(state, n_views, n_scalars, one_probe_share, scalar_share, depth_s
 
 @njit(cache=True)
 def _best_threshold(values, n, chosen, labels, min_share, sums, result):
-    """Best of evenly spread thresholds for responses values (n,) of samples `chosen`: gain and it, into result (2,).
+    """Best of evenly spread thresholds for responses values (n,) of samples `chosen`: gain and it,
+    into result (2,).
 
-    Plain variance reduction (Eq. 16 with Eq. 17 as a mean): up to a constant, |sum_left|^2 / n_left + the same right.
+    Plain variance reduction (Eq. 16 with Eq. 17 as a mean): up to a constant, |sum_left|^2 / n_left
+    + the same right.
     """
-    result[0], result[1] = -1.0, 0.0
-    low, high = values[0], values[0]
+    result[0] = -1.0
+    result[1] = 0.0
+    low = values[0]
+    high = values[0]
     for i in range(1, n):
-        low, high = min(low, values[i]), max(high, values[i])
+        low = min(low, values[i])
+        high = max(high, values[i])
     if not high - low >= 1.0:
         return
     n_labels = labels.shape[1]
@@ -223,7 +234,8 @@ def _best_threshold(values, n, chosen, labels, min_share, sums, result):
             right = total[d] - sums[b, d]
             gain += sums[b, d] * sums[b, d] / n_left + right * right / n_right
         if gain > result[0]:
-            result[0], result[1] = gain, low + (b + 0.5) / scale
+            result[0] = gain
+            result[1] = low + (b + 0.5) / scale
 
 
 @njit(cache=True)
@@ -256,7 +268,9 @@ def _find_split(
     sums,
     best,
 ):
-    """The test that a node keeps into best (4,): words 0, 1, 3 and the threshold. False when none separates it."""
+    """The test that a node keeps into best (4,): words 0, 1, 3 and the threshold. False when none
+    separates it.
+    """
     n = members.size
     n_tried = n_tests if n >= 128 else min(n_tests, max(20, n_tests * n // 128))
     n_first = min(n, _N_FIRST)
@@ -281,7 +295,8 @@ def _find_split(
     n_second = min(n, _N_SECOND)
     for i in range(n_second):
         chosen[i] = members[i] if n <= _N_SECOND else members[random_below(state, n)]
-    found, best_gain = False, -1.0
+    found = False
+    best_gain = -1.0
     ranked = np.argsort(gains)
     for r in range(min(_N_KEPT, n_tried)):
         k = ranked[r]
@@ -290,8 +305,11 @@ def _find_split(
         _look(heights, image, inverse_size, views, scalars, chosen, n_second, tests[k], values)
         _best_threshold(values, n_second, chosen, labels, min_leaf / n, sums, result)
         if result[0] > best_gain:
-            found, best_gain = True, result[0]
-            best[0], best[1], best[2] = tests[k, 0], tests[k, 1], tests[k, 2]
+            found = True
+            best_gain = result[0]
+            best[0] = tests[k, 0]
+            best[1] = tests[k, 1]
+            best[2] = tests[k, 2]
             best[3] = min(max(int(np.ceil(result[1])), -32768), 32767)
     return found
 
@@ -299,7 +317,8 @@ def _find_split(
 @njit(cache=True)
 def _part(heights, image, inverse_size, views, scalars, members, best):
     """Order `members` so that those going left come first; how many do."""
-    left, right = 0, members.size - 1
+    left = 0
+    right = members.size - 1
     while left <= right:
         s = members[left]
         value = response(
@@ -333,7 +352,9 @@ def _grow_tree(
     leaves,
     counts,
 ):
-    """Grow one tree on `members` into nodes and leaves; counts (2,) gets how many of each there are."""
+    """Grow one tree on `members` into nodes and leaves; counts (2,) gets how many of each there
+    are.
+    """
     state = np.empty(1, np.uint64)
     state[0] = seed
     n_labels = labels.shape[1]
@@ -342,11 +363,19 @@ def _grow_tree(
     sums = np.empty((_N_THRESHOLDS + 1, n_labels + 1))
     best = np.empty(4, np.int32)
     stack = np.empty((4 * max_depth + 8, 4), np.int64)  # node, first member, past the last, depth
-    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, members.size, 0
-    top, n_nodes, n_leaves = 1, 1, 0
+    stack[0, 0] = 0
+    stack[0, 1] = 0
+    stack[0, 2] = members.size
+    stack[0, 3] = 0
+    top = 1
+    n_nodes = 1
+    n_leaves = 0
     while top > 0:
         top -= 1
-        node, first, stop, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        node = stack[top, 0]
+        first = stack[top, 1]
+        stop = stack[top, 2]
+        depth = stack[top, 3]
         here = members[first:stop]
         middle = 0
         if (
@@ -388,9 +417,17 @@ def _grow_tree(
         nodes[node, 1] = (best[1] & 0xFFFF) | (best[3] << 16)
         nodes[node, 2] = n_nodes
         nodes[node, 3] = best[2]
-        right, left = stack[top], stack[top + 1]
-        right[0], right[1], right[2], right[3] = n_nodes + 1, first + middle, stop, depth + 1
-        left[0], left[1], left[2], left[3] = n_nodes, first, first + middle, depth + 1
+        right = stack[top]
+        left = stack[top + 1]
+        right[0] = n_nodes + 1
+        right[1] = first + middle
+        right[2] = stop
+        right[3] = depth + 1
+        left[0] = n_nodes
+        left[1] = first
+        left[2] = first + middle
+        left[3] = depth + 1
         top += 2
         n_nodes += 2
-    counts[0], counts[1] = n_nodes, n_leaves
+    counts[0] = n_nodes
+    counts[1] = n_leaves

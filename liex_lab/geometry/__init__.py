@@ -1,4 +1,6 @@
-"""Rigid motion: SO(3), SE(3), geodesics and Brownian motion. Twists are (omega, nu): radians, then millimetres."""
+"""Rigid motion: SO(3), SE(3), geodesics and Brownian motion. Twists are (omega, nu): radians, then
+millimetres.
+"""
 
 from liex_lab.geometry.brownian import brownian_path, brownian_steps
 from liex_lab.geometry.se3 import SE3

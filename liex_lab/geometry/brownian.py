@@ -11,7 +11,9 @@ from liex_lab.geometry.se3 import SE3
 def brownian_steps(
     rng: np.random.Generator, covariance: ArrayLike, n_steps: int, *batch: int
 ) -> NDArray[np.float64]:
-    """Tangent steps z_k ~ N(0, covariance) (*batch, n_steps, 6) for a covariance (6, 6) in rad and mm."""
+    """Tangent steps z_k ~ N(0, covariance) (*batch, n_steps, 6) for a covariance (6, 6) in rad and
+    mm.
+    """
     return rng.multivariate_normal(
         np.zeros(6), np.asarray(covariance, float), size=(*batch, n_steps)
     )
@@ -20,12 +22,14 @@ def brownian_steps(
 def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) -> SE3:
     """The path g(t) from `start` at the given times (n,), as a batch (n,).
 
-    g((k+1) delta) = g(k delta) exp(sqrt(delta) z_k) (Eq. 6); between the steps
-    g(t) = g(k delta) exp((t - k delta) / sqrt(delta) z_k) (Eq. 7).
+    g((k+1) delta) = g(k delta) exp(sqrt(delta) z_k) (Eq. 6); between the steps g(t) = g(k delta)
+    exp((t - k delta) / sqrt(delta) z_k) (Eq. 7).
 
-    steps: tangent steps z (n_steps, 6); delta: step length in s; times: seconds in [0, n_steps * delta].
+    steps: tangent steps z (n_steps, 6); delta: step length in s; times: seconds in [0, n_steps *
+    delta].
     """
-    z, t = np.asarray(steps, float), np.atleast_1d(np.asarray(times, float))
+    z = np.asarray(steps, float)
+    t = np.atleast_1d(np.asarray(times, float))
     if not delta > 0 or t.min() < 0 or t.max() > len(z) * delta * (1 + 1e-12):
         raise ValueError(
             f"times must lie within the path, 0 to {len(z) * delta} s, got {t.min()} to {t.max()} s"

@@ -1,4 +1,6 @@
-"""The group SE(3) of rigid motions: one element or a batch, with the formulas of Lie-X section 3."""
+"""The group SE(3) of rigid motions: one element or a batch, with the formulas of Lie-X
+section 3.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ Array = NDArray[np.float64]
 class SE3:
     """Rigid transforms, one or a batch: `T_a_b` carries points of frame b into frame a.
 
-    rotation (..., 3, 3), proper; translation (..., 3) mm. A tangent vector is (wx, wy, wz, vx, vy, vz), as in the
-    paper: radians, then millimetres.
+    rotation (..., 3, 3), proper; translation (..., 3) mm. A tangent vector is (wx, wy, wz, vx, vy,
+    vz), as in the paper: radians, then millimetres.
     """
 
     rotation: Array
@@ -39,7 +41,8 @@ class SE3:
     def exp(twist: ArrayLike) -> SE3:
         """The group elements of twists (..., 6) (Lie-X Eq. 4 and 5)."""
         xi = np.asarray(twist, float)
-        omega, nu = xi[..., :3], xi[..., 3:]
+        omega = xi[..., :3]
+        nu = xi[..., 3:]
         return SE3(so3.exp(omega), np.einsum("...ij,...j->...i", so3.left_jacobian(omega), nu))
 
     def log(self) -> Array:
@@ -54,7 +57,9 @@ class SE3:
         return SE3(transposed, -np.einsum("...ij,...j->...i", transposed, self.translation))
 
     def adjoint(self) -> Array:
-        """Matrices (..., 6, 6) that carry a twist of frame b into frame a: `exp(Ad xi) = g exp(xi) g^-1`."""
+        """Matrices (..., 6, 6) that carry a twist of frame b into frame a: `exp(Ad xi) = g exp(xi)
+        g^-1`.
+        """
         r = self.rotation
         matrix = np.zeros((*r.shape[:-2], 6, 6))
         matrix[..., :3, :3] = r
@@ -66,7 +71,9 @@ class SE3:
     def matrix(self) -> Array:
         """Homogeneous matrices (..., 4, 4)."""
         m = np.zeros((*self.rotation.shape[:-2], 4, 4))
-        m[..., :3, :3], m[..., :3, 3], m[..., 3, 3] = self.rotation, self.translation, 1.0
+        m[..., :3, :3] = self.rotation
+        m[..., :3, 3] = self.translation
+        m[..., 3, 3] = 1.0
         return m
 
     @overload
@@ -82,9 +89,11 @@ class SE3:
         )
 
     def geodesic(self, other: SE3, s: ArrayLike) -> SE3:
-        """The curve from self (s = 0) to other (s = 1): rotation and translation each go straight (Lie-X section 3).
+        """The curve from self (s = 0) to other (s = 1): rotation and translation each go straight
+        (Lie-X section 3).
 
-        The paper's matrix multiplies the translation by A, with which the end point is missed; it is left out here.
+        The paper's matrix multiplies the translation by A, with which the end point is missed; it
+        is left out here.
         """
         step = np.asarray(s, float)[..., None]
         omega = so3.log(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
@@ -93,9 +102,12 @@ class SE3:
 
 
 def product_of_exponentials(twists: ArrayLike) -> SE3:
-    """All partial products exp(xi_1) ... exp(xi_j) of a chain of twists (..., J, 6), as a batch (..., J)."""
+    """All partial products exp(xi_1) ... exp(xi_j) of a chain of twists (..., J, 6), as a batch
+    (..., J).
+    """
     links = SE3.exp(twists)
-    rotations, translations = [], []
+    rotations = []
+    translations = []
     so_far = SE3.identity(*links.translation.shape[:-2])
     for j in range(links.translation.shape[-2]):
         so_far = so_far @ SE3(links.rotation[..., j, :, :], links.translation[..., j, :])

@@ -1,4 +1,6 @@
-"""The rotation group SO(3): hat, exp, log, and means. Vectors are (..., 3) radians, rotations (..., 3, 3)."""
+"""The rotation group SO(3): hat, exp, log, and means. Vectors are (..., 3) radians, rotations (...,
+3, 3).
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,19 @@ def hat(omega: ArrayLike) -> Array:
     """Skew matrices (..., 3, 3) of vectors (..., 3) (Lie-X Eq. 2): `hat(w) @ x == cross(w, x)`."""
     w = np.asarray(omega, float)
     matrix = np.zeros((*w.shape[:-1], 3, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2] = -w[..., 2], w[..., 1]
-    matrix[..., 1, 0], matrix[..., 1, 2] = w[..., 2], -w[..., 0]
-    matrix[..., 2, 0], matrix[..., 2, 1] = -w[..., 1], w[..., 0]
+    matrix[..., 0, 1] = -w[..., 2]
+    matrix[..., 0, 2] = w[..., 1]
+    matrix[..., 1, 0] = w[..., 2]
+    matrix[..., 1, 2] = -w[..., 0]
+    matrix[..., 2, 0] = -w[..., 1]
+    matrix[..., 2, 1] = w[..., 0]
     return matrix
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products (..., 3) of vectors (..., 3) that broadcast; np.cross, three times as fast for few."""
+    """Cross products (..., 3) of vectors (..., 3) that broadcast; np.cross, three times as fast for
+    few.
+    """
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for k, i, j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[..., k] = a[..., i] * b[..., j] - a[..., j] * b[..., i]
@@ -51,11 +58,13 @@ def exp(omega: ArrayLike) -> Array:
 def quaternion(rotation: ArrayLike) -> Array:
     """Unit quaternions (..., 4) as (w, x, y, z), w >= 0, of rotations (..., 3, 3).
 
-    Shepperd's method: of the four squared components the largest is taken as pivot, so no division is by a small
-    number at any angle, pi included.
+    Shepperd's method: of the four squared components the largest is taken as pivot, so no division
+    is by a small number at any angle, pi included.
     """
     r = np.asarray(rotation, float)
-    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    d0 = r[..., 0, 0]
+    d1 = r[..., 1, 1]
+    d2 = r[..., 2, 2]
     squares = np.stack(
         [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1
     )
@@ -64,9 +73,13 @@ def quaternion(rotation: ArrayLike) -> Array:
     for k in range(4):
         rows[..., k, k] = squares[..., k]
     for i, k, value in (
-        (0, 1, r[..., 2, 1] - r[..., 1, 2]), (0, 2, r[..., 0, 2] - r[..., 2, 0]), (0, 3, r[..., 1, 0] - r[..., 0, 1]),
-        (1, 2, r[..., 0, 1] + r[..., 1, 0]), (1, 3, r[..., 0, 2] + r[..., 2, 0]), (2, 3, r[..., 1, 2] + r[..., 2, 1]),
-    ):  # fmt: skip
+        (0, 1, r[..., 2, 1] - r[..., 1, 2]),
+        (0, 2, r[..., 0, 2] - r[..., 2, 0]),
+        (0, 3, r[..., 1, 0] - r[..., 0, 1]),
+        (1, 2, r[..., 0, 1] + r[..., 1, 0]),
+        (1, 3, r[..., 0, 2] + r[..., 2, 0]),
+        (2, 3, r[..., 1, 2] + r[..., 2, 1]),
+    ):
         rows[..., i, k] = rows[..., k, i] = value
     pivot = np.argmax(squares, axis=-1)
     q = np.take_along_axis(rows, pivot[..., None, None], axis=-2)[..., 0, :]
@@ -75,10 +88,12 @@ def quaternion(rotation: ArrayLike) -> Array:
 
 
 def log(rotation: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) rad, length in [0, pi], of rotations (..., 3, 3): the inverse of `exp`.
+    """Rotation vectors (..., 3) rad, length in [0, pi], of rotations (..., 3, 3): the inverse of
+    `exp`.
 
-    Goes through the quaternion and atan2, which keeps full precision near 0 and near pi, where the arc cosine of the
-    trace loses all of it. At exactly pi the two signs are the same rotation; either may come out.
+    Goes through the quaternion and atan2, which keeps full precision near 0 and near pi, where the
+    arc cosine of the trace loses all of it. At exactly pi the two signs are the same rotation;
+    either may come out.
     """
     q = quaternion(rotation)
     v = q[..., 1:]
@@ -101,7 +116,9 @@ def left_jacobian(omega: ArrayLike) -> Array:
 
 
 def left_jacobian_inverse(omega: ArrayLike) -> Array:
-    """The inverse of `left_jacobian` for lengths in [0, pi]; it has a pole at 2 pi, so keep logs principal."""
+    """The inverse of `left_jacobian` for lengths in [0, pi]; it has a pole at 2 pi, so keep logs
+    principal.
+    """
     w = np.asarray(omega, float)
     th2 = np.sum(w * w, axis=-1)[..., None, None]
     small = th2 < _SMALL_A
@@ -124,7 +141,9 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
 
 
 def mean(rotations: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Weighted mean rotation (3, 3) of rotations (n, 3, 3): the chordal mean, unique unless they cancel."""
+    """Weighted mean rotation (3, 3) of rotations (n, 3, 3): the chordal mean, unique unless they
+    cancel.
+    """
     r = np.asarray(rotations, float)
     w = np.ones(len(r)) if weights is None else np.asarray(weights, float)
     return nearest_rotation(np.einsum("n,nij->ij", w, r))

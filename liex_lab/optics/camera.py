@@ -1,4 +1,6 @@
-"""The depth camera: a pinhole that carries points to pixels and back, and says where its numbers come from."""
+"""The depth camera: a pinhole that carries points to pixels and back, and says where its numbers
+come from.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from liex_lab.errors import LiexError
 
 Array = NDArray[np.float64]
 
-BROWN_CONRADY, KANNALA_BRANDT = "brown_conrady", "kannala_brandt"
+BROWN_CONRADY = "brown_conrady"
+KANNALA_BRANDT = "kannala_brandt"
 _N_COEFFICIENTS = {BROWN_CONRADY: 8, KANNALA_BRANDT: 4}
 _MODELS = {  # as OpenCV, ROS and Foxglove call them; an empty name is ROS's usual model
     **dict.fromkeys(
@@ -27,11 +30,12 @@ _WIDEST = 8.0  # tangent of the largest angle from the optical axis that is cons
 
 @dataclass(frozen=True)
 class Distortion:
-    """How a lens bends rays: the ray (x, y, 1) of an ideal pinhole meets the picture where (x', y', 1) should.
+    """How a lens bends rays: the ray (x, y, 1) of an ideal pinhole meets the picture where (x', y',
+    1) should.
 
-    model and coefficients, in OpenCV's order: 'brown_conrady' has k1 k2 p1 p2 k3 k4 k5 k6 (ROS: plumb_bob with five of
-    them, rational_polynomial with all), 'kannala_brandt' the k1 k2 k3 k4 of a fisheye lens (ROS: equidistant). `of`
-    makes one from what a file states.
+    model and coefficients, in OpenCV's order: 'brown_conrady' has k1 k2 p1 p2 k3 k4 k5 k6 (ROS:
+    plumb_bob with five of them, rational_polynomial with all), 'kannala_brandt' the k1 k2 k3 k4 of
+    a fisheye lens (ROS: equidistant). `of` makes one from what a file states.
     """
 
     model: str
@@ -41,16 +45,18 @@ class Distortion:
         n = _N_COEFFICIENTS.get(self.model)
         if n is None or len(self.coefficients) != n or not np.isfinite(self.coefficients).all():
             raise LiexError(
-                f"a lens distortion is brown_conrady with 8 finite coefficients or kannala_brandt with 4, got "
-                f"{self.model} with {list(self.coefficients)}; correct distortion in camera.toml or in the plan"
+                "a lens distortion is brown_conrady with 8 finite coefficients or kannala_brandt "
+                f"with 4, got {self.model} with {list(self.coefficients)}; correct distortion in "
+                "camera.toml or in the plan"
             )
 
     @staticmethod
     def of(model: str, coefficients: Sequence[float]) -> Distortion | None:
-        """The distortion that a file states; None where all coefficients are zero, for then there is none.
+        """The distortion that a file states; None where all coefficients are zero, for then there
+        is none.
 
-        Coefficients that are left out at the end are zero; OpenCV's thin prism (beyond the eighth) is refused unless
-        zero. Raises LiexError for a model that is not known.
+        Coefficients that are left out at the end are zero; OpenCV's thin prism (beyond the eighth)
+        is refused unless zero. Raises LiexError for a model that is not known.
         """
         values = [float(value) for value in coefficients]
         name = model.strip().lower().replace("-", "_").replace(" ", "_")
@@ -58,26 +64,31 @@ class Distortion:
             return None
         if name not in _MODELS:
             raise LiexError(
-                f"the lens distortion model '{model}' is not known; state it as plumb_bob, rational_polynomial or "
-                "equidistant, or set all its coefficients to 0 where it does not matter"
+                f"the lens distortion model '{model}' is not known; state it as plumb_bob, "
+                "rational_polynomial or equidistant, or set all its coefficients to 0 where it "
+                "does not matter"
             )
         n = _N_COEFFICIENTS[_MODELS[name]]
         if any(values[n:]):
             raise LiexError(
-                f"the lens distortion model '{model}' has up to {n} coefficients here, got {len(values)}: {values}; "
-                "calibrate the lens with fewer, or leave the others out"
+                f"the lens distortion model '{model}' has up to {n} coefficients here, got "
+                f"{len(values)}: {values}; calibrate the lens with fewer, or leave the others out"
             )
         return Distortion(_MODELS[name], tuple((values + [0.0] * n)[:n]))
 
     @cached_property
     def limit(self) -> float:
-        """The radius of (x, y) up to which farther out stays farther out; beyond it the model is no lens any more."""
+        """The radius of (x, y) up to which farther out stays farther out; beyond it the model is no
+        lens any more.
+        """
         r = np.linspace(0.0, _WIDEST, 4001)
         turned = np.flatnonzero(~(np.diff(self._radius(r)) > 0))
         return float(r[turned[0]]) if len(turned) else _WIDEST
 
     def _radius(self, r: Array) -> Array:
-        """Where a ray at radius r (...) of the ideal picture meets the real one, without the tangential part."""
+        """Where a ray at radius r (...) of the ideal picture meets the real one, without the
+        tangential part.
+        """
         k = self.coefficients
         if self.model == KANNALA_BRANDT:
             angle = np.arctan(r)
@@ -109,27 +120,30 @@ class Distortion:
         )
 
     def undistort(self, xy: ArrayLike) -> Array:
-        """Where rays met the picture (..., 2) -> the ideal rays (..., 2) that did; NaN where none within `limit` does.
+        """Where rays met the picture (..., 2) -> the ideal rays (..., 2) that did; NaN where none
+        within `limit` does.
 
-        The radius by bisection of the radial part, which increases, then Newton's steps for the small tangential one.
+        The radius by bisection of the radial part, which increases, then Newton's steps for the
+        small tangential one.
         """
         seen = np.asarray(xy, float)
         target = np.linalg.norm(seen, axis=-1)
-        low, high = np.zeros_like(target), np.full_like(target, self.limit)
+        low = np.zeros_like(target)
+        high = np.full_like(target, self.limit)
         for _ in range(50):
             middle = 0.5 * (low + high)
             below = self._radius(middle) < target
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
+            low = np.where(below, middle, low)
+            high = np.where(below, high, middle)
         ideal = seen * (np.where(target > 1e-12, low / np.maximum(target, 1e-12), 1.0))[..., None]
         ideal = np.where(self._radius(low)[..., None] < target[..., None] - 1e-3, np.nan, ideal)
-        right, down = np.array([1e-6, 0.0]), np.array([0.0, 1e-6])
+        right = np.array([1e-6, 0.0])
+        down = np.array([0.0, 1e-6])
         for _ in range(8):
             bent = self.distort(ideal)
             off = bent - seen
-            along_x, along_y = (
-                (self.distort(ideal + right) - bent) / 1e-6,
-                (self.distort(ideal + down) - bent) / 1e-6,
-            )
+            along_x = (self.distort(ideal + right) - bent) / 1e-6
+            along_y = (self.distort(ideal + down) - bent) / 1e-6
             determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
             move_x = (off[..., 0] * along_y[..., 1] - off[..., 1] * along_y[..., 0]) / determinant
             move_y = (along_x[..., 0] * off[..., 1] - along_x[..., 1] * off[..., 0]) / determinant
@@ -147,7 +161,9 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Lens:
-    """The intrinsics of a camera, stated without the size of its pictures; pixels, as in `Camera`."""
+    """The intrinsics of a camera, stated without the size of its pictures; pixels, as in
+    `Camera`.
+    """
 
     fx: float
     fy: float
@@ -160,8 +176,9 @@ class Lens:
             self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
         ):
             raise LiexError(
-                f"focal lengths are positive pixels, got fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}; "
-                "correct them in camera.toml or with --set camera.fx=... --set camera.fy=..."
+                f"focal lengths are positive pixels, got fx={self.fx}, fy={self.fy}, cx={self.cx}, "
+                f"cy={self.cy}; correct them in camera.toml or with --set camera.fx=... --set "
+                "camera.fy=..."
             )
 
 
@@ -169,9 +186,9 @@ class Lens:
 class Camera(Lens):
     """A depth camera. Pixels; (0, 0) is the centre of the top-left pixel.
 
-    Camera frame: x right, y down, z away from the lens, mm. `source` names where the intrinsics come from. Only a
-    recording as it was opened may have a distortion; what looks at pictures wants an ideal pinhole and gets it from
-    `recordings.rectify`.
+    Camera frame: x right, y down, z away from the lens, mm. `source` names where the intrinsics
+    come from. Only a recording as it was opened may have a distortion; what looks at pictures wants
+    an ideal pinhole and gets it from `recordings.rectify`.
     """
 
     width: int
@@ -182,8 +199,8 @@ class Camera(Lens):
         super().__post_init__()
         if not (self.width > 0 and self.height > 0):
             raise LiexError(
-                f"a picture has at least one pixel, got {self.width} x {self.height}; correct width and height in "
-                "camera.toml"
+                f"a picture has at least one pixel, got {self.width} x {self.height}; correct "
+                "width and height in camera.toml"
             )
 
     def project(self, p_camera: ArrayLike) -> Array:
@@ -201,7 +218,8 @@ class Camera(Lens):
         """Pixels (..., 2) and their depth (...) mm -> points (..., 3) mm in the camera frame."""
         u, v = np.moveaxis(np.asarray(uv, float), -1, 0)
         z = np.asarray(depth, float)
-        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        x = (u - self.cx) / self.fx
+        y = (v - self.cy) / self.fy
         if self.distortion is not None:
             x, y = np.moveaxis(self.distortion.undistort(np.stack([x, y], axis=-1)), -1, 0)
         return np.stack([x * z, y * z, z * np.ones_like(u)], axis=-1)
@@ -211,7 +229,8 @@ class Camera(Lens):
         if stride == 1:
             return self
         fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
-        width, height = -(-self.width // stride), -(-self.height // stride)
+        width = -(-self.width // stride)
+        height = -(-self.height // stride)
         return Camera(fx, fy, cx, cy, width, height, self.source, distortion=self.distortion)
 
     @property

@@ -1,18 +1,27 @@
-"""A flat water surface between the camera and what it looks at: where a point truly is that seems to be nearer.
+"""A flat water surface between the camera and what it looks at: where a point truly is that seems
+to be nearer.
 
-Light from under water bends at the surface, so a camera above it sees every point in a wrong direction and reports a
-wrong depth. The direction is put right by following the camera's ray down (Snell's law). Which depth the camera
-reports, the *apparent* depth, depends on how it measures:
+Light from under water bends at the surface, so a camera above it sees every point in a wrong
+direction and reports a wrong depth. The direction is put right by following the camera's ray down
+(Snell's law). Which depth the camera reports, the *apparent* depth, depends on how it measures:
 
-- `light_field` (plenoptic cameras, many small views in all directions) and `structured_light` (also stereo; two views
-  side by side along the picture's rows) triangulate: the apparent point is where the back-traced rays of neighbouring
-  views intersect. Seen straight down that is at depth / n below the surface. Obliquely the rays of a point meet in two
-  places (refraction at a plane is astigmatic): views displaced within the plane of incidence see it at
-  d cos^3(i) / (n cos^3(r)), views displaced across it at d tan(r) / tan(i), for a point d below the surface, i and r
-  the angles in air and in water. A camera reports the depth of which the disparity is the sum of both, each with the
+- `light_field` (plenoptic cameras, many small views in all directions) and `structured_light` (also
+  stereo; two views
+  side by side along the picture's rows) triangulate: the apparent point is where the back-traced
+  rays of neighbouring
+  views intersect. Seen straight down that is at depth / n below the surface. Obliquely the rays of
+  a point meet in two
+  places (refraction at a plane is astigmatic): views displaced within the plane of incidence see it
+  at
+  d cos^3(i) / (n cos^3(r)), views displaced across it at d tan(r) / tan(i), for a point d below the
+  surface, i and r
+  the angles in air and in water. A camera reports the depth of which the disparity is the sum of
+  both, each with the
   part of the displacement along it; for a light field the mean over all directions is taken.
-- `time_of_flight` cameras report half the way that the light would have gone in air: the way in water counts n times,
-  so that things seem farther, not nearer. (n is that of the group velocity, and near infrared is soon absorbed.)
+- `time_of_flight` cameras report half the way that the light would have gone in air: the way in
+  water counts n times,
+  so that things seem farther, not nearer. (n is that of the group velocity, and near infrared is
+  soon absorbed.)
 - `paraxial`: depth / n below the surface at every angle, the textbook's rule; for comparison.
 """
 
@@ -38,8 +47,9 @@ _STEEPEST = 0.05  # cosine between a ray and the perpendicular; flatter rays do 
 class Water:
     """A flat water surface that the camera looks down through.
 
-    height_mm: of the lens above the surface, along the perpendicular; tilt_x_rad, tilt_y_rad: how the surface recedes
-    from the camera towards the right and towards the lower edge of the picture; ranging: one of `RANGINGS`, see above.
+    height_mm: of the lens above the surface, along the perpendicular; tilt_x_rad, tilt_y_rad: how
+    the surface recedes from the camera towards the right and towards the lower edge of the picture;
+    ranging: one of `RANGINGS`, see above.
     """
 
     height_mm: float
@@ -55,28 +65,34 @@ class Water:
         )
         if not (possible and np.isfinite(numbers).all() and self.ranging in RANGINGS):
             raise LiexError(
-                f"a water surface lies a positive height_mm below the lens, with a refractive_index of at least 1, "
-                f"tilts below 1.2 rad and ranging {', '.join(RANGINGS)}, got {asdict(self)}; correct [water] in the "
-                "plan"
+                "a water surface lies a positive height_mm below the lens, with a "
+                "refractive_index of at least 1, tilts below 1.2 rad and ranging "
+                f"{', '.join(RANGINGS)}, got {asdict(self)}; correct [water] in the plan"
             )
 
     @property
     def normal(self) -> Array:
-        """Unit vector (3,) perpendicular to the surface, away from the camera, in the camera frame."""
+        """Unit vector (3,) perpendicular to the surface, away from the camera, in the
+        camera frame.
+        """
         down = np.array([-np.tan(self.tilt_x_rad), -np.tan(self.tilt_y_rad), 1.0])
         return down / np.linalg.norm(down)
 
     @property
     def lift_mm(self) -> Array:
-        """What carries points (3,) mm from the frame of the camera into that of `without`, whose axes are parallel."""
+        """What carries points (3,) mm from the frame of the camera into that of `without`, whose
+        axes are parallel.
+        """
         return (self.refractive_index - 1.0) * self.height_mm * self.normal
 
     def without(self, camera: Camera) -> Camera:
-        """The ideal camera that sees without the water what this one sees through it, from higher up (see `lift_mm`).
+        """The ideal camera that sees without the water what this one sees through it, from higher
+        up (see `lift_mm`).
 
-        Under water the rays that meet in the lens run, near the perpendicular, as if they met n times as high above
-        the surface. An ideal camera there, with focal lengths n times as long, sees everything from the same side and
-        in the same pixel; off the perpendicular a point moves a little towards the middle.
+        Under water the rays that meet in the lens run, near the perpendicular, as if they met n
+        times as high above the surface. An ideal camera there, with focal lengths n times as long,
+        sees everything from the same side and in the same pixel; off the perpendicular a point
+        moves a little towards the middle.
         """
         n = self.refractive_index
         way = self.law(np.zeros(2))[7:]
@@ -89,16 +105,20 @@ class Water:
         )
 
     def law(self, rays: ArrayLike) -> Array:
-        """What refraction does to rays (..., 2), the x and y of (x, y, 1): `N_LAW` numbers for each (..., N_LAW).
+        """What refraction does to rays (..., 2), the x and y of (x, y, 1): `N_LAW` numbers for each
+        (..., N_LAW).
 
-        (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z lies d below the surface, where
-        a d^2 + (b - c z) d = k z - 1, if k z > 1, else above the water and where it seems to be; and its place is
-        (sx, sy, sz) + d (bx, by, bz), mm in the camera frame: the ray's own place on the surface, and its way down.
+        (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z lies d below the
+        surface, where a d^2 + (b - c z) d = k z - 1, if k z > 1, else above the water and where it
+        seems to be; and its place is (sx, sy, sz) + d (bx, by, bz), mm in the camera frame: the
+        ray's own place on the surface, and its way down.
         """
         xy = np.asarray(rays, float)
         ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-        down, n, h = self.normal, self.refractive_index, self.height_mm
+        down = self.normal
+        n = self.refractive_index
+        h = self.height_mm
         cos_air = ray @ down
         reaches = cos_air > _STEEPEST
         cos_air = np.maximum(cos_air, _STEEPEST)
@@ -112,8 +132,12 @@ class Water:
         return law
 
     def _depth_law(self, ray: Array, cos_air: Array, cos_water: Array) -> Array:
-        """a, b, c and room for k of `law` (..., 4), from unit rays (..., 3) and the cosines (...) of i and r."""
-        n, h, zero = self.refractive_index, self.height_mm, np.zeros_like(cos_air)
+        """a, b, c and room for k of `law` (..., 4), from unit rays (..., 3) and the cosines (...)
+        of i and r.
+        """
+        n = self.refractive_index
+        h = self.height_mm
+        zero = np.zeros_like(cos_air)
         if self.ranging == "paraxial":
             return np.stack([zero, zero + 1.0 / (n * h), zero, zero], axis=-1)
         if self.ranging == "time_of_flight":
@@ -134,9 +158,11 @@ class Water:
         )
 
     def _weights(self, ray: Array, cos_air: Array) -> tuple[Array, Array]:
-        """The parts (...) of the views' displacement within and across the plane of incidence of unit rays (..., 3).
+        """The parts (...) of the views' displacement within and across the plane of incidence of
+        unit rays (..., 3).
 
-        They weigh the disparities: cos i / z' summed over both foci, z' being how far below the lens each lies.
+        They weigh the disparities: cos i / z' summed over both foci, z' being how far below the
+        lens each lies.
         """
         side = np.cross(self.normal, ray)
         straight_down = (
@@ -146,7 +172,8 @@ class Water:
         side = side / np.linalg.norm(side, axis=-1, keepdims=True)
         along = np.cross(side, ray)
         axes = (0, 1) if self.ranging == "light_field" else (0,)
-        within, across = np.zeros_like(cos_air), np.zeros_like(cos_air)
+        within = np.zeros_like(cos_air)
+        across = np.zeros_like(cos_air)
         for k in (
             axes
         ):  # the disparity of a displacement along one picture axis is measured along that axis
@@ -157,8 +184,11 @@ class Water:
         return within * share, across * share
 
     def true_points(self, rays: ArrayLike, depth: ArrayLike) -> Array:
-        """Where points (..., 3) mm truly are that are seen along rays (..., 2) at apparent depth (...) mm."""
-        xy, z = np.asarray(rays, float), np.asarray(depth, float)
+        """Where points (..., 3) mm truly are that are seen along rays (..., 2) at apparent depth
+        (...) mm.
+        """
+        xy = np.asarray(rays, float)
+        z = np.asarray(depth, float)
         law = self.law(xy)
         excess = law[..., 3] * z - 1.0
         wet = np.maximum(excess, 0.0)

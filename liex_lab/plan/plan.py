@@ -69,8 +69,8 @@ class Plan(Table):
             near = difflib.get_close_matches(str(plan), known, 1)
             hint = f"did you mean '{near[0]}'? " if near else ""
             raise PlanError(
-                f"there is no plan '{plan}': {hint}bundled are: {', '.join(known) or 'none'}, or give the path of a "
-                ".toml file"
+                f"there is no plan '{plan}': {hint}bundled are: {', '.join(known) or 'none'}, or "
+                "give the path of a .toml file"
             )
         return Plan.from_toml(_read(path), origin=str(path))
 
@@ -87,14 +87,18 @@ class Plan(Table):
 
     @staticmethod
     def from_table(table: dict[str, Any], origin: str = "the plan") -> Plan:
-        """The plan in a nested dict, as TOML or JSON gives it; missing settings have their defaults."""
+        """The plan in a nested dict, as TOML or JSON gives it; missing settings have their
+        defaults.
+        """
         try:
             return Plan.model_validate(table)
         except ValidationError as error:
             raise PlanError(f"{origin}: {_sentence(error)}") from None
 
     def with_settings(self, settings: Iterable[str]) -> Plan:
-        """This plan with settings like 'animal.spine_mm=65' put in; 'animal.spine_mm=' brings the default back."""
+        """This plan with settings like 'animal.spine_mm=65' put in; 'animal.spine_mm=' brings the
+        default back.
+        """
         chosen = list(settings)
         table = self.model_dump(exclude_none=True)
         for setting in chosen:

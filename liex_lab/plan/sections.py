@@ -12,7 +12,9 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class Table(BaseModel):
-    """A table of settings: no unknown key, no value of another type, never changed after it was made."""
+    """A table of settings: no unknown key, no value of another type, never changed after it was
+    made.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -29,7 +31,10 @@ class Animal(Table):
     )
     spine_mm: Positive | None = Field(
         None,
-        description="length of this animal's skeleton from its first joint to its last; not set: it is measured",
+        description=(
+            "length of this animal's skeleton from its first joint to its last; not set: it is "
+            "measured"
+        ),
     )
     spine_min_mm: Positive = Field(
         40.0, description="an animal is not shorter than this, where its size is measured"
@@ -48,7 +53,9 @@ class Animal(Table):
 
 
 class CameraOverride(Table):
-    """[camera]: intrinsics that overrule what the recording states or what is typical of the camera."""
+    """[camera]: intrinsics that overrule what the recording states or what is typical of the
+    camera.
+    """
 
     fx: Positive | None = Field(
         None, description="focal length along a row, pixels; not set: what the recording says"
@@ -62,12 +69,18 @@ class CameraOverride(Table):
     )
     distortion: list[float] | None = Field(
         None,
-        description="coefficients of the lens distortion, in OpenCV's order: [k1, k2, p1, p2, k3, k4, k5, k6], all but "
-        "the first may be left out; [] says that there is none; not set: what the recording says",
+        description=(
+            "coefficients of the lens distortion, in OpenCV's order: [k1, k2, p1, p2, k3, k4, "
+            "k5, k6], all but the first may be left out; [] says that there is none; not set: "
+            "what the recording says"
+        ),
     )
     distortion_model: str | None = Field(
         None,
-        description="plumb_bob (not set), rational_polynomial, or equidistant for a fisheye lens [k1, k2, k3, k4]",
+        description=(
+            "plumb_bob (not set), rational_polynomial, or equidistant for a fisheye lens [k1, "
+            "k2, k3, k4]"
+        ),
     )
     source: str | None = Field(
         None, description="where these numbers come from; it is written into session.json"
@@ -75,11 +88,15 @@ class CameraOverride(Table):
 
 
 class WaterSurface(Table):
-    """[water]: a flat water surface between the camera and the animal; not needed for a camera behind glass in air."""
+    """[water]: a flat water surface between the camera and the animal; not needed for a camera
+    behind glass in air.
+    """
 
     height_mm: Positive | None = Field(
         None,
-        description="height of the lens above the water; set, it makes millimetres under water true",
+        description=(
+            "height of the lens above the water; set, it makes millimetres under water true"
+        ),
     )
     refractive_index: float = Field(
         1.333,
@@ -91,18 +108,25 @@ class WaterSurface(Table):
         0.0,
         ge=-1,
         le=1,
-        description="angle by which the surface recedes from the camera towards the picture's right",
+        description=(
+            "angle by which the surface recedes from the camera towards the picture's right"
+        ),
     )
     tilt_y_rad: float = Field(
         0.0,
         ge=-1,
         le=1,
-        description="angle by which the surface recedes from the camera towards the picture's bottom",
+        description=(
+            "angle by which the surface recedes from the camera towards the picture's bottom"
+        ),
     )
     ranging: Literal["light_field", "structured_light", "time_of_flight", "paraxial"] = Field(
         "light_field",
-        description="how the camera measures: light_field (Raytrix), structured_light (PrimeSense, RealSense; stereo "
-        "along the picture's rows), time_of_flight (Kinect v2, Azure), or paraxial: depth / n at every angle",
+        description=(
+            "how the camera measures: light_field (Raytrix), structured_light (PrimeSense, "
+            "RealSense; stereo along the picture's rows), time_of_flight (Kinect v2, Azure), or "
+            "paraxial: depth / n at every angle"
+        ),
     )
 
 
@@ -131,7 +155,10 @@ class RecordingOptions(Table):
     )
     mirrored: bool = Field(
         False,
-        description="true: exchange left and right, for pictures that come mirrored, or to measure a left hand",
+        description=(
+            "true: exchange left and right, for pictures that come mirrored, or to measure a "
+            "left hand"
+        ),
     )
 
 
@@ -167,7 +194,10 @@ class Estimation(Table):
     )
     doubtful_above_mm: Positive | None = Field(
         None,
-        description="frames with a larger predicted error are flagged doubtful; not set: the model's own limit",
+        description=(
+            "frames with a larger predicted error are flagged doubtful; not set: the model's own "
+            "limit"
+        ),
     )
 
 
@@ -176,8 +206,10 @@ class Tracking(Table):
 
     bridge_s: NotNegative = Field(
         0.5,
-        description="a stretch without a measurement that is no longer than this is bridged and flagged so, and of a "
-        "longer one half as much at either end",
+        description=(
+            "a stretch without a measurement that is no longer than this is bridged and flagged "
+            "so, and of a longer one half as much at either end"
+        ),
     )
 
 
@@ -187,7 +219,10 @@ class SessionFacts(Table):
     name: str | None = Field(
         None,
         pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+@-]{0,199}$",
-        description="the session's id in every table, and the name of its folder; not set: the recording's name",
+        description=(
+            "the session's id in every table, and the name of its folder; not set: the "
+            "recording's name"
+        ),
     )
     individual: str = Field("animal", description="name of the animal within this session")
     subject_id: str | None = Field(None, description="the animal's identity across the whole study")
@@ -197,7 +232,10 @@ class SessionFacts(Table):
     batch: str | None = Field(None, description="batch of the experiment")
     session_start_time: str | None = Field(
         None,
-        description="ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording says",
+        description=(
+            "ISO 8601 with time zone, as 2026-08-21T10:00:00+02:00; not set: what the recording "
+            "says"
+        ),
     )
 
     @field_validator("session_start_time", mode="before")
@@ -215,11 +253,15 @@ class SessionFacts(Table):
 
 
 class Behaviour(Table):
-    """[behaviour]: where one behaviour ends and the next begins. Starting values: check them on your own animals."""
+    """[behaviour]: where one behaviour ends and the next begins. Starting values: check them on
+    your own animals.
+    """
 
     speed_half_window_s: Positive = Field(
         0.034,
-        description="speed at time t is measured from t - this to t + this (one frame each side at 30 fps)",
+        description=(
+            "speed at time t is measured from t - this to t + this (one frame each side at 30 fps)"
+        ),
     )
     pause_below_mm_s: Positive = Field(
         50.0, description="slower than this is a pause, faster is walking"
@@ -254,7 +296,8 @@ class Behaviour(Table):
     def _in_order(self) -> Behaviour:
         if not self.pause_below_mm_s < self.run_above_mm_s:
             raise ValueError(
-                f"pause_below_mm_s={self.pause_below_mm_s} should be below run_above_mm_s={self.run_above_mm_s}"
+                f"pause_below_mm_s={self.pause_below_mm_s} should be below "
+                f"run_above_mm_s={self.run_above_mm_s}"
             )
         return self
 
@@ -275,6 +318,9 @@ class Actions(Table):
 
     model: str | None = Field(
         None,
-        description="an action model by the animal's name, or the path of a .skops made by `liex train actions`; not "
-        "set: the animal's bundled one, where there is one; 'rules': the thresholds of [behaviour]",
+        description=(
+            "an action model by the animal's name, or the path of a .skops made by `liex train "
+            "actions`; not set: the animal's bundled one, where there is one; 'rules': the "
+            "thresholds of [behaviour]"
+        ),
     )

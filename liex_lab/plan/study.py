@@ -1,6 +1,8 @@
-"""A study: which animals, in which groups, recorded in which sessions, measured by which plan; one small TOML file.
+"""A study: which animals, in which groups, recorded in which sessions, measured by which plan; one
+small TOML file.
 
-The file names recordings and never leaves the folder it lies in: its recordings, plans and results are inside.
+The file names recordings and never leaves the folder it lies in: its recordings, plans and results
+are inside.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ PathText = Annotated[str, Field(min_length=1, max_length=1000)]
 Settings = dict[str, Any]
 
 STUDY_FILE = "study.toml"
-RAW, DERIVED = "rawdata", "derivatives/liex-lab"
+RAW = "rawdata"
+DERIVED = "derivatives/liex-lab"
 RESULTS = (
     "behav"  # the session folder of one recording, as NeuroBlueprint calls what shows behaviour
 )
@@ -42,7 +45,10 @@ _PATHS = (
 _SAY = {
     "id": "should be letters and digits only, as in m01",
     "animal": "should be the id of an animal: letters and digits only, as in m01",
-    "session": "should be letters and digits, with key-value pairs after them, as in 01 or 01_date-20260821",
+    "session": (
+        "should be letters and digits, with key-value pairs after them, as in 01 or "
+        "01_date-20260821"
+    ),
 }
 
 
@@ -94,12 +100,14 @@ class StudyTable(_Table):
         for one in self.sessions:
             if one.animal not in {animal.id for animal in self.animals}:
                 raise ValueError(
-                    f"the session {one.session} is of {one.animal}, an animal that is not in [[animals]]"
+                    f"the session {one.session} is of {one.animal}, an animal that is not in "
+                    "[[animals]]"
                 )
             key = one.animal.lower(), one.session.lower()
             if key in taken:
                 raise ValueError(
-                    f"the animal {one.animal} has two sessions {one.session}; give each its own name"
+                    f"the animal {one.animal} has two sessions {one.session}; give each its own "
+                    "name"
                 )
             taken.add(key)
         return self
@@ -109,8 +117,8 @@ class StudyTable(_Table):
 class PlannedSession:
     """One recording of the study with everything it is measured by.
 
-    id: unique in the study, as in sub-m01_ses-01; recording: a path, or the address of a virtual one; folder: where
-    its results lie; exclude: why it is left out, empty where it is not.
+    id: unique in the study, as in sub-m01_ses-01; recording: a path, or the address of a virtual
+    one; folder: where its results lie; exclude: why it is left out, empty where it is not.
     """
 
     id: str
@@ -135,7 +143,9 @@ class Study:
 
     @staticmethod
     def load(path: str | Path) -> Study:
-        """The study in a TOML file. Raises StudyError with one sentence about what is wrong in it."""
+        """The study in a TOML file. Raises StudyError with one sentence about what is wrong
+        in it.
+        """
         file = Path(path)
         if file.is_dir():
             file = file / STUDY_FILE
@@ -176,7 +186,8 @@ class Study:
         raw = self.folder / RAW
         if found == raw or raw in found.parents:
             raise StudyError(
-                f"{self.path}: results = '{self.table.results}' lies in {RAW}, where nothing is written"
+                f"{self.path}: results = '{self.table.results}' lies in {RAW}, where nothing is "
+                "written"
             )
         return found
 
@@ -202,8 +213,9 @@ class Study:
         )
         if bad:
             raise StudyError(
-                f"{self.path}: {what} is '{text}', and a study names only what is in its own folder {self.folder}; "
-                "move or link it there and write the path from there, without .."
+                f"{self.path}: {what} is '{text}', and a study names only what is in its own "
+                f"folder {self.folder}; move or link it there and write the path from there, "
+                "without .."
             )
         return self.folder.joinpath(*parts)
 
@@ -218,7 +230,9 @@ class Study:
         )
 
     def _plan(self, animal: StudyAnimal, one: StudySession, id: str) -> Plan:
-        """The plan with the settings of study, animal and session put in, the later before the earlier."""
+        """The plan with the settings of study, animal and session put in, the later before the
+        earlier.
+        """
         named = one.plan or self.table.plan
         plan = Plan.load(named if named in known_plans() else self.inside(named, "plan"))
         facts: Settings = {"name": id, "individual": animal.id, "subject_id": animal.id}

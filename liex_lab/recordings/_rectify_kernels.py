@@ -1,7 +1,9 @@
-"""Numba kernels that carry a depth picture to an ideal pinhole camera: lens distortion and water undone.
+"""Numba kernels that carry a depth picture to an ideal pinhole camera: lens distortion and water
+undone.
 
-Serial, and without the interpreter's lock: what is written is spread over the picture, and two threads that spread
-together cost more than they save (`look_up` of 1024 x 1024 pixels takes about 2 ms, `lift` and `close` 6 ms).
+Serial, and without the interpreter's lock: what is written is spread over the picture, and two
+threads that spread together cost more than they save (`look_up` of 1024 x 1024 pixels takes about 2
+ms, `lift` and `close` 6 ms).
 """
 
 from __future__ import annotations
@@ -10,14 +12,19 @@ import numpy as np
 from numba import njit
 
 UNREAD = np.float32(1e30)  # stands where a pixel without reading belongs, and yields to any reading
-_ONE, _HALF, _FOUR = np.float32(1.0), np.float32(0.5), np.float32(4.0)
-# a picture's depths are finite; without infinities and signed zeros the compiler may treat eight pixels at once
+_ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
+_FOUR = np.float32(4.0)
+# a picture's depths are finite; without infinities and signed zeros the compiler may treat eight
+# pixels at once
 _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 
 @njit(cache=True, nogil=True)
 def look_up(depth, source, out):
-    """Into out (H, W), for every ideal pixel, the depth of the picture's pixel `source` (H, W); -1: there is none."""
+    """Into out (H, W), for every ideal pixel, the depth of the picture's pixel `source` (H, W); -1:
+    there is none.
+    """
     stored = depth.ravel()
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
@@ -27,7 +34,9 @@ def look_up(depth, source, out):
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def lift_row(depth, law, u, v, deep):
-    """Where the pixels of one row (W,) go, and their new depth. law (13, W): see `rectify.pixel_laws`."""
+    """Where the pixels of one row (W,) go, and their new depth. law (13, W): see
+    `rectify.pixel_laws`.
+    """
     for column in range(depth.size):
         along = law[3, column] * depth[column]  # 1 where the ray meets the water
         wet = max(along - _ONE, np.float32(0.0))
@@ -46,41 +55,49 @@ def lift_row(depth, law, u, v, deep):
 
 @njit(cache=True, nogil=True)
 def lift(depth, laws, out):
-    """Every pixel of `depth` (H, W) mm as a point, moved to where it truly is, into out (H, W); the nearest stays.
+    """Every pixel of `depth` (H, W) mm as a point, moved to where it truly is, into out (H, W); the
+    nearest stays.
 
-    out is infinite where nothing went. laws (H, 13, W). A pixel without reading goes the way of the reading before it
-    in its row, and leaves UNREAD.
+    out is infinite where nothing went. laws (H, 13, W). A pixel without reading goes the way of the
+    reading before it in its row, and leaves UNREAD.
     """
     n_rows, n_columns = depth.shape
-    u, v = np.empty(n_columns, np.int32), np.empty(n_columns, np.int32)
+    u = np.empty(n_columns, np.int32)
+    v = np.empty(n_columns, np.int32)
     deep = np.empty(n_columns, np.float32)
     out[:] = np.inf
     for row in range(n_rows):
         lift_row(depth[row], laws[row], u, v, deep)
-        right, down = 0, 0
+        right = 0
+        down = 0
         for column in range(n_columns):
             z = deep[column]
             if depth[row, column] > 0:
-                right, down = u[column] - column, v[column] - row
+                right = u[column] - column
+                down = v[column] - row
             else:
                 z = UNREAD
-            i, j = row + down, column + right
+            i = row + down
+            j = column + right
             if 0 <= i < n_rows and 0 <= j < n_columns and z < out[i, j]:
                 out[i, j] = z
 
 
 @njit(cache=True, nogil=True)
 def close(lifted, out):
-    """Fill what lies between two readings, side by side or one above the other, with the farther one: into out (H, W).
+    """Fill what lies between two readings, side by side or one above the other, with the farther
+    one: into out (H, W).
 
-    Only where nothing went: a pixel that was unread stays so. The farther, so that no outline grows.
+    Only where nothing went: a pixel that was unread stays so. The farther, so that no outline
+    grows.
     """
     n_rows, n_columns = lifted.shape
     for row in range(n_rows):
         for column in range(n_columns):
             z = lifted[row, column]
             if z >= UNREAD:
-                nothing_went, z = z > UNREAD, np.float32(0.0)
+                nothing_went = z > UNREAD
+                z = np.float32(0.0)
                 if nothing_went and 0 < column < n_columns - 1:
                     z = _between(lifted[row, column - 1], lifted[row, column + 1])
                 if nothing_went and z == 0 and 0 < row < n_rows - 1:

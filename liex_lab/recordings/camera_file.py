@@ -18,8 +18,9 @@ from liex_lab.recordings.timestamps import start_of_day
 
 CAMERA_FILE = "camera.toml"
 WHAT_TO_WRITE = (
-    "write a file camera.toml with the lines [camera], fx = 575.8, fy = 575.8, cx = 319.5, cy = 239.5 (your camera's "
-    "numbers, in pixels), unit_mm = 1.0 (millimetres per stored step) and fps = 30.0 where there is no timestamps.csv"
+    "write a file camera.toml with the lines [camera], fx = 575.8, fy = 575.8, cx = 319.5, cy = "
+    "239.5 (your camera's numbers, in pixels), unit_mm = 1.0 (millimetres per stored step) and "
+    "fps = 30.0 where there is no timestamps.csv"
 )
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
@@ -36,12 +37,13 @@ _KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
 class CameraFile:
     """What a camera.toml states, under [camera] or at its top; everything may be left out.
 
-    intrinsics: any of fx, fy, cx, cy; distortion: of the lens, from distortion (a list of coefficients in OpenCV's
-    order) and distortion_model; width, height: pixels; unit_mm: millimetres per stored step; unread: stored values that
-    mean "no reading"; encoding: how stored values mean depth, a key of `encodings`; byte_order: of PGM pictures, "big"
-    or "little"; fps: used where there are no stamps; timestamps: name of the stamp file, time_column and time_unit: its
-    column of times, see `read_csv_times`; pattern: which pictures of the folder to read, as in "*_depth.png"; metadata:
-    subject_id, session_start_time; source: who says all this.
+    intrinsics: any of fx, fy, cx, cy; distortion: of the lens, from distortion (a list of
+    coefficients in OpenCV's order) and distortion_model; width, height: pixels; unit_mm:
+    millimetres per stored step; unread: stored values that mean "no reading"; encoding: how stored
+    values mean depth, a key of `encodings`; byte_order: of PGM pictures, "big" or "little"; fps:
+    used where there are no stamps; timestamps: name of the stamp file, time_column and time_unit:
+    its column of times, see `read_csv_times`; pattern: which pictures of the folder to read, as in
+    "*_depth.png"; metadata: subject_id, session_start_time; source: who says all this.
     """
 
     path: Path
@@ -108,13 +110,15 @@ class CameraFile:
 
 
 def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
-    """The camera itself, if it belongs to pictures of this size; one stated without a size belongs to any."""
+    """The camera itself, if it belongs to pictures of this size; one stated without a size belongs
+    to any.
+    """
     bare = (lens.fx, lens.fy, lens.cx, lens.cy, width, height)
     camera = lens if isinstance(lens, Camera) else Camera(*bare, distortion=lens.distortion)
     if (camera.width, camera.height) != (width, height):
         raise RecordingError(
-            f"{where} is for pictures of {camera.width} x {camera.height} pixels, but these have {width} x {height}; "
-            "state the intrinsics of this picture size"
+            f"{where} is for pictures of {camera.width} x {camera.height} pixels, but these have "
+            f"{width} x {height}; state the intrinsics of this picture size"
         )
     return camera
 
@@ -140,7 +144,8 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
     for key in ("fx", "fy"):
         if key in numbers and not numbers[key] > 0:
             raise RecordingError(
-                f"{path} states {key} = {numbers[key]:g}; a focal length is a positive number of pixels"
+                f"{path} states {key} = {numbers[key]:g}; a focal length is a positive number of "
+                "pixels"
             )
     if numbers.get("unit_mm", 1.0) == 0.0:
         raise RecordingError(
@@ -169,7 +174,8 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
         start = start_of_day(table["session_start_time"])
         if start is None:
             problems += (
-                f"session_start_time in {path} has no time zone, so it was not used; write 2024-05-01T10:00:00Z",
+                f"session_start_time in {path} has no time zone, so it was not used; write "
+                "2024-05-01T10:00:00Z",
             )
         else:
             metadata["session_start_time"] = start
@@ -197,7 +203,8 @@ def _distortion(path: Path, table: dict[str, Any]) -> Distortion | None:
     values = table.get("distortion", [])
     if not isinstance(values, list):
         raise RecordingError(
-            f"{path} states distortion = {values!r}; it is a list of coefficients, as in [-0.1, 0.02, 0, 0]"
+            f"{path} states distortion = {values!r}; it is a list of coefficients, as in [-0.1, "
+            "0.02, 0, 0]"
         )
     coefficients = [_number(path, "distortion", value) for value in values]
     try:
@@ -217,4 +224,7 @@ def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:
 
 def _unknown_key(path: Path, key: str) -> str:
     near = difflib.get_close_matches(key, _KEYS, n=1)
-    return f"{path.name} has a key {key!r} that means nothing here{f'; did you mean {near[0]!r}?' if near else ''}"
+    return (
+        f"{path.name} has a key {key!r} that means nothing "
+        f"here{f'; did you mean {near[0]!r}?' if near else ''}"
+    )

@@ -1,5 +1,5 @@
-"""How stored numbers mean depth, the ways that cameras and data sets of the field have come up with, and millimetres as
-the whole steps that 16-bit pictures store, exactly or not at all.
+"""How stored numbers mean depth, the ways that cameras and data sets of the field have come up
+with, and millimetres as the whole steps that 16-bit pictures store, exactly or not at all.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ def _rotated(stored: Stored) -> Stored:
 
 
 def _disparity(stored: Stored) -> Stored:
-    """Kinect v1 as NYU Depth v2 keeps it: 11 bits of disparity, metres = 351.3 / (1092.5 - value)."""
+    """Kinect v1 as NYU Depth v2 keeps it: 11 bits of disparity, metres = 351.3 / (1092.5 -
+    value).
+    """
     ahead = 1092.5 - stored.astype(np.float32)
     read = (ahead > 0) & (stored != _NO_DISPARITY)
     return np.where(read, 351_300.0 / np.where(read, ahead, 1.0), 0.0).astype(np.float32)
@@ -58,8 +60,8 @@ def decode(
 ) -> Depth:
     """Stored values (H, W) -> float32 mm (H, W), 0 = unread.
 
-    unit_mm: millimetres per step of what `encoding` gives; unread: *stored* values that mean "no reading" (of what the
-    encoding gives for colour pictures), besides those that it has by itself.
+    unit_mm: millimetres per step of what `encoding` gives; unread: *stored* values that mean "no
+    reading" (of what the encoding gives for colour pictures), besides those that it has by itself.
     """
     values = _MILLIMETRES[encoding][1](stored)
     if values is stored or stored.ndim == 3:
@@ -71,7 +73,9 @@ def decode(
 
 
 def whole_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
-    """The steps (H, W) that are read back as exactly this depth; None where there are none, or more than 16 bits."""
+    """The steps (H, W) that are read back as exactly this depth; None where there are none, or more
+    than 16 bits.
+    """
     if depth.size and float(depth.max()) > LARGEST_STEP * step_mm:
         return None
     steps = (depth if step_mm == 1.0 else np.rint(depth / np.float32(step_mm))).astype(np.uint16)
@@ -91,10 +95,12 @@ def nearest_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
 
 
 def metres(depth: Depth) -> tuple[NDArray[np.float32], int]:
-    """Depth (H, W) in m that times 1000 is the depth again, and for how many pixels there is no such number.
+    """Depth (H, W) in m that times 1000 is the depth again, and for how many pixels there is no
+    such number.
 
-    Between 1000 and 1024 mm, and at their halves and doubles, neighbouring float32s of metres are farther apart than
-    those of millimetres; there the nearest is taken, half a millionth of a millimetre per metre off.
+    Between 1000 and 1024 mm, and at their halves and doubles, neighbouring float32s of metres are
+    farther apart than those of millimetres; there the nearest is taken, half a millionth of a
+    millimetre per metre off.
     """
     scaled = depth / np.float32(1000.0)
     off = scaled * np.float32(1000.0) != depth

@@ -14,7 +14,8 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DepthFrame:
-    """A depth picture: index, its row in the recording it was read from; time_ns on the recording's own clock.
+    """A depth picture: index, its row in the recording it was read from; time_ns on the recording's
+    own clock.
 
     depth (H, W) float32 mm along the optical axis; 0 = unread; finite, never negative.
     """
@@ -27,9 +28,10 @@ class DepthFrame:
 def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float] = (0.0,)) -> Depth:
     """Stored values (H, W) -> float32 mm (H, W), a fresh array; 0 = unread.
 
-    unit_mm: millimetres per stored step, negative where the file's depth axis points towards the camera; unread: stored
-    values that mean "no reading". They are marked before scaling, while they can still be compared exactly. 0, NaN and
-    infinite values are always unread, and so is what lies behind the lens.
+    unit_mm: millimetres per stored step, negative where the file's depth axis points towards the
+    camera; unread: stored values that mean "no reading". They are marked before scaling, while they
+    can still be compared exactly. 0, NaN and infinite values are always unread, and so is what lies
+    behind the lens.
     """
     depth = stored.astype(np.float32)
     for value in unread:

@@ -13,9 +13,9 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
 _READS = (
-    "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix camera with a "
-    "raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or .tar.gz), a PrimeSense recording "
-    "(.oni), an MCAP file or a ROS bag (.bag, .db3)"
+    "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix "
+    "camera with a raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or "
+    ".tar.gz), a PrimeSense recording (.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
 _MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
@@ -35,19 +35,26 @@ _FILES = (
     | {".dat": "moseq.reader.open_moseq"}
     | dict.fromkeys(_PICTURES, "images.folder.open_images")
 )
-_RENDERED = "synthetic:"  # an address of a virtual recording; rendering stands above reading, so it is named only here
+# an address of a virtual recording; rendering stands above reading, so it is named only here
+_RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
 _WITH_TOPICS = ("messages.mcap.open_mcap", "messages.rosbag.open_bag")
 _RAYTRIX = (
-    "is in Raytrix's own format, which only the maker's licensed software reads; compute metric depth in RxLive, save "
-    "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, write a raytrix.toml "
+    "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
+    "depth in RxLive, save "
+    "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, "
+    "write a raytrix.toml "
     'with the line profile = "raytrix-f32-negative-mm" into it, and give that folder'
 )
 _CLOUD = (
-    "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says what its numbers "
+    "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says "
+    "what its numbers "
     'mean, with a line such as profile = "raytrix-points-mm", and give the folder'
 )
-_EIGHT_BIT = "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give the depth itself"
+_EIGHT_BIT = (
+    "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give "
+    "the depth itself"
+)
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
@@ -69,7 +76,9 @@ class _How:
     progress: Progress
 
     def open(self, where: str, path: Path) -> Recording:
-        """By the function `where` of `formats`, as in "oni.reader.open_oni"; it brings its libraries when asked for."""
+        """By the function `where` of `formats`, as in "oni.reader.open_oni"; it brings its
+        libraries when asked for.
+        """
         module, name = where.rsplit(".", 1)
         opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
         topic = (self.topic,) if where in _WITH_TOPICS else ()
@@ -93,11 +102,11 @@ def open_recording(
 ) -> Recording:
     """Open a depth recording of any format; frames are read when asked for.
 
-    path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see `open_synthetic`); camera:
-    comes before whatever the files state, a `Lens` for pictures of any size; fps: used only where the files hold no
-    time stamps; topic: of an MCAP file or a ROS bag with several depth topics; strict: refuse a recording that is cut
-    short, instead of only saying so in `problems` and `truncated`; progress: told while an archive is unpacked or an
-    index made.
+    path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see
+    `open_synthetic`); camera: comes before whatever the files state, a `Lens` for pictures of any
+    size; fps: used only where the files hold no time stamps; topic: of an MCAP file or a ROS bag
+    with several depth topics; strict: refuse a recording that is cut short, instead of only saying
+    so in `problems` and `truncated`; progress: told while an archive is unpacked or an index made.
     """
     path = Path(path)
     try:
@@ -114,8 +123,8 @@ def open_recording(
         recording.close()
         n_whole = f"{recording.n_whole} whole frame{'' if recording.n_whole == 1 else 's'}"
         raise RecordingError(
-            f"{path} is cut short or damaged, {n_whole} can be read from it; copy it again, or go on with what is "
-            "whole by adding --set recording.accept_truncated=true"
+            f"{path} is cut short or damaged, {n_whole} can be read from it; copy it again, or go "
+            "on with what is whole by adding --set recording.accept_truncated=true"
         )
     return recording
 
@@ -166,7 +175,8 @@ def _open_folder(folder: Path, how: _How) -> Recording:
         return how.open("images.nyu.open_nyu", folder)
     if "session.json" in inside:
         raise RecordingError(
-            f"{folder} is a session, the result of a run; look at it with `liex show`, or give a recording"
+            f"{folder} is a session, the result of a run; look at it with `liex show`, or give a "
+            "recording"
         )
     if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
         return how.open("images.folder.open_images", folder)

@@ -1,4 +1,6 @@
-"""A recording: what a depth camera saw, frame by frame, read when asked for and never wholly in memory."""
+"""A recording: what a depth camera saw, frame by frame, read when asked for and never wholly in
+memory.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,15 @@ _BLOCK = 1 << 20
 class Recording:
     """Depth frames in order of time, from one camera.
 
-    A format makes one by handing over `read`, which turns a stored frame's number into depth (H, W) float32 mm. Frames
-    are read one at a time, so memory does not grow with length; iterating twice reads twice and yields the same.
+    A format makes one by handing over `read`, which turns a stored frame's number into depth (H, W)
+    float32 mm. Frames are read one at a time, so memory does not grow with length; iterating twice
+    reads twice and yields the same.
 
-    name; format ("images", "moseq", "mcap", ...); camera; times_ns (n,) int64 on the recording's own clock, strictly
-    increasing; problems: sentences about what is odd in the file, also those found while reading; truncated: the file
-    is cut or damaged, and n_whole of its frames are whole; metadata: subject_id and session_start_time (ISO 8601 with
-    zone) where the file tells them; optics: what was undone on reading, empty where nothing was (see `rectify`).
+    name; format ("images", "moseq", "mcap", ...); camera; times_ns (n,) int64 on the recording's
+    own clock, strictly increasing; problems: sentences about what is odd in the file, also those
+    found while reading; truncated: the file is cut or damaged, and n_whole of its frames are whole;
+    metadata: subject_id and session_start_time (ISO 8601 with zone) where the file tells them;
+    optics: what was undone on reading, empty where nothing was (see `rectify`).
     """
 
     def __init__(
@@ -55,18 +59,22 @@ class Recording:
         faults: NDArray[np.uint8] | None = None,
         grow: Callable[[], Recording | None] | None = None,
     ) -> None:
-        """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from its parent.
+        """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from
+        its parent.
 
         faults (n,): which stamps were moved and why, see `Settled`; grow: see `grown`.
         """
-        self.name, self.format, self.camera = name, format, camera
+        self.name = name
+        self.format = format
+        self.camera = camera
         self.times_ns = np.ascontiguousarray(times_ns, np.int64)
         self.problems: list[str] = [] if problems is None else problems
         self.truncated = truncated
         self.n_whole = len(self.times_ns) if n_whole is None else n_whole
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
         self.optics: dict[str, Any] = {}
-        self._read, self._sources = read, tuple(sources)
+        self._read = read
+        self._sources = tuple(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
         self._faults = np.zeros(len(self.times_ns), np.uint8) if faults is None else faults
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
@@ -96,7 +104,9 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second while none is missing: one over the median step; NaN for a single frame."""
+        """Frames per second while none is missing: one over the median step; NaN for a single
+        frame.
+        """
         return 1e9 / self._step_ns if self._step_ns else float("nan")
 
     @property
@@ -115,7 +125,9 @@ class Recording:
 
     @property
     def faults(self) -> list[Gap]:
-        """The frames whose stamps had to be moved: repeated, out of order, or wild; clock jumps are among the gaps."""
+        """The frames whose stamps had to be moved: repeated, out of order, or wild; clock jumps are
+        among the gaps.
+        """
         joined = {gap.start_frame for gap in self.gaps if self._jumped(gap)}
         found = find_faults(self.times_ns, self._step_ns, self._faults)
         return [fault for fault in found if fault.start_frame not in joined]
@@ -124,7 +136,10 @@ class Recording:
         return len(self.times_ns)
 
     def __repr__(self) -> str:
-        return f"<Recording {self.name}: {len(self)} frames of {self.width} x {self.height}, {self.format}>"
+        return (
+            f"<Recording {self.name}: {len(self)} frames of {self.width} x {self.height}, "
+            f"{self.format}>"
+        )
 
     def frame(self, index: int) -> DepthFrame:
         """Frame `index`, counted from 0, or from the end when negative."""
@@ -139,17 +154,22 @@ class Recording:
         return (self.frame(i) for i in range(len(self)))
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames from `first` on in lists of `n_frames`, the last may be shorter; one list is in memory."""
+        """The frames from `first` on in lists of `n_frames`, the last may be shorter; one list is
+        in memory.
+        """
         if n_frames < 1:
             raise ValueError(f"a chunk has at least one frame, got {n_frames}")
         for start in range(first, len(self), n_frames):
             yield [self.frame(i) for i in range(start, min(start + n_frames, len(self)))]
 
     def __getitem__(self, part: slice) -> Recording:
-        """Some of the frames as a recording of its own, with rows counted anew; it reads from the same files."""
+        """Some of the frames as a recording of its own, with rows counted anew; it reads from the
+        same files.
+        """
         if not isinstance(part, slice):
             raise TypeError(
-                "a recording is cut with a slice, as in recording[10:20]; one frame is recording.frame(10)"
+                "a recording is cut with a slice, as in recording[10:20]; one frame is "
+                "recording.frame(10)"
             )
         start, stop, step = part.indices(len(self))
         if step < 1 or start >= stop:
@@ -171,13 +191,15 @@ class Recording:
             stored=self._stored[rows],
             faults=self._faults[rows],
         )
-        cut._whole, cut.optics = self._whole or self, self.optics
+        cut._whole = self._whole or self
+        cut.optics = self.optics
         return cut
 
     def seen_by(
         self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]
     ) -> Recording:
-        """The same frames as another camera would have seen them: `change` turns each depth picture when it is read.
+        """The same frames as another camera would have seen them: `change` turns each depth picture
+        when it is read.
 
         The input, and so the digest, stays the same; closing one closes both.
         """
@@ -199,13 +221,16 @@ class Recording:
             faults=self._faults,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
         )
-        other._whole, other.optics = self._whole or self, optics
+        other._whole = self._whole or self
+        other.optics = optics
         return other
 
     def grown(self) -> Recording | None:
-        """The same recording with what was written to its files since it was opened, read on from where it ended.
+        """The same recording with what was written to its files since it was opened, read on from
+        where it ended.
 
-        It takes this one's place, which is used no more. None where the format has to be opened anew for that.
+        It takes this one's place, which is used no more. None where the format has to be opened
+        anew for that.
         """
         more = None if self._grow is None else self._grow()
         if more is not None:
@@ -215,9 +240,11 @@ class Recording:
         return more
 
     def digest(self, progress: Progress = silent) -> str:
-        """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in order of name.
+        """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in
+        order of name.
 
-        A recording that is in no file is its times and depths. A slice has the digest of the whole input.
+        A recording that is in no file is its times and depths. A slice has the digest of the whole
+        input.
         """
         if self._whole is not None:
             return self._whole.digest(progress)
@@ -229,13 +256,17 @@ class Recording:
 
     @property
     def stamp(self) -> list[list[str | int]]:
-        """Name, size and time of each of the input's files, to see cheaply whether it changed; empty without files."""
+        """Name, size and time of each of the input's files, to see cheaply whether it changed;
+        empty without files.
+        """
         whole = self._whole or self
         found = [(path.name, path.stat()) for path in whole._sources]
         return sorted([name, stat.st_size, stat.st_mtime_ns] for name, stat in found)
 
     def take_digest(self, digest: str) -> None:
-        """Believe that this is the input's hash, for it was read before and its files have not changed since."""
+        """Believe that this is the input's hash, for it was read before and its files have not
+        changed since.
+        """
         (self._whole or self)._digest = digest
 
     def _content_digest(self) -> str:
@@ -245,7 +276,9 @@ class Recording:
         return whole.hexdigest()
 
     def close(self) -> None:
-        """Let go of files, and remove what was unpacked; a slice leaves that to the recording it was cut from."""
+        """Let go of files, and remove what was unpacked; a slice leaves that to the recording it
+        was cut from.
+        """
         self._closed = self._whole is None
         if self._close is not None:
             self._close()
@@ -263,10 +296,14 @@ class Recording:
 
 
 def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
-    """sha256, hex: of one file its bytes; of several, for each in order of name its name, its size and its bytes."""
+    """sha256, hex: of one file its bytes; of several, for each in order of name its name, its size
+    and its bytes.
+    """
     ordered = sorted(files, key=lambda path: path.name)
     sizes = [path.stat().st_size for path in ordered]
-    whole, done, total = hashlib.sha256(), 0, sum(sizes) // _BLOCK + 1
+    whole = hashlib.sha256()
+    done = 0
+    total = sum(sizes) // _BLOCK + 1
     for path, size in zip(ordered, sizes, strict=True):
         if len(ordered) > 1:
             whole.update(f"{path.name}\0{size}\0".encode())

@@ -1,8 +1,10 @@
-"""True millimetres on reading: a recording through a bent lens or a water surface, as an ideal pinhole would see it.
+"""True millimetres on reading: a recording through a bent lens or a water surface, as an ideal
+pinhole would see it.
 
-Everything behind this door works with an ideal pinhole camera in air. A recording without distortion and water is
-handed on untouched. A bent lens becomes a straight one with the same focal lengths, its picture so much larger that it
-holds what the bent one held. For the water see `Water.without`: the ideal camera stands higher than the real one.
+Everything behind this door works with an ideal pinhole camera in air. A recording without
+distortion and water is handed on untouched. A bent lens becomes a straight one with the same focal
+lengths, its picture so much larger that it holds what the bent one held. For the water see
+`Water.without`: the ideal camera stands higher than the real one.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ _MAX_GROWTH = 0.15  # of a picture's width or height, at each side
 
 
 def rectified(recording: Recording, water: Water | None = None) -> Recording:
-    """The recording with its camera's distortion and the water's refraction undone whenever a frame is read.
+    """The recording with its camera's distortion and the water's refraction undone whenever a frame
+    is read.
 
     The recording itself where there is neither. `optics` of the result says what was undone.
     """
@@ -40,8 +43,8 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
     lost = share_lost(camera)
     if lost > _MUCH_LOST:
         seen.problems.append(
-            f"{lost:.0%} of the pixels leave the picture when the lens distortion is undone; keep the animal away from "
-            "the picture's edge, or check the distortion's coefficients"
+            f"{lost:.0%} of the pixels leave the picture when the lens distortion is undone; keep "
+            "the animal away from the picture's edge, or check the distortion's coefficients"
         )
     return seen
 
@@ -64,9 +67,11 @@ def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The same camera with a straight lens: its picture grows at each side by as much as the bent one's edge went in.
+    """The same camera with a straight lens: its picture grows at each side by as much as the bent
+    one's edge went in.
 
-    Up to `_MAX_GROWTH`, for the far corners of a fisheye lens would be at infinity. Sizes stay multiples of four.
+    Up to `_MAX_GROWTH`, for the far corners of a fisheye lens would be at infinity. Sizes stay
+    multiples of four.
     """
     straight = replace(camera, distortion=None)
     if camera.distortion is None:
@@ -109,7 +114,8 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
             kernels.look_up(depth, source, straight)
             depth = straight
         if laws is not None:
-            lifted, closed = np.empty_like(depth), np.empty_like(depth)
+            lifted = np.empty_like(depth)
+            closed = np.empty_like(depth)
             kernels.lift(depth, laws, lifted)
             kernels.close(lifted, closed)
             depth = closed
@@ -119,10 +125,12 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
 
 
 def lookup_table(camera: Camera) -> NDArray[np.int32]:
-    """For every pixel of the straight picture the pixel of the bent one that lies nearest, row * width + column; or -1.
+    """For every pixel of the straight picture the pixel of the bent one that lies nearest, row *
+    width + column; or -1.
 
-    The other way round would leave holes where the straight picture is the larger one. Depth along the optical axis is
-    the same in both, and is never mixed from neighbours, which would put points between the animal and the floor.
+    The other way round would leave holes where the straight picture is the larger one. Depth along
+    the optical axis is the same in both, and is never mixed from neighbours, which would put points
+    between the animal and the floor.
     """
     straight = straight_camera(camera)
     seen = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
@@ -132,11 +140,13 @@ def lookup_table(camera: Camera) -> NDArray[np.int32]:
 
 
 def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
-    """`Water.law` of every pixel's ray (H, 13, W) for `kernels.lift`, its points as homogeneous pixels of `without`.
+    """`Water.law` of every pixel's ray (H, 13, W) for `kernels.lift`, its points as homogeneous
+    pixels of `without`.
 
     A point of the law becomes (u z, v z, z), and three more numbers carry it to the higher camera.
     """
-    ideal, up = water.without(camera), water.lift_mm
+    ideal = water.without(camera)
+    up = water.lift_mm
     to_pixels = ideal.matrix
     laws = np.empty((camera.height, 13, camera.width), np.float32)
     uv = _pixels(camera)
@@ -149,7 +159,9 @@ def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
 
 
 def share_lost(camera: Camera) -> float:
-    """The share of a bent picture's pixels that have no place in the straight one, told from every eighth."""
+    """The share of a bent picture's pixels that have no place in the straight one, told from every
+    eighth.
+    """
     if camera.distortion is None:
         return 0.0
     straight = straight_camera(camera)
@@ -159,7 +171,8 @@ def share_lost(camera: Camera) -> float:
 
 def _inside(uv: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
     """Where (...) pixels (..., 2) are in the picture; False for NaN."""
-    right, down = uv[..., 0] + 0.5, uv[..., 1] + 0.5
+    right = uv[..., 0] + 0.5
+    down = uv[..., 1] + 0.5
     return np.asarray((right >= 0) & (right < camera.width) & (down >= 0) & (down < camera.height))
 
 

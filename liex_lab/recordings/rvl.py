@@ -1,4 +1,6 @@
-"""RVL, the run-length code for depth images: zeros are counted, steps between readings are stored in nibbles."""
+"""RVL, the run-length code for depth images: zeros are counted, steps between readings are stored
+in nibbles.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from numpy.typing import NDArray
 def _put(
     value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[np.uint32, int, int]:
-    """Append a number as nibbles of three bits and one that says more follow; eight nibbles make a word."""
+    """Append a number as nibbles of three bits and one that says more follow; eight nibbles make a
+    word.
+    """
     while True:
         nibble = value & 7
         value >>= 3
@@ -23,7 +27,9 @@ def _put(
         held += 1
         if held == 8:
             words[at] = word
-            at, held, word = at + 1, 0, np.uint32(0)
+            at = at + 1
+            held = 0
+            word = np.uint32(0)
         if value == 0:
             return word, at, held
 
@@ -31,7 +37,10 @@ def _put(
 @njit(cache=True, nogil=True)
 def _pack(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
     """Encode pixels (n,) into words (at least n + 2) and return how many words were used."""
-    n, i, at, held = len(pixels), 0, 0, 0
+    n = len(pixels)
+    i = 0
+    at = 0
+    held = 0
     last = np.int64(0)
     word = np.uint32(0)
     while i < n:
@@ -63,7 +72,9 @@ def pack_rvl(depth: NDArray[np.uint16]) -> NDArray[np.uint32]:
 
 
 def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """The whole payload of a compressedDepth RVL message, which is what Rerun takes as an `EncodedDepthImage`."""
+    """The whole payload of a compressedDepth RVL message, which is what Rerun takes as an
+    `EncodedDepthImage`.
+    """
     height, width = depth.shape
     head = struct.pack("<iffII", 0, 0.0, 0.0, width, height)
     return np.concatenate([np.frombuffer(head, np.uint8), pack_rvl(depth).view(np.uint8)])
@@ -74,12 +85,14 @@ def _take(
     words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[int, np.uint32, int, int]:
     """The next number, and where it ends; -1 where the words end before it does."""
-    value, shift = 0, 0
+    value = 0
+    shift = 0
     while shift < 33:
         if held == 0:
             if at >= len(words):
                 return -1, word, at, held
-            word, held = words[at], 8
+            word = words[at]
+            held = 8
             at += 1
         nibble = int(word >> np.uint32(28))
         word = np.uint32(word << np.uint32(4))
@@ -93,8 +106,13 @@ def _take(
 
 @njit(cache=True, nogil=True)
 def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
-    """Decode into pixels (n,), which are zero; False where the words do not hold exactly as many."""
-    n, i, at, held = len(pixels), 0, 0, 0
+    """Decode into pixels (n,), which are zero; False where the words do not hold exactly as
+    many.
+    """
+    n = len(pixels)
+    i = 0
+    at = 0
+    held = 0
     last = np.int64(0)
     word = np.uint32(0)
     while i < n:
@@ -131,7 +149,9 @@ def _to_millimetres(depth: NDArray[np.float32], out: NDArray[np.uint16]) -> None
 
 
 def to_millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth (H, W) mm to the nearest whole millimetre; 0 stays unread, beyond 65535 mm becomes unread."""
+    """Depth (H, W) mm to the nearest whole millimetre; 0 stays unread, beyond 65535 mm becomes
+    unread.
+    """
     out = np.empty(depth.shape, np.uint16)
     _to_millimetres(np.ascontiguousarray(depth, np.float32), out)
     return out

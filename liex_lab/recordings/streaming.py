@@ -1,4 +1,6 @@
-"""Frames that are still to come: of a file or folder that is being written, or replayed through a socket."""
+"""Frames that are still to come: of a file or folder that is being written, or replayed through a
+socket.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from liex_lab.recordings.recording import Recording
 _FRAME = struct.Struct("<qqII")  # index, time ns, height, width; then float32 mm, row by row
 _HEAD = struct.Struct("<I")  # length of the greeting, JSON
 _POLL_S = 0.02
-_GREETING_S, _LONGEST_GREETING = 10.0, 1 << 20
+_GREETING_S = 10.0
+_LONGEST_GREETING = 1 << 20
 _MOST_WAITING = 128  # frames that have come and were not asked for yet; then the sender waits
 
 
@@ -46,7 +49,8 @@ class Arriving:
 def growing(reopen: Callable[[], Recording], patience_s: float) -> Arriving:
     """A file or folder that is being written; it is over when nothing has come for patience_s.
 
-    reopen: opens what is there now, as far as it is whole. It is asked again whenever the last look found all read.
+    reopen: opens what is there now, as far as it is whole. It is asked again whenever the last look
+    found all read.
     """
     first = _when_there(reopen, patience_s)
     return Arriving(first.name, first.camera, _grown(first, reopen, patience_s))
@@ -73,7 +77,8 @@ def _when_there(reopen: Callable[[], Recording], patience_s: float) -> Recording
 def _grown(
     opened: Recording, reopen: Callable[[], Recording], patience_s: float
 ) -> Iterator[Arrival]:
-    done, last = 0, time.perf_counter()
+    done = 0
+    last = time.perf_counter()
     while time.perf_counter() - last < patience_s:
         for index in range(done, len(opened)):
             last = time.perf_counter()
@@ -97,7 +102,9 @@ def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
 
 
 def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
-    """A recording sent through a socket of this machine at its own pace, or `speed` times as fast."""
+    """A recording sent through a socket of this machine at its own pace, or `speed` times
+    as fast.
+    """
     server = socket.create_server(("127.0.0.1", 0))
     threading.Thread(target=_send, args=(server, recording, speed), daemon=True).start()
     return received(*server.getsockname()[:2])
@@ -128,14 +135,16 @@ def _greeting(link: socket.socket, where: str) -> dict[str, Any]:
     if not isinstance(said, dict) or not {"name", "camera"} <= set(said):
         link.close()
         raise RecordingError(
-            f"what is at {where} does not send depth frames as `replayed` does: no greeting with name and camera came; "
-            "check the port"
+            f"what is at {where} does not send depth frames as `replayed` does: no greeting with "
+            "name and camera came; check the port"
         )
     return said
 
 
 def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
-    """The same, read on a thread of its own, so that a frame's time is when it came and not when it was asked for."""
+    """The same, read on a thread of its own, so that a frame's time is when it came and not when it
+    was asked for.
+    """
     waiting: Queue[Arrival | None] = Queue(_MOST_WAITING)
 
     def fetch() -> None:
@@ -192,7 +201,9 @@ def _exactly(link: socket.socket, n: int) -> bytes:
 
 
 def _fill(link: socket.socket, place: memoryview) -> bool:
-    """Whether the next bytes came, as many as there is room for; they go where they stay, a frame is millions."""
+    """Whether the next bytes came, as many as there is room for; they go where they stay, a frame
+    is millions.
+    """
     filled = 0
     while filled < len(place):
         try:

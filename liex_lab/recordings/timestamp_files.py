@@ -1,4 +1,6 @@
-"""Time stamps that stand beside the pictures, in a file or in their names: read as written, exact to the nanosecond."""
+"""Time stamps that stand beside the pictures, in a file or in their names: read as written, exact
+to the nanosecond.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ _PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 t
 
 
 def to_ns(text: str, ns_per_unit: int) -> int:
-    """A decimal number as integer nanoseconds, exactly: a float64 of seconds since 1970 is good to 200 ns only."""
+    """A decimal number as integer nanoseconds, exactly: a float64 of seconds since 1970 is good to
+    200 ns only.
+    """
     value = Decimal(text.strip()) * ns_per_unit
     if not value.is_finite() or abs(value) >= LIMIT_NS:
         raise InvalidOperation(f"{text} is not a time")
@@ -40,9 +44,10 @@ def to_ns(text: str, ns_per_unit: int) -> int:
 def read_csv_times(path: Path, column: str | int | None = None, unit: str | None = None) -> Times:
     """The stamps of a table with a header, parted by commas, semicolons, tabs or blanks.
 
-    column: the name of the column of times, or its number from 0 in a table that may have no header; by itself the
-    first of time_ns, time_us, time_ms and time_s is taken. unit: ns, us, ms or s, where the column's name does not end
-    in it. Lines that begin with # are passed over, but for one that names the columns.
+    column: the name of the column of times, or its number from 0 in a table that may have no
+    header; by itself the first of time_ns, time_us, time_ms and time_s is taken. unit: ns, us, ms
+    or s, where the column's name does not end in it. Lines that begin with # are passed over, but
+    for one that names the columns.
     """
     lines = _lines(path)
     rows = [(number, row) for number, row in enumerate(_split(lines), start=1) if row]
@@ -60,22 +65,24 @@ def read_csv_times(path: Path, column: str | int | None = None, unit: str | None
     )
     if at < 0:
         raise RecordingError(
-            f"{path} should begin with a line that names a column {column or 'time_ns or time_s'}, but its first line "
-            f"is {_shorten(lines[0]) if lines else 'missing'!r}; "
+            f"{path} should begin with a line that names a column {column or 'time_ns or time_s'}, "
+            f"but its first line is {_shorten(lines[0]) if lines else 'missing'!r}; "
             + ("correct time_column in camera.toml" if column else "add that header line")
         )
     name = next(name for name in wanted if name in header)
     ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(name)
     if ns_per_unit is None:
         raise RecordingError(
-            f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", "us" or '
-            '"ns" beside time_column in camera.toml'
+            f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", '
+            '"us" or "ns" beside time_column in camera.toml'
         )
     return _parse(path, rows[at + 1 :], header.index(name), ns_per_unit)
 
 
 def read_column_times(path: Path, ns_per_unit: int) -> Times:
-    """The stamps in column 0 of a file of numbers parted by blanks or commas; a header line is passed over."""
+    """The stamps in column 0 of a file of numbers parted by blanks or commas; a header line is
+    passed over.
+    """
     rows = [
         (number, line.replace(",", " ").split())
         for number, line in enumerate(_lines(path), start=1)
@@ -89,9 +96,10 @@ def read_column_times(path: Path, ns_per_unit: int) -> Times:
 def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
     """The stamps that stand in the names of pictures, and whether they count from 1970 in UTC.
 
-    They must stand in every name, in one of these forms: a date and a time with a fraction of a second, as in
-    20121214T142255.814212 (its zone is not known, so it tells steps and no moment); seconds since 1970 with a fraction;
-    or 13, 16 or 19 digits of milliseconds, microseconds or nanoseconds since 1970. None where they do not.
+    They must stand in every name, in one of these forms: a date and a time with a fraction of a
+    second, as in 20121214T142255.814212 (its zone is not known, so it tells steps and no moment);
+    seconds since 1970 with a fraction; or 13, 16 or 19 digits of milliseconds, microseconds or
+    nanoseconds since 1970. None where they do not.
     """
     for form, read in ((_DATE, _date_ns), (_SECONDS, _seconds_ns), (_WHOLE, _whole_ns)):
         found = [form.findall(name) for name in names]
@@ -156,8 +164,8 @@ def _parse(path: Path, rows: list[tuple[int, list[str]]], column: int, ns_per_un
             times.append(to_ns(text, ns_per_unit))
         except InvalidOperation:
             raise RecordingError(
-                f"{path} holds {_shorten(text)!r} on line {number} where a time stamp was expected; "
-                "correct or remove that line"
+                f"{path} holds {_shorten(text)!r} on line {number} where a time stamp was "
+                "expected; correct or remove that line"
             ) from None
     return np.array(times, np.int64)
 

@@ -1,4 +1,6 @@
-"""Time stamps: read as written, exact to the nanosecond, and made to increase without hiding that they did not."""
+"""Time stamps: read as written, exact to the nanosecond, and made to increase without hiding that
+they did not.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,18 @@ _PLAUSIBLE_START_NS = (
 )  # the year 2000: earlier stamps count from something else than 1970
 
 
-DROPPED, JUMPED = "camera_dropped", "clock_jumped"
+DROPPED = "camera_dropped"
+JUMPED = "clock_jumped"
 
 
 @dataclass(frozen=True)
 class Gap:
     """A place where the recording's time is not what a steady camera would have written.
 
-    Half open, like every interval here. Frames that the camera did not deliver: start_frame = stop_frame = the frame
-    after the gap, for no frame lies inside; from start_ns, one median step after the last frame before, to stop_ns, the
-    time of the frame after. A stamp that had to be moved: the one frame it belongs to, n_frames_missing = 0.
+    Half open, like every interval here. Frames that the camera did not deliver: start_frame =
+    stop_frame = the frame after the gap, for no frame lies inside; from start_ns, one median step
+    after the last frame before, to stop_ns, the time of the frame after. A stamp that had to be
+    moved: the one frame it belongs to, n_frames_missing = 0.
     """
 
     start_frame: int
@@ -46,15 +50,18 @@ class Gap:
 
 
 FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `Settled.faults` counts
-_REPEATED, _OUT_OF_ORDER, _JUMPED = 1, 2, 3  # their places in it
+# their places in it
+_REPEATED = 1
+_OUT_OF_ORDER = 2
+_JUMPED = 3
 
 
 @dataclass(frozen=True)
 class Settled:
     """Stamps made strictly increasing.
 
-    times_ns (n,); faults (n,) uint8, index into `FAULTS`: why this frame's stamp was moved, 0 for one that stayed;
-    problem: a sentence about what was moved, None where nothing was.
+    times_ns (n,); faults (n,) uint8, index into `FAULTS`: why this frame's stamp was moved, 0 for
+    one that stayed; problem: a sentence about what was moved, None where nothing was.
     """
 
     times_ns: Times
@@ -70,8 +77,8 @@ def median_step(times_ns: Times) -> int:
 def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
     """The places where more than 1.5 steps of `step_ns` lie between two frames.
 
-    Where it is more than a minute the camera was stopped, or its clock set: how many frames are missing, nobody knows,
-    and one is counted.
+    Where it is more than a minute the camera was stopped, or its clock set: how many frames are
+    missing, nobody knows, and one is counted.
     """
     if step_ns <= 0:
         return []
@@ -109,10 +116,11 @@ def from_rate(n_frames: int, fps: float) -> Times:
 def settle(times_ns: Times) -> Settled:
     """The stamps made strictly increasing, frames in file order, without hiding what was moved.
 
-    A clock that was set back, or wrapped around, while frames went on coming is let go on from where it was, as if one
-    frame were missing there: how long the jump really took, nobody knows. After that the most stamps that can stay do
-    stay, exactly (the longest chain that increases), so that one wild stamp does not drag its neighbours along; the
-    others are spread evenly between those that stay, for that is where a camera that runs on takes its pictures.
+    A clock that was set back, or wrapped around, while frames went on coming is let go on from
+    where it was, as if one frame were missing there: how long the jump really took, nobody knows.
+    After that the most stamps that can stay do stay, exactly (the longest chain that increases), so
+    that one wild stamp does not drag its neighbours along; the others are spread evenly between
+    those that stay, for that is where a camera that runs on takes its pictures.
     """
     if np.all(np.diff(times_ns) > 0):
         return Settled(times_ns, np.zeros(len(times_ns), np.uint8), None)
@@ -132,24 +140,25 @@ def settle(times_ns: Times) -> Settled:
         first = int(jumps[0])
         back_s = float(times_ns[first - 1] - times_ns[first]) / 1e9
         sentences.append(
-            f"the clock jumps back in {len(jumps)} places, the first by {back_s:.3f} s at frame {first}; time was "
-            "taken to go on there as after one missing frame"
+            f"the clock jumps back in {len(jumps)} places, the first by {back_s:.3f} s at frame "
+            f"{first}; time was taken to go on there as after one missing frame"
         )
     if moved.any():
         largest_ms = float(np.abs(times - joined).max()) / 1e6
         sentences.append(
-            f"time stamps do not increase: {int(moved.sum())} of {len(times)} are repeated or out of order; "
-            "frames were kept in file order and these stamps spread between their neighbours, moved by "
-            f"{largest_ms:.3f} ms at most"
+            f"time stamps do not increase: {int(moved.sum())} of {len(times)} are repeated or out "
+            "of order; frames were kept in file order and these stamps spread between their "
+            f"neighbours, moved by {largest_ms:.3f} ms at most"
         )
     return Settled(times, faults.astype(np.uint8), "; ".join(sentences))
 
 
 def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
-    """The stamps with every lasting jump back taken out, and the frames (k,) at which the clock jumps.
+    """The stamps with every lasting jump back taken out, and the frames (k,) at which the clock
+    jumps.
 
-    Lasting: `_SURE` stamps before it increase, and `_SURE` from it on increase without reaching the one before it. What
-    is shorter is frames out of order, or one wild stamp.
+    Lasting: `_SURE` stamps before it increase, and `_SURE` from it on increase without reaching the
+    one before it. What is shorter is frames out of order, or one wild stamp.
     """
     dt = np.diff(times_ns)
     back = np.flatnonzero(dt <= 0) + 1
@@ -173,8 +182,11 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
 
 
 def _fewest_moved(times_ns: Times) -> Times:
-    """The stamps made strictly increasing by moving as few of them as possible, evenly between those that stay."""
-    # Integers that must increase by at least 1 are integers minus their rank that must not decrease.
+    """The stamps made strictly increasing by moving as few of them as possible, evenly between
+    those that stay.
+    """
+    # Integers that must increase by at least 1 are integers minus their rank that must not
+    # decrease.
     slack = times_ns - np.arange(len(times_ns), dtype=np.int64)
     keep = _first_of_equal(times_ns, slack, _longest_nondecreasing(slack.tolist()))
     settled = times_ns.copy()
@@ -183,16 +195,22 @@ def _fewest_moved(times_ns: Times) -> Times:
     settled[: keep[0]] = int(kept[0]) - step * np.arange(int(keep[0]), 0, -1)
     settled[keep[-1] + 1 :] = int(kept[-1]) + step * np.arange(1, len(times_ns) - int(keep[-1]))
     for n in np.flatnonzero(np.diff(keep) > 1):
-        i, j, start, stop = int(keep[n]), int(keep[n + 1]), int(kept[n]), int(kept[n + 1])
+        i = int(keep[n])
+        j = int(keep[n + 1])
+        start = int(kept[n])
+        stop = int(kept[n + 1])
         settled[i + 1 : j] = [start + (stop - start) * k // (j - i) for k in range(1, j - i)]
     return settled
 
 
 def _first_of_equal(times_ns: Times, slack: Times, keep: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The chain with the first of equal stamps in place of a later one: what repeats is the stale one."""
+    """The chain with the first of equal stamps in place of a later one: what repeats is the stale
+    one.
+    """
     chosen = keep.copy()
     for n, k in enumerate(keep.tolist()):
-        first, after = k, int(chosen[n - 1]) + 1 if n else 0
+        first = k
+        after = int(chosen[n - 1]) + 1 if n else 0
         while first > after and times_ns[first - 1] == times_ns[k]:
             first -= 1
         if n + 1 == len(keep) or slack[keep[n + 1]] >= slack[first]:
@@ -212,8 +230,10 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
             tops.append(value)
             top_index.append(i)
         else:
-            tops[pile], top_index[pile] = value, i
-    chain, i = [], top_index[-1]
+            tops[pile] = value
+            top_index[pile] = i
+    chain = []
+    i = top_index[-1]
     while i >= 0:
         chain.append(i)
         i = int(before[i])
@@ -223,18 +243,22 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
 def match_counts(
     n_frames: int, times_ns: Times, frames_from: str, times_from: str
 ) -> tuple[int, str | None]:
-    """How many frames have both a picture and a stamp, and a sentence with both numbers when they differ."""
+    """How many frames have both a picture and a stamp, and a sentence with both numbers when they
+    differ.
+    """
     if n_frames == len(times_ns):
         return n_frames, None
     n = min(n_frames, len(times_ns))
     return n, (
-        f"{frames_from} holds {n_frames} frames but {times_from} holds {len(times_ns)} time stamps; "
-        f"the first {n} of both are used"
+        f"{frames_from} holds {n_frames} frames but {times_from} holds {len(times_ns)} time "
+        f"stamps; the first {n} of both are used"
     )
 
 
 def start_of_day(stated: str | datetime | None) -> str | None:
-    """A stated start as ISO 8601 with zone; None where there is none or it has no zone, for then it says no moment."""
+    """A stated start as ISO 8601 with zone; None where there is none or it has no zone, for then it
+    says no moment.
+    """
     if isinstance(stated, str):
         try:
             stated = datetime.fromisoformat(stated)
@@ -246,7 +270,9 @@ def start_of_day(stated: str | datetime | None) -> str | None:
 
 
 def start_of_clock(first_ns: int) -> str | None:
-    """The moment of a stamp that counts from 1970 (UTC), ISO 8601; None where it plainly counts from something else."""
+    """The moment of a stamp that counts from 1970 (UTC), ISO 8601; None where it plainly counts
+    from something else.
+    """
     if first_ns < _PLAUSIBLE_START_NS:
         return None
     return (

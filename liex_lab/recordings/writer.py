@@ -1,7 +1,7 @@
 """Recordings written frame by frame: what every writer promises; folders of PNG pictures, and .oni.
 
-A writer is left with its `with` block: what belongs at the end is written where the block ended well. `notes` then says
-what a reader of the file should know.
+A writer is left with its `with` block: what belongs at the end is written where the block ended
+well. `notes` then says what a reader of the file should know.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ _FACTS = ("subject_id", "session_start_time")  # of the metadata, those that a c
 
 
 class RecordingWriter(ABC):
-    """Takes the frames of a recording in order of time. path: what is written, and there must be nothing yet."""
+    """Takes the frames of a recording in order of time. path: what is written, and there must be
+    nothing yet.
+    """
 
     def __init__(self, path: Path, camera: Camera) -> None:
-        self.path, self.camera = path, camera
+        self.path = path
+        self.camera = camera
         self.notes: list[str] = []
 
     @abstractmethod
@@ -76,7 +79,8 @@ class PictureFolderWriter(RecordingWriter):
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(path, camera)
-        self._step_mm, self._exact = step_mm, exact
+        self._step_mm = step_mm
+        self._exact = exact
         self._facts = {key: str(value) for key, value in (metadata or {}).items() if key in _FACTS}
         self._times: list[int] = []
         path.mkdir()
@@ -113,7 +117,9 @@ class PictureFolderWriter(RecordingWriter):
 
 
 class OniRecordingWriter(RecordingWriter):
-    """PrimeSense's .oni; step_mm: 1.0 or 0.1; exact: refuse depths between steps instead of rounding them."""
+    """PrimeSense's .oni; step_mm: 1.0 or 0.1; exact: refuse depths between steps instead of
+    rounding them.
+    """
 
     def __init__(
         self,
@@ -125,11 +131,15 @@ class OniRecordingWriter(RecordingWriter):
         start_ns: int = 0,
         rate_hz: float = 30.0,
     ) -> None:
-        """start_ns: of the first frame, for the format has no time before zero; rate_hz: what the file says of it."""
+        """start_ns: of the first frame, for the format has no time before zero; rate_hz: what the
+        file says of it.
+        """
         from liex_lab.recordings.formats.oni.writer import OniWriter
 
         super().__init__(path, camera)
-        self._step_mm, self._exact, self._earlier_ns = step_mm, exact, min(0, start_ns)
+        self._step_mm = step_mm
+        self._exact = exact
+        self._earlier_ns = min(0, start_ns)
         self._rounded = False
         self._oni = OniWriter(path, camera, unit_mm=step_mm, rate_hz=rate_hz, exact=exact)
 
@@ -150,7 +160,8 @@ class OniRecordingWriter(RecordingWriter):
             )
         if self.camera.distortion is not None:
             self.notes.append(
-                f"the lens distortion ({self.camera.distortion}) was left out, for .oni has no place for it"
+                f"the lens distortion ({self.camera.distortion}) was left out, for .oni has no "
+                "place for it"
             )
         if not self._exact:
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
@@ -168,12 +179,14 @@ def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint1
         return steps
     if float(depth.max()) > LARGEST_STEP * step_mm:
         raise RecordingError(
-            f"frame {frame.index} holds depths up to {depth.max():.0f} mm, and 16 bits in steps of {step_mm:g} mm hold "
-            f"up to {LARGEST_STEP * step_mm:.0f} mm; write an .mcap file, or choose a larger step with --step-mm"
+            f"frame {frame.index} holds depths up to {depth.max():.0f} mm, and 16 bits in steps of "
+            f"{step_mm:g} mm hold up to {LARGEST_STEP * step_mm:.0f} mm; write an .mcap file, or "
+            "choose a larger step with --step-mm"
         )
     raise RecordingError(
-        f"frame {frame.index} holds depths between whole steps of {step_mm:g} mm, which 16 bits do not keep; write an "
-        "unpacked .mcap file, which does, or let the depths be rounded with --step-mm 0.1"
+        f"frame {frame.index} holds depths between whole steps of {step_mm:g} mm, which 16 bits do "
+        "not keep; write an unpacked .mcap file, which does, or let the depths be rounded with "
+        "--step-mm 0.1"
     )
 
 

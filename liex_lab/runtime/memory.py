@@ -1,4 +1,6 @@
-"""How much memory this process has held, and arrays that lie on disk so that hours of recording take no more of it."""
+"""How much memory this process has held, and arrays that lie on disk so that hours of recording
+take no more of it.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ def peak_memory_mb() -> float | None:
 def give_back() -> None:
     """Hand memory that is not used any more back to the system, where it would be kept for later.
 
-    glibc keeps what lies between arrays still in use, and Arrow what tables took; after hours of recording it is much.
+    glibc keeps what lies between arrays still in use, and Arrow what tables took; after hours of
+    recording it is much.
     """
     if "pyarrow" in sys.modules:
         sys.modules["pyarrow"].default_memory_pool().release_unused()
@@ -55,8 +58,8 @@ def give_back() -> None:
 
 
 def on_disk(folder: Path) -> Room:
-    """Where arrays are made that lie in nameless files of that folder and go with the last who looks at them; in memory
-    where files of that disk cannot be mapped, as on some shares.
+    """Where arrays are made that lie in nameless files of that folder and go with the last who
+    looks at them; in memory where files of that disk cannot be mapped, as on some shares.
 
     Making one raises OSError where the disk is full, so that filling it cannot fail.
     """
@@ -97,9 +100,11 @@ def blocks(n: int, size: int) -> Iterator[slice]:
 
 
 def let_go(*arrays: NDArray[Any]) -> None:
-    """Let go of the memory of those of these arrays that are mapped from files; it is read again when it is wanted.
+    """Let go of the memory of those of these arrays that are mapped from files; it is read again
+    when it is wanted.
 
-    Only for what is shared with its file (`on_disk`) or never written to: changes of a private copy would be lost.
+    Only for what is shared with its file (`on_disk`) or never written to: changes of a private copy
+    would be lost.
     """
     for array in arrays:
         base: Any = array

@@ -1,4 +1,6 @@
-"""How a long job tells the person who waits how far it is: one callable, handed down from the command line."""
+"""How a long job tells the person who waits how far it is: one callable, handed down from the
+command line.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ class Progress(Protocol):
     """Whoever wants to know how far a job is."""
 
     def __call__(self, done: int, total: int | None, what: str) -> None:
-        """Told after every piece of work: pieces done, pieces in all (None: nobody knows), what is being done."""
+        """Told after every piece of work: pieces done, pieces in all (None: nobody knows), what is
+        being done.
+        """
 
 
 def silent(done: int, total: int | None, what: str) -> None:
@@ -21,7 +25,9 @@ def silent(done: int, total: int | None, what: str) -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error, gone when the block ends; nothing at all where that is not a terminal."""
+    """A progress bar on standard error, gone when the block ends; nothing at all where that is not
+    a terminal.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -61,8 +67,8 @@ COMPILING = "compiling, once on this machine: a minute or two"
 
 @contextmanager
 def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
-    """The same progress, which within the block also hears of kernels being compiled, and then again what it heard
-    last.
+    """The same progress, which within the block also hears of kernels being compiled, and then
+    again what it heard last.
     """
     from numba.core import event
 
@@ -91,13 +97,19 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
 
 
 class Board:
-    """How far many jobs are that run at once: a bar for each that runs, one for all, and a line for each that ended."""
+    """How far many jobs are that run at once: a bar for each that runs, one for all, and a line for
+    each that ended.
+    """
 
     def __init__(
         self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """say: takes the lines; clock: seconds that only go on, whatever the computer's clock is set to."""
-        self._n, self._say, self._clock = n_jobs, say, clock
+        """say: takes the lines; clock: seconds that only go on, whatever the computer's clock is
+        set to.
+        """
+        self._n = n_jobs
+        self._say = say
+        self._clock = clock
         self._began = clock()
         self._running: dict[str, float] = {}  # job -> share of it that is done
         self.n_ended = self.n_failed = 0
@@ -109,7 +121,8 @@ class Board:
     def ended(self, name: str, sentence: str, failed: bool) -> None:
         """A job is over."""
         self._running.pop(name, None)
-        self.n_ended, self.n_failed = self.n_ended + 1, self.n_failed + failed
+        self.n_ended = self.n_ended + 1
+        self.n_failed = self.n_failed + failed
         left = self.left_s
         wait = f", about {_span(left)} left" if left is not None and self.n_ended < self._n else ""
         self._say(f"{self.n_ended} of {self._n}: {name} {sentence}{wait}")
@@ -122,7 +135,8 @@ class Board:
     @property
     def left_s(self) -> float | None:
         """Seconds until all are done if it goes on like this; None where nothing is known yet."""
-        share, spent = self.share, self._clock() - self._began
+        share = self.share
+        spent = self._clock() - self._began
         return spent * (1.0 - share) / share if share > 0 else None
 
     @property

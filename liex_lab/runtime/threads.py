@@ -11,8 +11,11 @@ Item = TypeVar("Item")
 
 
 def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
-    """The same items, each made by a thread while the one before it is used; what goes wrong is raised in its turn."""
-    left, end = iter(items), object()
+    """The same items, each made by a thread while the one before it is used; what goes wrong is
+    raised in its turn.
+    """
+    left = iter(items)
+    end = object()
     with ThreadPoolExecutor(1) as maker:
         coming = maker.submit(next, left, end)
         while True:
@@ -25,8 +28,8 @@ def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
 
 @contextmanager
 def meanwhile(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
-    """What `make` makes on a thread of its own while the block runs; what is yielded waits for it, and raises what went
-    wrong. A block that ends before is not held up.
+    """What `make` makes on a thread of its own while the block runs; what is yielded waits for it,
+    and raises what went wrong. A block that ends before is not held up.
     """
     maker = ThreadPoolExecutor(1)
     coming = maker.submit(make)
@@ -40,8 +43,9 @@ def meanwhile(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
 def threads(parallel: bool) -> Iterator[None]:
     """Within the block, parallel kernels run on one thread unless `parallel`.
 
-    One kernel serves both: two numba functions made from one Python function, with and without parallel=True, share an
-    entry in numba's cache, and whichever was compiled first is loaded for both.
+    One kernel serves both: two numba functions made from one Python function, with and without
+    parallel=True, share an entry in numba's cache, and whichever was compiled first is loaded for
+    both.
     """
     import numba
 

@@ -36,8 +36,9 @@ _HELD = 20.0  # how much more a joint that a person placed counts than one that 
 
 @dataclass(frozen=True)
 class CorrectedTrack:
-    """A track with the corrections of flips and joints in it. turned: rows in which exchanging head and tail may have
-    changed the pose; moved: rows with joints that a person placed; flips: the table `flips`.
+    """A track with the corrections of flips and joints in it. turned: rows in which exchanging head
+    and tail may have changed the pose; moved: rows with joints that a person placed; flips: the
+    table `flips`.
     """
 
     track: Track
@@ -55,7 +56,8 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
     """The track of a session, opened raw, with the standing corrections of its log."""
     track = track_of(session, skeleton)
     index = session.frames["frame_index"].to_numpy(np.int64)
-    flips, turned = tuple(read_flips(session)), np.zeros(0, np.int64)
+    flips = tuple(read_flips(session))
+    turned = np.zeros(0, np.int64)
     spans: list[FlipSpan] = log.corrections(FlipSpan)
     if spans:
         track, flips, turned = _turned_round(session, track, index, spans)
@@ -67,7 +69,9 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
 def _turned_round(
     session: Session, track: Track, index: Rows, spans: Sequence[FlipSpan]
 ) -> tuple[Track, tuple[Flip, ...], Rows]:
-    """The track made again from what the single frames said, with the spans turned round; far from them it stays."""
+    """The track made again from what the single frames said, with the spans turned round; far from
+    them it stays.
+    """
     seen, subject = read_evidence(session)
     wanted = [Flip(*_rows_of(index, span), 1.0, True, HUMAN) for span in spans]
     earlier = [
@@ -86,23 +90,24 @@ def _turned_round(
 def place_joints(
     track: Track, index: Rows, moves: Sequence[JointMove], camera: Camera, T_arena_camera: SE3
 ) -> Rows:
-    """Put joints where a person says, in place, and let the others follow; returns the rows that this changed.
+    """Put joints where a person says, in place, and let the others follow; returns the rows that
+    this changed.
 
-    A local fit of the chain: bones keep their lengths and joints their limits, and those that nobody placed stay as
-    near as they can to where they were.
+    A local fit of the chain: bones keep their lengths and joints their limits, and those that
+    nobody placed stay as near as they can to where they were.
     """
     if not moves:
         return np.zeros(0, np.int64)
-    skeleton, names = track.skeleton, list(track.skeleton.names)
+    skeleton = track.skeleton
+    names = list(track.skeleton.names)
     rows = np.unique(np.searchsorted(index, [move.frame for move in moves]))
     weight = np.ones((len(rows), skeleton.n_joints))
     points = track.joints_mm[rows].copy()
     for move in moves:
-        k, j = (
-            int(np.searchsorted(rows, np.searchsorted(index, move.frame))),
-            names.index(move.joint),
-        )
-        points[k, j], weight[k, j] = (move.x_mm, move.y_mm, move.z_mm), _HELD
+        k = int(np.searchsorted(rows, np.searchsorted(index, move.frame)))
+        j = names.index(move.joint)
+        points[k, j] = (move.x_mm, move.y_mm, move.z_mm)
+        weight[k, j] = _HELD
     if not np.isfinite(points).all():
         raise SessionError(
             "a joint was moved in a frame that has no pose; take that correction back"
@@ -116,14 +121,15 @@ def place_joints(
     for k in range(len(rows)):
         pull = np.diag(weight[k])
         fit = fit_poses(skeleton, (pull @ points[k])[None], pull, start[k : k + 1], keep_scale=True)
-        row, pose = rows[k], fit.pose
-        track.root_rotation[row], track.root_mm[row] = (
-            pose.root.rotation[0],
-            pose.root.translation[0],
-        )
-        track.angles_rad[row], track.joints_mm[row] = pose.angles[0], pose.joints(skeleton)[0]
+        row = rows[k]
+        pose = fit.pose
+        track.root_rotation[row] = pose.root.rotation[0]
+        track.root_mm[row] = pose.root.translation[0]
+        track.angles_rad[row] = pose.angles[0]
+        track.joints_mm[row] = pose.joints(skeleton)[0]
     track.uv_px[rows] = camera.project(T_arena_camera.inverse() @ track.joints_mm[rows])
-    track.bridged[rows], track.flag[rows] = False, CORRECTED
+    track.bridged[rows] = False
+    track.flag[rows] = CORRECTED
     return rows
 
 
@@ -138,8 +144,8 @@ def edited_bouts(
 ) -> pd.DataFrame:
     """The columns of `tables.BOUTS` of an ethogram with a person's edits, one after the other.
 
-    Each clears the bout that it edits, then its own span: a bout that reaches into it keeps what lies outside. What a
-    person says has the source human, the score 1 and no model.
+    Each clears the bout that it edits, then its own span: a bout that reaches into it keeps what
+    lies outside. What a person says has the source human, the score 1 and no model.
     """
     rows = _spans(bouts, frames)
     for edit in edits:
@@ -155,11 +161,12 @@ def edited_bouts(
 def spliced_bouts(
     bouts: pd.DataFrame, other: pd.DataFrame, rows: Rows, frames: pd.DataFrame
 ) -> pd.DataFrame:
-    """The bouts of one ethogram, and in some rows of the recording those of another; one word across a seam is one
-    bout.
+    """The bouts of one ethogram, and in some rows of the recording those of another; one word
+    across a seam is one bout.
     """
     times = frames["time_ns"].to_numpy(np.int64)
-    inside, mixed = _spans(other, frames), _spans(bouts, frames)
+    inside = _spans(other, frames)
+    mixed = _spans(bouts, frames)
     end = max([int(times[-1]) + 1, *(row["stop_ns"] for row in [*inside, *mixed])])
     for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
         start = int(times[part[0]])
@@ -176,7 +183,9 @@ def spliced_bouts(
 
 
 def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """Bouts as rows with their ends on the recording's clock: the frames' own times where they are one."""
+    """Bouts as rows with their ends on the recording's clock: the frames' own times where they are
+    one.
+    """
     times = frames["time_ns"].to_numpy(np.int64)
     rows: list[dict[str, Any]] = []
     for row in bouts[["action", "start_s", "stop_s", "score", "source", "model_hash"]].to_dict(
@@ -203,11 +212,10 @@ def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[di
 
 def _table(rows: Sequence[dict[str, Any]], frames: pd.DataFrame) -> pd.DataFrame:
     """Rows in order of time as the table; a piece of a bout without a frame is none."""
-    times, count = (
-        frames["time_ns"].to_numpy(np.int64),
-        frame_count(frames["frame_index"].to_numpy(np.int64)),
-    )
-    first, made = int(times[0]), []
+    times = frames["time_ns"].to_numpy(np.int64)
+    count = frame_count(frames["frame_index"].to_numpy(np.int64))
+    first = int(times[0])
+    made = []
     for row in sorted(rows, key=lambda row: row["start_ns"]):
         a, b = np.searchsorted(times, [row["start_ns"], row["stop_ns"]])
         if a == b:

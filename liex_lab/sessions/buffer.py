@@ -30,7 +30,9 @@ def columns_of(rows: Columnar) -> dict[str, NDArray[Any]]:
 
 
 class TrackBuffer:
-    """A track that grows by parts, in arrays made for the expected number of frames, so that nothing is held twice."""
+    """A track that grows by parts, in arrays made for the expected number of frames, so that
+    nothing is held twice.
+    """
 
     def __init__(self, skeleton: Skeleton, n_expected: int) -> None:
         self._room = Track.empty(skeleton, np.zeros(n_expected, np.int64))
@@ -40,7 +42,8 @@ class TrackBuffer:
     def of(track: Track) -> TrackBuffer:
         """One that holds a track as it is."""
         held = TrackBuffer(track.skeleton, 0)
-        held._room, held._n = track, track.n_frames
+        held._room = track
+        held._n = track.n_frames
         return held
 
     def append(self, part: Track) -> None:

@@ -1,8 +1,9 @@
-"""An unfinished session: a folder beside the final place that says how far the work has come, so that it can go on.
+"""An unfinished session: a folder beside the final place that says how far the work has come, so
+that it can go on.
 
-What was seen in the frames lies in it as plain arrays that only grow; the logs (replay, MCAP) grow beside them. Every
-few seconds `checkpoint.json` takes down, by a rename, how long all of them were at one moment. Whatever lies behind
-that is cut off before the work goes on.
+What was seen in the frames lies in it as plain arrays that only grow; the logs (replay, MCAP) grow
+beside them. Every few seconds `checkpoint.json` takes down, by a rename, how long all of them were
+at one moment. Whatever lies behind that is cut off before the work goes on.
 """
 
 from __future__ import annotations
@@ -26,14 +27,13 @@ from liex_lab.sessions.lock import take_lock
 EVERY_S = (
     3.0  # between two checkpoints: as much work is lost at most, besides what it takes to begin
 )
-_STATE, _LOCK, _SEEN, _INPUT, STRETCHES = (
-    "checkpoint.json",
-    "lock",
-    "seen",
-    "input.json",
-    "stretches",
-)
-_MOST_S = 1e10  # of work: three hundred years; whole numbers beyond what a float holds are no seconds either
+_STATE = "checkpoint.json"
+_LOCK = "lock"
+_SEEN = "seen"
+_INPUT = "input.json"
+STRETCHES = "stretches"
+# of work: three hundred years; whole numbers beyond what a float holds are no seconds either
+_MOST_S = 1e10
 _MOST = 1 << 20  # values of one column that a frame may have
 OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES)  # what is no part of the finished session
 
@@ -47,10 +47,12 @@ Clock = Callable[[], float]
 
 @dataclass
 class State:
-    """How far a session is. n_frames: written and seen; seconds: spent on them; runs: parts that each log is in, one
-    for each time that the work was begun and for each of the stretches that others wrote.
+    """How far a session is. n_frames: written and seen; seconds: spent on them; runs: parts that
+    each log is in, one for each time that the work was begun and for each of the stretches that
+    others wrote.
 
-    logs: for each part of each log its bytes, in the order of writing: "session.mcap" -> [1200, 5030].
+    logs: for each part of each log its bytes, in the order of writing: "session.mcap" -> [1200,
+    5030].
     """
 
     key: str
@@ -67,7 +69,9 @@ class Checkpoint:
     def __init__(
         self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic
     ) -> None:
-        """Begin, or go on where a session of the same facts (JSON) was left. clock: seconds that never jump."""
+        """Begin, or go on where a session of the same facts (JSON) was left. clock: seconds that
+        never jump.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         check_free(folder)
         held = take_lock(folder / _LOCK)
@@ -75,7 +79,9 @@ class Checkpoint:
             raise SessionError(
                 f"another process has just begun to write {folder}; wait until it is done"
             )
-        self.folder, self._held, self._clock = folder, held, clock
+        self.folder = folder
+        self._held = held
+        self._clock = clock
         text = json.dumps(facts, sort_keys=True, default=str)
         key = hashlib.sha256(text.encode()).hexdigest()
         state = _read_state(folder / _STATE)
@@ -84,7 +90,8 @@ class Checkpoint:
             state = State(key)
         else:
             state.runs += 1
-        self.state, self.seconds_before = state, state.seconds
+        self.state = state
+        self.seconds_before = state.seconds
         (folder / _SEEN).mkdir(exist_ok=True)
         self.seen = Columns(folder / _SEEN)
         self._last = clock()
@@ -95,7 +102,9 @@ class Checkpoint:
         return self._clock() - self._last >= EVERY_S
 
     def save(self, n_frames: int, seconds: float, logs: Mapping[str, int]) -> None:
-        """Take down that everything up to a frame is on disk; logs: the bytes of each log's present part."""
+        """Take down that everything up to a frame is on disk; logs: the bytes of each log's present
+        part.
+        """
         self.seen.flush()
         present = {
             name: [*self.state.logs.get(name, [])[: self.n_parts - 1], size]
@@ -113,9 +122,12 @@ class Checkpoint:
         )
 
     def take(self, n_frames: int, seconds: float, logs: Mapping[str, Path]) -> None:
-        """Take over the next part of each log, written by another process; what was seen in it is in `seen` already."""
+        """Take over the next part of each log, written by another process; what was seen in it is
+        in `seen` already.
+        """
         self.seen.flush()
-        sizes, k = {}, self.n_parts - 1
+        sizes = {}
+        k = self.n_parts - 1
         for log, path in logs.items():
             sizes[log] = [*self.state.logs.get(log, [])[:k], path.stat().st_size]
             path.replace(self.part(log, k))
@@ -138,7 +150,9 @@ class Checkpoint:
 
     @property
     def n_parts(self) -> int:
-        """Parts of each log: one, and one more for each time the work went on or a stretch was taken over."""
+        """Parts of each log: one, and one more for each time the work went on or a stretch was
+        taken over.
+        """
         return self.state.runs
 
     @property
@@ -152,7 +166,9 @@ class Checkpoint:
         return path if number == 0 else path.with_name(f"{path.stem}-{number}{path.suffix}")
 
     def parts(self, log: str) -> list[tuple[Path, int | None]]:
-        """The parts of a log in order, with the bytes of each that count; None for all of the present one."""
+        """The parts of a log in order, with the bytes of each that count; None for all of the
+        present one.
+        """
         sizes: list[int | None] = [*self.state.logs.get(log, [])[: self.n_parts - 1], None]
         return [(self.part(log, k), size) for k, size in enumerate(sizes)]
 
@@ -171,7 +187,9 @@ class Checkpoint:
                 join(self.parts(log), whole)
 
     def drop_parts(self) -> None:
-        """The joined logs take the place of their parts, from which the work could have gone on until now."""
+        """The joined logs take the place of their parts, from which the work could have gone on
+        until now.
+        """
         if self.n_parts > 1:
             for log, whole in self.logs.items():
                 for path, _ in self.parts(log)[1:]:
@@ -224,7 +242,9 @@ class Checkpoint:
 
 
 class Columns:
-    """Arrays on disk that grow by rows, one file each, and a small text that says what they hold, in order."""
+    """Arrays on disk that grow by rows, one file each, and a small text that says what they hold,
+    in order.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -266,7 +286,9 @@ class Columns:
         self._files.clear()
 
     def read(self) -> dict[str, NDArray[Any]]:
-        """All rows of every column, in memory that the system may take back; empty where none was written."""
+        """All rows of every column, in memory that the system may take back; empty where none was
+        written.
+        """
         self.flush()
         return {
             name: np.memmap(self._folder / f"{name}.bin", np.dtype(kind), "c").reshape(-1, *shape)
@@ -281,7 +303,8 @@ class Columns:
         if kinds is None:
             return n == 0
         for name, (kind, shape) in kinds.items():
-            path, size = folder / f"{name}.bin", n * np.dtype(kind).itemsize * int(np.prod(shape))
+            path = folder / f"{name}.bin"
+            size = n * np.dtype(kind).itemsize * int(np.prod(shape))
             if not path.is_file() or path.stat().st_size < size:
                 return False
             with path.open("r+b") as file:
@@ -290,7 +313,8 @@ class Columns:
 
 
 def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
-    """Have the recording's hash, which takes long for hours of it, from an interrupted run where its files are as then.
+    """Have the recording's hash, which takes long for hours of it, from an interrupted run where
+    its files are as then.
 
     folder: of the unfinished session.
     """
@@ -314,8 +338,8 @@ def check_free(folder: Path) -> None:
         held = take_lock(folder / _LOCK)
         if held is None:
             raise SessionError(
-                f"another process is writing the session {folder.with_suffix('').name} into {folder.parent}; wait "
-                "until it is done, or choose another place with --out"
+                f"another process is writing the session {folder.with_suffix('').name} into "
+                f"{folder.parent}; wait until it is done, or choose another place with --out"
             )
         held.close()
 
@@ -337,7 +361,9 @@ def _read_state(path: Path) -> State | None:
 
 
 def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
-    """What columns.json says of the columns: dtype and shape of a row by name; None where it makes no sense."""
+    """What columns.json says of the columns: dtype and shape of a row by name; None where it makes
+    no sense.
+    """
     try:
         found: dict[str, Any] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
         kinds = {

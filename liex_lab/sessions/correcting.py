@@ -1,4 +1,6 @@
-"""Corrections that a person asks for, checked against the session: from seconds, pixels and words to entries."""
+"""Corrections that a person asks for, checked against the session: from seconds, pixels and words
+to entries.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ _WORD_LENGTH = 60
 
 
 def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
-    """Head and tail are exchanged from start_s to stop_s, seconds since the first frame, stop exclusive."""
+    """Head and tail are exchanged from start_s to stop_s, seconds since the first frame, stop
+    exclusive.
+    """
     first, last = rows_between(session, start_s, stop_s, "a span to flip")
     count = frame_count(session.frames["frame_index"].to_numpy(np.int64))
     return FlipSpan(int(count[first]), int(count[last]))
@@ -33,8 +37,8 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
 def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> JointMove:
     """A joint of one frame, the camera's count, lies at place_mm (3,), arena frame.
 
-    Raises SessionError where there is no such frame, joint or pose, or where the place is farther from where the joint
-    was than the animal is long.
+    Raises SessionError where there is no such frame, joint or pose, or where the place is farther
+    from where the joint was than the animal is long.
     """
     row, was = _joint_row(session, frame, joint)
     place = np.asarray(place_mm, float)
@@ -42,11 +46,13 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
         raise SessionError(
             f"a joint's place is x, y and z in mm of the arena frame, got {place_mm}"
         )
-    length, off = float(session.frames["spine_mm"].iloc[row]), float(np.linalg.norm(place - was))
+    length = float(session.frames["spine_mm"].iloc[row])
+    off = float(np.linalg.norm(place - was))
     if off > length:
         raise SessionError(
-            f"{joint} of frame {frame} cannot be {off:.0f} mm from where it was found, at ({was[0]:.1f}, {was[1]:.1f}, "
-            f"{was[2]:.1f}) mm, for the animal is {length:.0f} mm long; check the place"
+            f"{joint} of frame {frame} cannot be {off:.0f} mm from where it was found, at "
+            f"({was[0]:.1f}, {was[1]:.1f}, {was[2]:.1f}) mm, for the animal is {length:.0f} mm "
+            "long; check the place"
         )
     return JointMove(int(frame), joint, *(round(float(x), 3) for x in place))
 
@@ -56,8 +62,8 @@ def joint_move_at_pixel(
 ) -> JointMove:
     """A joint of one frame lies under the pixel (u_px, v_px) of the depth picture.
 
-    The depth there is that of the skin; the joint is put as deep under it as it usually lies: the median over frames
-    of the recording in which the pose is trusted.
+    The depth there is that of the skin; the joint is put as deep under it as it usually lies: the
+    median over frames of the recording in which the pose is trusted.
     """
     from liex_lab.recordings import open_recording
 
@@ -70,15 +76,15 @@ def joint_move_at_pixel(
         and 0 <= round(v_px) < camera.height
     ):
         raise SessionError(
-            f"a pixel is a column and a row of the depth picture of {camera.width} x {camera.height}, the top-left one "
-            f"(0, 0); got ({u_px:g}, {v_px:g})"
+            f"a pixel is a column and a row of the depth picture of {camera.width} x "
+            f"{camera.height}, the top-left one (0, 0); got ({u_px:g}, {v_px:g})"
         )
     with open_recording(session.path / "session.mcap") as recording:
         skin_mm = depth_under(recording.frame(row).depth, u_px, v_px)
         if math.isnan(skin_mm):
             raise SessionError(
-                f"frame {frame} has no depth at pixel ({u_px:g}, {v_px:g}); choose one beside it, or give the joint's "
-                "place in mm"
+                f"frame {frame} has no depth at pixel ({u_px:g}, {v_px:g}); choose one beside it, "
+                "or give the joint's place in mm"
             )
         inset_mm = _inset_mm(session, recording, joint)
     place = camera.unproject(np.array([u_px, v_px]), np.array(skin_mm + inset_mm))
@@ -87,7 +93,8 @@ def joint_move_at_pixel(
 
 def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:
     """The median depth (mm) read in the three by three pixels around one, NaN where nothing was."""
-    v, u = round(v_px), round(u_px)
+    v = round(v_px)
+    u = round(u_px)
     near = depth[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
     return float(np.median(near[near > 0])) if (near > 0).any() else math.nan
 
@@ -117,7 +124,9 @@ def _inset_mm(session: Session, recording: Any, joint: str) -> float:
 
 
 def bout_at(session: Session, at_s: float) -> dict[str, Any]:
-    """The bout that a time lies in. Raises SessionError, with the nearest ones, where there is none."""
+    """The bout that a time lies in. Raises SessionError, with the nearest ones, where there is
+    none.
+    """
     bouts = session.bouts
     inside = bouts[(bouts["start_s"] <= at_s + _ROUNDED_S) & (bouts["stop_s"] > at_s + _ROUNDED_S)]
     if len(inside) == 0:
@@ -146,7 +155,8 @@ def add_bout(
 
 def rename_bout(session: Session, at_s: float, action: str, *, new_word: bool = False) -> BoutEdit:
     """The bout at at_s is one of `action`; the word that it has already confirms it."""
-    bout, word = bout_at(session, at_s), _word(session, action, new_word)
+    bout = bout_at(session, at_s)
+    word = _word(session, action, new_word)
     span = _span_of(session, bout)
     return BoutEdit("rename", word, *span, str(bout["action"]), *span)
 
@@ -168,8 +178,8 @@ def delete_bout(session: Session, at_s: float) -> BoutEdit:
 
 
 def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
-    """The whole ethogram as a person has labelled it: `labels` is a table of actions.labels, of this session alone or
-    with its name as session_id.
+    """The whole ethogram as a person has labelled it: `labels` is a table of actions.labels, of
+    this session alone or with its name as session_id.
     """
     from liex_lab.actions.ethogram import Ethogram
     from liex_lab.actions.labels import words_of
@@ -183,9 +193,11 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
     bouts = Ethogram.of_words(words_of(labels, time_s, named), time_ns).bouts
     if not bouts:
         raise SessionError(
-            f"none of these labels lies within the session {session.name}; check their times and names"
+            f"none of these labels lies within the session {session.name}; check their times and "
+            "names"
         )
-    first, last = int(time_ns[0]), _end_ns(session)
+    first = int(time_ns[0])
+    last = _end_ns(session)
     edges = [first, *(t for bout in bouts for t in (bout.start_ns, bout.stop_ns)), last]
     free = [
         BoutEdit("delete", "", a, b, "any")
@@ -201,14 +213,16 @@ def rows_between(session: Session, start_s: float, stop_s: float, what: str) -> 
     first, last = (int(np.searchsorted(time_s, at - _ROUNDED_S)) for at in (start_s, stop_s))
     if not (start_s < stop_s and first < last):
         raise SessionError(
-            f"{what} is from a time to a later one, in seconds since the first frame, and holds a frame; got "
-            f"{start_s:g} to {stop_s:g} in a session of 0 to {time_s[-1]:.3f} s"
+            f"{what} is from a time to a later one, in seconds since the first frame, and holds a "
+            f"frame; got {start_s:g} to {stop_s:g} in a session of 0 to {time_s[-1]:.3f} s"
         )
     return first, last
 
 
 def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
-    """A span of frames on the recording's clock: of the first frame inside, and of the first one outside."""
+    """A span of frames on the recording's clock: of the first frame inside, and of the first one
+    outside.
+    """
     first, last = rows_between(session, start_s, stop_s, "a bout")
     times = session.frames["time_ns"].to_numpy(np.int64)
     return int(times[first]), int(times[last]) if last < len(times) else _end_ns(session)
@@ -228,14 +242,16 @@ def _span_of(session: Session, bout: dict[str, Any]) -> tuple[int, int]:
 
 def _word(session: Session, action: str, new_word: bool) -> str:
     """A word for an action, checked."""
-    word, known = action.strip(), list(session.metadata.get("actions") or {})
+    word = action.strip()
+    known = list(session.metadata.get("actions") or {})
     if not word or len(word) > _WORD_LENGTH or not word.isprintable():
         raise LiexError(f"an action is a word of up to {_WORD_LENGTH} letters, got {action!r}")
     if word not in known and not new_word:
         near = difflib.get_close_matches(word, known, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise SessionError(
-            f"the ethogram has no word '{word}': {hint}known are {', '.join(known) or 'none'}; --new-word makes it one"
+            f"the ethogram has no word '{word}': {hint}known are {', '.join(known) or 'none'}; "
+            "--new-word makes it one"
         )
     return word
 
@@ -258,6 +274,7 @@ def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
     )
     if not np.isfinite(place).all():
         raise SessionError(
-            f"frame {frame} has no pose, so no joint of it can be moved; joints are moved where the animal was found"
+            f"frame {frame} has no pose, so no joint of it can be moved; joints are moved where "
+            "the animal was found"
         )
     return row, place

@@ -1,8 +1,10 @@
-"""What people correct in a session: head and tail exchanged in a span, a joint moved, bouts of the ethogram.
+"""What people correct in a session: head and tail exchanged in a span, a joint moved, bouts of the
+ethogram.
 
-A session's own files are never written again. Beside them lies the folder `corrected`: `corrections.json` is the log,
-to which entries are only ever added (one may take back another), and the tables are what the session's own become with
-the entries that stand. `Session.open` reads those; `Session.open(path, raw=True)` reads what was measured.
+A session's own files are never written again. Beside them lies the folder `corrected`:
+`corrections.json` is the log, to which entries are only ever added (one may take back another), and
+the tables are what the session's own become with the entries that stand. `Session.open` reads
+those; `Session.open(path, raw=True)` reads what was measured.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from typing import Any, ClassVar
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
 
-FOLDER, LOG, REPLAY = "corrected", "corrections.json", "corrected.rrd"
+FOLDER = "corrected"
+LOG = "corrections.json"
+REPLAY = "corrected.rrd"
 SCHEMA_VERSION = 1
 FACTS = {
     "frames",
@@ -33,7 +37,9 @@ EDITS = ("add", "rename", "recut", "delete")
 
 @dataclass(frozen=True)
 class FlipSpan:
-    """Head and tail are exchanged in the frames start_frame to stop_frame, the camera's count, stop exclusive."""
+    """Head and tail are exchanged in the frames start_frame to stop_frame, the camera's count, stop
+    exclusive.
+    """
 
     kind: ClassVar[str] = "flip"
     start_frame: int
@@ -57,14 +63,18 @@ class JointMove:
 
     def __str__(self) -> str:
         """What is said in a list."""
-        return f"{self.joint} of frame {self.frame} to ({self.x_mm:.1f}, {self.y_mm:.1f}, {self.z_mm:.1f}) mm"
+        return (
+            f"{self.joint} of frame {self.frame} to ({self.x_mm:.1f}, {self.y_mm:.1f}, "
+            f"{self.z_mm:.1f}) mm"
+        )
 
 
 @dataclass(frozen=True)
 class BoutEdit:
-    """From start_ns to stop_ns, the recording's clock, stop exclusive, the animal does `action`; '' is nothing that has
-    a name. was_start_ns to was_stop_ns: the bout that is edited and loses its time first; equal where there was none.
-    edit: a word of EDITS; was: the edited bout's action, for the reader.
+    """From start_ns to stop_ns, the recording's clock, stop exclusive, the animal does `action`; ''
+    is nothing that has a name. was_start_ns to was_stop_ns: the bout that is edited and loses its
+    time first; equal where there was none. edit: a word of EDITS; was: the edited bout's action,
+    for the reader.
     """
 
     kind: ClassVar[str] = "bout"
@@ -97,7 +107,8 @@ _UNDO = "undo"
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the log: a correction, or, where `what` is None, that the entry number `undoes` is taken back.
+    """One line of the log: a correction, or, where `what` is None, that the entry number `undoes`
+    is taken back.
 
     made_at: ISO 8601 with zone.
     """
@@ -133,8 +144,8 @@ def _typed(value: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True)
 class Log:
-    """All entries, first to last; made_of: which poses and bouts they correct, see `basis`; files: bytes and hash of
-    each corrected table; facts: what session.json would say instead.
+    """All entries, first to last; made_of: which poses and bouts they correct, see `basis`; files:
+    bytes and hash of each corrected table; facts: what session.json would say instead.
     """
 
     made_of: str
@@ -163,7 +174,8 @@ class Log:
                 raise SessionError(
                     f"there is no correction {number} to take back; those that stand are {told}"
                 )
-        who, now = author or author_name(), datetime.now(UTC).isoformat(timespec="seconds")
+        who = author or author_name()
+        now = datetime.now(UTC).isoformat(timespec="seconds")
         number = max((entry.number for entry in self.entries), default=0)
         new: list[Entry] = []
         for undone, one in [*((n, None) for n in dict.fromkeys(undo)), *((0, w) for w in what)]:
@@ -185,7 +197,9 @@ class Log:
 
 
 def _sum(document: Mapping[str, Any]) -> str:
-    """The hash of a log's content, but for itself: what is read and merged into session.json's was written by us."""
+    """The hash of a log's content, but for itself: what is read and merged into session.json's was
+    written by us.
+    """
     stated = {key: value for key, value in document.items() if key != "sum"}
     return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
 
@@ -200,13 +214,17 @@ def author_name() -> str:
 
 def corrected_folder(session: Path) -> Path:
     """The folder of the corrections; while it is being replaced, the one that was there before."""
-    folder, old = session / FOLDER, session / f"{FOLDER}.old"
+    folder = session / FOLDER
+    old = session / f"{FOLDER}.old"
     return old if old.is_dir() and not folder.is_dir() else folder
 
 
 def basis(session: Path, metadata: Mapping[str, Any]) -> str:
-    """What the corrections of a session are made of: the hash of its poses, its own bouts and flips."""
-    stated, found = metadata.get("files") or {}, []
+    """What the corrections of a session are made of: the hash of its poses, its own bouts and
+    flips.
+    """
+    stated = metadata.get("files") or {}
+    found = []
     for name in ("poses.parquet", "bouts.parquet", "flips.parquet"):
         facts = stated.get(name) if isinstance(stated, dict) else None
         found.append(
@@ -230,13 +248,14 @@ def read_log(session: Path) -> Log:
         version = int(document["schema_version"])
         if version > SCHEMA_VERSION:
             raise SessionError(
-                f"{path} was written by a newer liex_lab (schema {version}, this one reads up to {SCHEMA_VERSION}); "
-                "upgrade with `pip install -U liex_lab`"
+                f"{path} was written by a newer liex_lab (schema {version}, this one reads up to "
+                f"{SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
             )
         if document["sum"] != _sum(document):
             raise ValueError("its sum does not fit, so it was changed")
         entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
-        files, facts = document.get("files", {}), document.get("facts", {})
+        files = document.get("files", {})
+        facts = document.get("facts", {})
         if not (
             isinstance(files, dict)
             and isinstance(facts, dict)
@@ -256,8 +275,8 @@ def read_log(session: Path) -> Log:
         RecursionError,
     ) as error:
         raise SessionError(
-            f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it, or remove the folder "
-            f"{FOLDER} to go on with what was measured"
+            f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it, or "
+            f"remove the folder {FOLDER} to go on with what was measured"
         ) from None
 
 

@@ -1,4 +1,6 @@
-"""What the track of a session was made of, kept beside it: so that it can be made again after a human's correction."""
+"""What the track of a session was made of, kept beside it: so that it can be made again after a
+human's correction.
+"""
 
 from __future__ import annotations
 
@@ -68,8 +70,8 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
     path = session.path / FILE
     if not path.is_file():
         raise SessionError(
-            f"{session.path} does not hold what its single frames said ({FILE}), as sessions of earlier versions; "
-            "run `liex run` on the recording again"
+            f"{session.path} does not hold what its single frames said ({FILE}), as sessions of "
+            "earlier versions; run `liex run` on the recording again"
         )
     with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
         facts = json.loads(kept["subject"].tobytes())
@@ -94,7 +96,8 @@ def _check_shapes(seen: Observations, n_frames: int) -> None:
     """Raises ValueError where the arrays are not of so many frames."""
     wanted = Observations.empty(seen.skeleton, np.zeros(n_frames, np.int64))
     for name in COLUMNS:
-        found, expected = getattr(seen, name), getattr(wanted, name)
+        found = getattr(seen, name)
+        expected = getattr(wanted, name)
         if (found.shape, found.dtype) != (expected.shape, expected.dtype):
             raise ValueError(
                 f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}"
@@ -120,8 +123,10 @@ def read_flips(session: Session) -> list[Flip]:
 
 def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
     """The origin of a session, as it was told when the session was first written."""
-    about, camera = session.metadata, session.metadata["camera"]
-    source, home = about["input"], {"name", "joints", "bones", "home_length_mm"}
+    about = session.metadata
+    camera = session.metadata["camera"]
+    source = about["input"]
+    home = {"name", "joints", "bones", "home_length_mm"}
     return Provenance(
         name=session.name,
         skeleton=skeleton,
@@ -152,10 +157,8 @@ def _camera_gaps(session: Session) -> list[Gap]:
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
     found = []
     for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
-        at, missing = (
-            int(times[np.searchsorted(index, row["start_frame"])]),
-            int(row["n_frames_missing"]),
-        )
+        at = int(times[np.searchsorted(index, row["start_frame"])])
+        missing = int(row["n_frames_missing"])
         first = at - round(1e9 * (row["stop_s"] - row["start_s"])) if missing else at
         found.append(
             Gap(

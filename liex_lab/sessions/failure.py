@@ -1,4 +1,6 @@
-"""What a session leaves behind that could not be measured: failed.json, with the reason and what to do about it."""
+"""What a session leaves behind that could not be measured: failed.json, with the reason and what to
+do about it.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _REPORT = "report it to the makers of liex_lab with the lines under traceback"
 
 
 def describe_failure(error: BaseException, stage: str, frame: int | None) -> dict[str, Any]:
-    """What is to be said about an error. stage: what was being done; frame: the last one that was measured, if any."""
+    """What is to be said about an error. stage: what was being done; frame: the last one that was
+    measured, if any.
+    """
     ours = not isinstance(error, LiexError | OSError | MemoryError)
     if isinstance(error, LiexError):
         reason, _, remedy = str(error).rpartition("; ")
@@ -28,12 +32,11 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
         reason = f"the system refused{where}: {error.strerror or error}"
         remedy = "make room, correct the permissions or mend the drive, and try again"
     elif isinstance(error, MemoryError):
-        reason, remedy = (
-            "the memory was not enough",
-            "give each worker more memory, or use fewer workers",
-        )
+        reason = "the memory was not enough"
+        remedy = "give each worker more memory, or use fewer workers"
     else:
-        reason, remedy = f"{type(error).__name__}: {error}", _REPORT
+        reason = f"{type(error).__name__}: {error}"
+        remedy = _REPORT
     told: dict[str, Any] = {
         "stage": stage,
         "frame": frame,
@@ -68,7 +71,9 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def read_failure(folder: Path) -> dict[str, Any] | None:
-    """The failed.json in a folder, None where there is none; a damaged one says so as its reason."""
+    """The failed.json in a folder, None where there is none; a damaged one says so as its
+    reason.
+    """
     path = folder / FAILED_FILE
     if not path.is_file():
         return None

@@ -1,4 +1,6 @@
-"""Logs that were written in parts, for the work was interrupted, made one: bytes are copied, nothing is unpacked."""
+"""Logs that were written in parts, for the work was interrupted, made one: bytes are copied,
+nothing is unpacked.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,16 @@ from liex_lab.sessions.renumbering import Known, renumber
 Parts = Sequence[tuple[Path, int | None]]  # the bytes of each that count, None for all
 _FIRST_CHUNKS = 8  # within so many a part's channels of depth are named
 
-RRD_HEAD, _RRD_END = 12, 0  # magic, version and options; the kind of the message that ends a stream
+# magic, version and options; the kind of the message that ends a stream
+RRD_HEAD = 12
+_RRD_END = 0
 _CHUNK_HEAD = 8 + 8 + 8 + 4  # start and end time, size, check sum; then the name of the compression
 _BLOCK = 1 << 22
 
 
 def rrd_messages(file: IO[bytes], size: int, start: int = RRD_HEAD) -> Iterator[tuple[int, int]]:
-    """(offset, bytes) of the messages of an .rrd file from `start` on, up to its end message if it has one.
+    """(offset, bytes) of the messages of an .rrd file from `start` on, up to its end message if it
+    has one.
 
     Raises SessionError where a message goes beyond `size`.
     """
@@ -57,7 +62,9 @@ def rrd_messages(file: IO[bytes], size: int, start: int = RRD_HEAD) -> Iterator[
 
 
 def join_rrd(parts: Parts, out: Path) -> None:
-    """One .rrd with the messages of all parts; without their indexes, which count from each part's beginning."""
+    """One .rrd with the messages of all parts; without their indexes, which count from each part's
+    beginning.
+    """
     with out.open("wb") as whole:
         for k, (path, size) in enumerate(parts):
             with path.open("rb") as file:
@@ -71,7 +78,9 @@ def join_rrd(parts: Parts, out: Path) -> None:
 
 
 def join_mcap(parts: Parts, out: Path) -> None:
-    """One MCAP file with the chunks of all parts; the last one is whole and gets its channels numbered as the first."""
+    """One MCAP file with the chunks of all parts; the last one is whole and gets its channels
+    numbered as the first.
+    """
     last = parts[-1][0]
     known = _known_to(last)
     if not _numbered_alike(parts[0], known):
@@ -93,15 +102,19 @@ def join_mcap(parts: Parts, out: Path) -> None:
 def _chunks_of(
     file: IO[bytes], end: int, at_out: int, indexes: list[ChunkIndex], counts: dict[int, int]
 ) -> tuple[int, int]:
-    """Where the chunks of a part begin and end; `indexes` gets theirs, as they will be in the joined file."""
-    at, first = len(MCAP0_MAGIC), 0
+    """Where the chunks of a part begin and end; `indexes` gets theirs, as they will be in the
+    joined file.
+    """
+    at = len(MCAP0_MAGIC)
+    first = 0
     while at + 9 <= end:
         file.seek(at)
         opcode, length = struct.unpack("<BQ", file.read(9))
         shift = at_out - first if at_out else 0
         if opcode == Opcode.CHUNK:
             if at_out and not first:
-                first, shift = at, at_out - at
+                first = at
+                shift = at_out - at
             indexes.append(_chunk_index(file, at + shift, 9 + length))
         elif opcode == Opcode.MESSAGE_INDEX:
             index = MessageIndex.read(ReadDataStream(file))
@@ -143,7 +156,9 @@ def _numbered_alike(first: tuple[Path, int | None], known: Known) -> bool:
 
 
 def _first_known(path: Path, size: int | None) -> Known:
-    """Schemas and channels that the first chunks of a part name, whole or not; a channel is named where it begins."""
+    """Schemas and channels that the first chunks of a part name, whole or not; a channel is named
+    where it begins.
+    """
     end = path.stat().st_size if size is None else size
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -193,7 +208,9 @@ def _finish_mcap(
     end = RecordBuilder()
     DataEnd(0).write(end)
     whole.write(end.end())
-    start, builder, offsets = whole.tell(), RecordBuilder(), []
+    start = whole.tell()
+    builder = RecordBuilder()
+    offsets = []
     statistics = Statistics(
         attachment_count=0,
         channel_count=len(channels),

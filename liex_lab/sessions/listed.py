@@ -1,4 +1,6 @@
-"""How a study's sessions are listed for those who look at them: what both jobs and views may know of each."""
+"""How a study's sessions are listed for those who look at them: what both jobs and views may know
+of each.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ WHO = ("subject_id", "group", "cage", "sex", "batch")
 
 @dataclass(frozen=True)
 class Entry:
-    """A session as the study lists it. key: its name in the study; folder: None where it was not measured.
+    """A session as the study lists it. key: its name in the study; folder: None where it was not
+    measured.
 
     who: those of `WHO` that are known.
     """

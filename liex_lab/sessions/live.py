@@ -19,7 +19,9 @@ _DEPTH_EVERY = 5  # frames; a picture takes longer to send than a skeleton
 
 
 class LiveView:
-    """A stream of depth and skeletons: into a viewer of this machine ('viewer'), one at an address, or a file .rrd."""
+    """A stream of depth and skeletons: into a viewer of this machine ('viewer'), one at an address,
+    or a file .rrd.
+    """
 
     def __init__(
         self, name: str, camera: Camera, T_arena_camera: SE3, skeleton: Skeleton, to: str

@@ -1,4 +1,6 @@
-"""One process at a time: a lock on a file that the system takes back when its holder ends, however it ends."""
+"""One process at a time: a lock on a file that the system takes back when its holder ends, however
+it ends.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,11 @@ from liex_lab.errors import SessionError
 
 
 def take_lock(path: Path) -> IO[bytes] | None:
-    """Hold `path`, made if needed; None where another process holds it. Close the file to let go of it.
+    """Hold `path`, made if needed; None where another process holds it. Close the file to let go of
+    it.
 
-    A folder that was renamed or removed in between is no longer the one that was asked for: None, too.
+    A folder that was renamed or removed in between is no longer the one that was asked for: None,
+    too.
     """
     file = path.open("ab")
     try:
@@ -31,7 +35,9 @@ def take_lock(path: Path) -> IO[bytes] | None:
 
 @contextmanager
 def locked(path: Path, held: str) -> Iterator[None]:
-    """Hold `path` within the block. Raises SessionError with `held`, half a sentence, where another one does."""
+    """Hold `path` within the block. Raises SessionError with `held`, half a sentence, where another
+    one does.
+    """
     file = take_lock(path)
     if file is None:
         raise SessionError(f"{held}; wait until it is done, or end it")

@@ -1,6 +1,8 @@
-"""The MCAP file for Foxglove: depth, camera, skeleton, transforms and action states, lengths in metres.
+"""The MCAP file for Foxglove: depth, camera, skeleton, transforms and action states, lengths in
+metres.
 
-Depth streams in as it comes; everything small is written at the end from the same track the tables are made of.
+Depth streams in as it comes; everything small is written at the end from the same track the tables
+are made of.
 """
 
 from __future__ import annotations
@@ -53,12 +55,16 @@ _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
 
 class McapWriter:
-    """Writes `session.mcap`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`."""
+    """Writes `session.mcap`. Call `add` for the depth of consecutive frames, then `finish` once, or
+    `abandon`.
+    """
 
     def __init__(
         self, path: Path, origin: Provenance, *, level: int = 0, chunk_size: int = 128 * 1024
     ) -> None:
-        """level: of compression, 0 for the usual one, 22 for the smallest file; chunk_size: bytes packed at once."""
+        """level: of compression, 0 for the usual one, 22 for the smallest file; chunk_size: bytes
+        packed at once.
+        """
         self._origin = origin
         self._context = (
             foxglove.Context()
@@ -133,7 +139,9 @@ class McapWriter:
                 self._transforms.log(messages.FrameTransforms(transforms=[root]), log_time=time_ns)
 
     def flushed(self) -> int:
-        """Hand everything to the system; returns the file's bytes. Raises what the system said against it."""
+        """Hand everything to the system; returns the file's bytes. Raises what the system said
+        against it.
+        """
         self._writer.flush()
         self._file.flush()
         self._file.check()
@@ -146,8 +154,11 @@ class McapWriter:
         self._file.check()
 
     def _log_camera(self, time_ns: int) -> None:
-        """Calibration and the camera's place, about once a second, so that a viewer may start anywhere."""
-        camera, place = self._origin.camera, self._origin.T_arena_camera
+        """Calibration and the camera's place, about once a second, so that a viewer may start
+        anywhere.
+        """
+        camera = self._origin.camera
+        place = self._origin.T_arena_camera
         self._calibrated_ns = time_ns
         k = camera.matrix
         calibration = messages.CameraCalibration(
@@ -164,7 +175,9 @@ class McapWriter:
         self._transforms.log(messages.FrameTransforms(transforms=[transform]), log_time=time_ns)
 
     def _scene_update(self, time_ns: int, joints_m: Array, seen: bool) -> messages.SceneUpdate:
-        """Bones as lines and joints as spheres under one entity id; the entity goes when the animal is lost."""
+        """Bones as lines and joints as spheres under one entity id; the entity goes when the animal
+        is lost.
+        """
         stamp = _stamp(time_ns)
         if not seen:
             gone = messages.SceneEntityDeletion(
@@ -243,7 +256,9 @@ class McapWriter:
 
 
 class _WatchedFile:
-    """A file for Foxglove's writer, which goes on without a word when the disk is full: this one remembers."""
+    """A file for Foxglove's writer, which goes on without a word when the disk is full: this one
+    remembers.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")

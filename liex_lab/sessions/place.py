@@ -32,16 +32,20 @@ def check_place(path: Path, overwrite: bool) -> None:
         return  # what failed before may be replaced
     if not (path / "session.json").is_file():
         raise SessionError(
-            f"{path} exists and is not a session, so it is left alone; choose another place with --out"
+            f"{path} exists and is not a session, so it is left alone; choose another place with "
+            "--out"
         )
     if not overwrite:
         raise SessionError(
-            f"the session {path} exists already; choose another place with --out, or say --overwrite"
+            f"the session {path} exists already; choose another place with --out, or say "
+            "--overwrite"
         )
 
 
 def file_facts(folder: Path, logs: Mapping[str, Path]) -> dict[str, Any]:
-    """Bytes and SHA-256 of the tables and of what is small, bytes of the logs, for `liex verify`."""
+    """Bytes and SHA-256 of the tables and of what is small, bytes of the logs, for `liex
+    verify`.
+    """
     found: dict[str, Any] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix in _HASHED and path.name not in OWN:

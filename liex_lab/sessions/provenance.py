@@ -1,4 +1,6 @@
-"""What a session says about its origin: recording, camera, animal, plan, software, and the cost of the run."""
+"""What a session says about its origin: recording, camera, animal, plan, software, and the cost of
+the run.
+"""
 
 from __future__ import annotations
 
@@ -45,13 +47,15 @@ _PACKAGES = (
 class Provenance:
     """What is known about a recording before its first frame is written.
 
-    name: the session's id; individual: the animal's name in it; T_arena_camera and floor_distance_mm: the camera's
-    place above the floor; input_sha256: of the recording's bytes; profile: how its stored numbers were read, where a
-    profile says so; plan_toml: the plan as resolved; n_frames: expected, None when unknown; gaps: what the camera did
-    not deliver, and stamps that were moved; problems: sentences about the recording; subject: any of subject_id, group,
-    cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its origin; optics: what was undone
-    of lens and water, for then `camera` is the ideal one; arena: the shape of the floor; zones: those that a person has
-    drawn on it; replay_depth, replay_candidates: what the replay is to hold.
+    name: the session's id; individual: the animal's name in it; T_arena_camera and
+    floor_distance_mm: the camera's place above the floor; input_sha256: of the recording's bytes;
+    profile: how its stored numbers were read, where a profile says so; plan_toml: the plan as
+    resolved; n_frames: expected, None when unknown; gaps: what the camera did not deliver, and
+    stamps that were moved; problems: sentences about the recording; subject: any of subject_id,
+    group, cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its
+    origin; optics: what was undone of lens and water, for then `camera` is the ideal one; arena:
+    the shape of the floor; zones: those that a person has drawn on it; replay_depth,
+    replay_candidates: what the replay is to hold.
     """
 
     name: str
@@ -82,8 +86,11 @@ class Provenance:
     def of(
         recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any
     ) -> Provenance:
-        """The facts of a recording, the floor it was taken above and the plan; `more` are further fields."""
-        told, stated = recording.metadata, plan.session
+        """The facts of a recording, the floor it was taken above and the plan; `more` are further
+        fields.
+        """
+        told = recording.metadata
+        stated = plan.session
         subject = {
             "subject_id": stated.subject_id or told.get("subject_id"),
             "group": stated.group,
@@ -132,7 +139,10 @@ class Provenance:
             "schema_version": SCHEMA_VERSION,
             "calibration_hash": self.calibration_hash,
             "model_hash": self.model.get("sha256", ""),
-            "axes": "arena: x, y on the floor, z up from it; origin at the foot of the camera's perpendicular; mm",
+            "axes": (
+                "arena: x, y on the floor, z up from it; origin at the foot of the camera's "
+                "perpendicular; mm"
+            ),
             "joints": "on the body's mid-axis",
         }
 

@@ -18,6 +18,6 @@ def reading_from(path: Path) -> Iterator[Path]:
         raise
     except Exception as error:
         raise SessionError(
-            f"{path} is damaged and cannot be read ({type(error).__name__}: {one_line(error)}); run `liex run` on the "
-            "recording again"
+            f"{path} is damaged and cannot be read ({type(error).__name__}: {one_line(error)}); "
+            "run `liex run` on the recording again"
         ) from None

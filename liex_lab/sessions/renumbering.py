@@ -17,7 +17,8 @@ Known = tuple[list[Schema], list[Channel]]
 
 
 def renumber(path: Path, first: Known, last: Known, out: Path) -> Known:
-    """Write the MCAP file `path`, which knows what `last` holds, to `out` in the numbers of `first`; returns all known.
+    """Write the MCAP file `path`, which knows what `last` holds, to `out` in the numbers of
+    `first`; returns all known.
 
     What only the last part knows gets numbers of its own.
     """
@@ -55,8 +56,11 @@ def renumber(path: Path, first: Known, last: Known, out: Path) -> Known:
 
 
 def _joined(first: list, last: list, name: str) -> tuple[list, dict[int, int]]:
-    """All records, those of `last` that `first` does not have with new ids; and the new id of each one of `last`."""
-    joined, ids = {getattr(one, name): one for one in first}, {}
+    """All records, those of `last` that `first` does not have with new ids; and the new id of each
+    one of `last`.
+    """
+    joined = {getattr(one, name): one for one in first}
+    ids = {}
     for one in last:
         key = getattr(one, name)
         if key not in joined:

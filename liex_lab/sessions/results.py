@@ -1,4 +1,6 @@
-"""Everything tabular of a session, written into a folder: from a track, and from what was measured of it."""
+"""Everything tabular of a session, written into a folder: from a track, and from what was measured
+of it.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ class Results:
 
     def write_track(self, folder: Path) -> None:
         """The tables of the track itself: frames, poses, rotations, gaps, flips, sessions."""
-        rows, described = self.rows, self.origin.table_metadata()
+        rows = self.rows
+        described = self.origin.table_metadata()
         own: dict[str, Any] = {
             "frames": rows.frames(),
             "poses": rows.poses(),
@@ -45,7 +48,9 @@ class Results:
     def write_measured(
         self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]
     ) -> None:
-        """The tables of behaviour, summary.csv, and columns.json, which describes every table there is."""
+        """The tables of behaviour, summary.csv, and columns.json, which describes every table there
+        is.
+        """
         described = self.origin.table_metadata()
         for name, result in results.items():
             schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
@@ -65,7 +70,9 @@ class Results:
 
     def session_row(self) -> dict[str, Any]:
         """The row of the table `sessions`."""
-        rows, track, subject = self.rows, self.rows.track, self.origin.subject
+        rows = self.rows
+        track = self.rows.track
+        subject = self.origin.subject
         step = median_step(rows.time_s)
         return {
             "session_id": rows.session_id,
@@ -85,7 +92,9 @@ class Results:
 
     def counts(self) -> dict[str, Any]:
         """How many frames there are, and how they were measured: `frames` of session.json."""
-        rows, track, row = self.rows, self.rows.track, self.session_row()
+        rows = self.rows
+        track = self.rows.track
+        row = self.session_row()
         flags = {flag or "good": int(np.sum(track.flag == flag)) for flag in np.unique(track.flag)}
         return {
             "n_frames": track.n_frames,

@@ -1,6 +1,8 @@
-"""The Rerun replay: depth, skeleton, scalars and actions on the timelines `frame` and `time`, in a scene of metres.
+"""The Rerun replay: depth, skeleton, scalars and actions on the timelines `frame` and `time`, in a
+scene of metres.
 
-Depth streams in as it comes; everything small is written at the end from the same track the tables are made of.
+Depth streams in as it comes; everything small is written at the end from the same track the tables
+are made of.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ ROOT = "arena/root"
 UNCERTAINTY = "arena/uncertainty"
 FLOOR = "arena/floor"
 CANDIDATES = "arena/candidates"
-ACTIONS, TRACKING = "ethogram/predicted", "ethogram/tracking"
+ACTIONS = "ethogram/predicted"
+TRACKING = "ethogram/tracking"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
 _PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
 _NOISY_PNG = (
@@ -48,12 +51,15 @@ _NOISY_PNG = (
     17,
     2,
 )  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
-# pictures, and their bytes, in one message: for each message the index that ends the file takes some 5 kB of memory
-_TOGETHER, _TOGETHER_BYTES = 64, 1 << 23
+# pictures, and their bytes, in one message: for each message the index that ends the file takes
+# some 5 kB of memory
+_TOGETHER = 64
+_TOGETHER_BYTES = 1 << 23
 _BLOCK = 8192  # frames of small things sent in one go
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
-# Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them in order.
+# Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them
+# in order.
 PALETTE = (
     0xEE6677,
     0xCCBB44,
@@ -74,17 +80,20 @@ _FLAG_COLOURS = {
     "no_depth": 0xBBBBBB,
     "corrected": 0x4477AA,
 }
-_WALL, _WORST = 0x9AA0A6, 12
+_WALL = 0x9AA0A6
+_WORST = 12
 _HOLDS_95 = 2.795  # standard deviations of a Gaussian in space
 _SPREAD = [255, 170, 60, 140]
-_BONE, _JOINT = [255, 255, 255, 255], [255, 80, 60, 255]
+_BONE = [255, 255, 255, 255]
+_JOINT = [255, 80, 60, 255]
 
 
 class ReplayWriter:
-    """Writes `session.rrd`. Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`.
+    """Writes `session.rrd`. Call `add` for the depth of consecutive frames, then `finish` once, or
+    `abandon`.
 
-    corrected: a replay of what people corrected, to be shown with that one: it has neither depth nor the scene, and its
-    own entities (see `corrected_entity`).
+    corrected: a replay of what people corrected, to be shown with that one: it has neither depth
+    nor the scene, and its own entities (see `corrected_entity`).
     """
 
     def __init__(
@@ -100,7 +109,10 @@ class ReplayWriter:
         )
         stream.set_log_time_enabled(False)
         self._stream: Any = _Renamed(stream) if corrected else stream
-        self._path, self._n_sent, self._checked, self._n_found = path, 0, 0, 0
+        self._path = path
+        self._n_sent = 0
+        self._checked = 0
+        self._n_found = 0
         self._stream.save(path)
         if blueprint is not None:
             self._stream.send_blueprint(blueprint)
@@ -112,7 +124,9 @@ class ReplayWriter:
         self._first_ns = first_ns
 
     def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
-        """Depth (H, W) uint16 mm of consecutive frames; nothing where the replay is to be without depth."""
+        """Depth (H, W) uint16 mm of consecutive frames; nothing where the replay is to be without
+        depth.
+        """
         if not self._origin.replay_depth:
             return
         if self._first_ns is None:
@@ -147,11 +161,13 @@ class ReplayWriter:
         problems: Sequence[str],
         candidates: Observations | None = None,
     ) -> None:
-        """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the ethogram's vocabulary;
-        candidates: what single frames thought possible, where that is to be seen, too.
+        """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the
+        ethogram's vocabulary; candidates: what single frames thought possible, where that is to be
+        seen, too.
         """
         self._send_depth()
-        index, elapsed = rows.frame_index, rows.track.times_ns - rows.track.times_ns[:1]
+        index = rows.frame_index
+        elapsed = rows.track.times_ns - rows.track.times_ns[:1]
         self._log_skeleton(rows, index, elapsed)
         self._log_root(rows, index, elapsed)
         if candidates is not None:
@@ -195,7 +211,8 @@ class ReplayWriter:
         self.abandon()
 
     def flushed(self) -> int:
-        """Hand everything to the system; returns the file's bytes. Raises SessionError where something is missing.
+        """Hand everything to the system; returns the file's bytes. Raises SessionError where
+        something is missing.
 
         Rerun does not tell when the disk is full, so the messages on disk are counted.
         """
@@ -204,7 +221,8 @@ class ReplayWriter:
         size = self._path.stat().st_size
         with self._path.open("rb") as file:
             for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
-                self._checked, self._n_found = at + length, self._n_found + 1
+                self._checked = at + length
+                self._n_found = self._n_found + 1
         if self._n_found < self._n_sent:
             raise SessionError(
                 "the replay was not written whole; make room on the disk and run it again"
@@ -217,7 +235,8 @@ class ReplayWriter:
         self._stream.disconnect()
 
     def _log_scene(self) -> None:
-        camera, T_arena_camera = self._origin.camera, self._origin.T_arena_camera
+        camera = self._origin.camera
+        T_arena_camera = self._origin.T_arena_camera
         self._stream.log("arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         pose = rr.Transform3D(
             translation=T_arena_camera.translation / 1000.0, mat3x3=T_arena_camera.rotation
@@ -242,7 +261,9 @@ class ReplayWriter:
                 self._stream.log(f"{OVERLAY}/{where}", in_picture, static=True)
 
     def _outlines(self) -> list[tuple[str, Array, int]]:
-        """The walls, whose name is empty, and the zones on the floor: name, corners (n, 2) mm, colour."""
+        """The walls, whose name is empty, and the zones on the floor: name, corners (n, 2) mm,
+        colour.
+        """
         walls = self._origin.arena.outline_mm()
         zones = zip(self._origin.zones, cycle(PALETTE), strict=False)
         drawn = [(zone.name, zone.outline_mm(), colour) for zone, colour in zones]
@@ -262,8 +283,11 @@ class ReplayWriter:
     def _log_skeleton(
         self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]
     ) -> None:
-        """Joints and bones in the arena, and over the picture; a frame without a pose shows none."""
-        track, skeleton = rows.track, rows.track.skeleton
+        """Joints and bones in the arena, and over the picture; a frame without a pose shows
+        none.
+        """
+        track = rows.track
+        skeleton = rows.track.skeleton
         names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
         bones = rr.ClassDescription(
             info=rr.AnnotationInfo(id=1, label=skeleton.name, color=_BONE),
@@ -294,7 +318,8 @@ class ReplayWriter:
         girth = float(self._origin.animal_size.get("girth", 1.0))
         carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
         for part in blocks(track.n_frames, _BLOCK):
-            when, seen = _timeline(index[part], elapsed[part]), track[part].posed
+            when = _timeline(index[part], elapsed[part])
+            seen = track[part].posed
             self._send_points(
                 SKELETON,
                 when,
@@ -321,8 +346,11 @@ class ReplayWriter:
         dot: Any,
         line: Any,
     ) -> None:
-        """Points (k, J, 2 or 3) of the k frames that are `seen` out of those of `when`, as dots and as bones."""
-        skeleton, size = self._origin.skeleton, points.shape[-1]
+        """Points (k, J, 2 or 3) of the k frames that are `seen` out of those of `when`, as dots and
+        as bones.
+        """
+        skeleton = self._origin.skeleton
+        size = points.shape[-1]
         edges = np.array(skeleton.edges, np.int64).reshape(-1, 2)
         dots = dot.columns(
             positions=points.reshape(-1, size),
@@ -330,14 +358,17 @@ class ReplayWriter:
             keypoint_ids=np.tile(np.arange(skeleton.n_joints, dtype=np.uint16), len(points)),
         )
         strips = line.columns(strips=points[:, edges].reshape(-1, 2, size).astype(np.float32))
-        n_dots, n_bones = np.where(seen, skeleton.n_joints, 0), np.where(seen, len(edges), 0)
+        n_dots = np.where(seen, skeleton.n_joints, 0)
+        n_bones = np.where(seen, len(edges), 0)
         self._stream.send_columns(f"{entity}/joints", when, [*dots.partition(n_dots)])
         self._stream.send_columns(f"{entity}/bones", when, [*strips.partition(n_bones)])
 
     def _send_spheres(
         self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]
     ) -> None:
-        """Around each joint (k, J, 3) of the k frames `seen` a sphere that holds it with 95 %; sd_mm (k, J)."""
+        """Around each joint (k, J, 3) of the k frames `seen` a sphere that holds it with 95 %;
+        sd_mm (k, J).
+        """
         size = np.repeat(_HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 1), 3, axis=1) / MM_PER_UNIT
         spheres = rr.Ellipsoids3D.columns(
             half_sizes=size, centers=joints_mm.reshape(-1, 3) / MM_PER_UNIT
@@ -346,7 +377,9 @@ class ReplayWriter:
         self._stream.send_columns(UNCERTAINTY, when, [*spheres.partition(n_spheres)])
 
     def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
-        """The frame of the body's base; while the animal is lost it stays where it was seen last."""
+        """The frame of the body's base; while the animal is lost it stays where it was seen
+        last.
+        """
         track = rows.track
         seen = track.posed
         if not seen.any():
@@ -407,7 +440,9 @@ class ReplayWriter:
         )
         end = (int(rows.frame_index[-1]) + 1, float(stop_times(rows.time_s)[-1]))
         self._log_lane(ACTIONS, spans, dict(zip(words, cycle(PALETTE), strict=False)), end)
-        count, time, stop = frame_count(rows.frame_index), rows.time_s, stop_times(rows.time_s)
+        count = frame_count(rows.frame_index)
+        time = rows.time_s
+        stop = stop_times(rows.time_s)
         marked = [
             (int(count[a]), int(count[b]), float(time[a]), float(stop[b - 1]), str(flag))
             for a, b, flag in stretches(rows.track.flag)
@@ -441,7 +476,9 @@ class ReplayWriter:
 
 
 def corrected_entity(entity: str) -> str:
-    """Where the replay of corrections keeps what the session's own keeps at `entity`: below the same camera."""
+    """Where the replay of corrections keeps what the session's own keeps at `entity`: below the
+    same camera.
+    """
     for above in (f"{IMAGE}/", "arena/"):
         if entity.startswith(above):
             return f"{above}corrected/{entity.removeprefix(above)}"
@@ -465,8 +502,9 @@ class _Renamed:
 
 
 def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
-    """A depth picture (H, W) without loss, and how: RVL, which takes half of what raw pictures do and is quick; where
-    noise makes that large, PNG if it is smaller (Huffman's code alone: noise has no runs to look for).
+    """A depth picture (H, W) without loss, and how: RVL, which takes half of what raw pictures do
+    and is quick; where noise makes that large, PNG if it is smaller (Huffman's code alone: noise
+    has no runs to look for).
     """
     import cv2
 
@@ -479,7 +517,9 @@ def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
 
 
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
-    """Depth in mm between which the colours spread: the floor as the first frame shows it, and 80 mm above it."""
+    """Depth in mm between which the colours spread: the floor as the first frame shows it, and 80
+    mm above it.
+    """
     read = depth[depth > 0]
     near, far = (
         np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)

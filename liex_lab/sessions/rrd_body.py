@@ -1,4 +1,6 @@
-"""The body in the replay: its surface in rigid parts, each carried by a joint; a frame costs a few transforms."""
+"""The body in the replay: its surface in rigid parts, each carried by a joint; a frame costs a few
+transforms.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ _SKIN = [176, 190, 205, 150]
 
 @dataclass(frozen=True)
 class BodyPart:
-    """A piece of the surface in the frame of the joint that carries it: vertices (V, 3) mm at scale 1, faces (F, 3),
-    normals (V, 3).
+    """A piece of the surface in the frame of the joint that carries it: vertices (V, 3) mm at scale
+    1, faces (F, 3), normals (V, 3).
     """
 
     joint: int
@@ -34,13 +36,16 @@ class BodyPart:
 
 
 def body_parts(skeleton: Skeleton, girth: float = 1.0) -> list[BodyPart]:
-    """The trunk of the default animal at home, cut at its joints; each part reaches one ring of faces farther, so that
-    a bent body shows no gap. girth: of the animal, over what is usual for its length.
+    """The trunk of the default animal at home, cut at its joints; each part reaches one ring of
+    faces farther, so that a bent body shows no gap. girth: of the animal, over what is usual for
+    its length.
     """
-    surface, home = Surface.of(skeleton), Pose.home(skeleton)
+    surface = Surface.of(skeleton)
+    home = Pose.home(skeleton)
     faces = surface.faces[: surface.n_trunk_faces].astype(np.int64)
     vertices = surface.vertices(home, girth=girth, parallel=False)
-    frames, normals = home.frames(skeleton), _normals(vertices, faces)
+    frames = home.frames(skeleton)
+    normals = _normals(vertices, faces)
     carrier = _carriers(skeleton, vertices)
     parts = []
     for joint in np.unique(carrier[faces]).tolist():
@@ -104,7 +109,8 @@ def send_body(stream: Any, track: Track, rows: slice, when: list[Any], carriers:
     pose = Pose(part.root, part.angles_rad, part.scale)[seen]
     frames = pose.frames(track.skeleton)
     for joint in carriers:
-        place, xyzw = np.zeros((len(seen), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1))
+        place = np.zeros((len(seen), 3))
+        xyzw = np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1))
         place[seen] = frames.translation[:, joint] / 1000.0
         xyzw[seen] = np.roll(so3.quaternion(frames.rotation[:, joint]), -1, axis=-1)
         size = np.where(seen, np.nan_to_num(part.scale), 0.0)

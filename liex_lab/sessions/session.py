@@ -60,7 +60,9 @@ _OPTIONAL = {
 
 
 class Session:
-    """The results of one recording, read from its folder when asked for. Tables are pandas data frames."""
+    """The results of one recording, read from its folder when asked for. Tables are pandas data
+    frames.
+    """
 
     def __init__(self, path: Path, metadata: dict[str, Any], log: Log | None = None) -> None:
         self.path = path
@@ -71,7 +73,8 @@ class Session:
     def open(path: str | Path, *, raw: bool = False) -> Session:
         """The session in the folder `path`, checked for its version and for missing files.
 
-        raw: as it was measured, without what people corrected (see `liex_lab.sessions.corrections`).
+        raw: as it was measured, without what people corrected (see
+        `liex_lab.sessions.corrections`).
         """
         folder = Path(path)
         document = folder / "session.json"
@@ -90,8 +93,8 @@ class Session:
             ) from None
         if found > SCHEMA_VERSION:
             raise SessionError(
-                f"{folder} was written by a newer liex_lab (session schema {found}, this one reads up to "
-                f"{SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
+                f"{folder} was written by a newer liex_lab (session schema {found}, this one reads "
+                f"up to {SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
             )
         for name in FILES:
             if name not in _OPTIONAL and not (folder / name).is_file():
@@ -108,7 +111,9 @@ class Session:
             return str(self.metadata["session_id"])
 
     def file(self, name: str) -> Path:
-        """Where a file of the session lies: the corrected one where there is one, else the session's own."""
+        """Where a file of the session lies: the corrected one where there is one, else the
+        session's own.
+        """
         return corrected_folder(self.path) / name if name in self.log.files else self.path / name
 
     def has(self, name: str) -> bool:
@@ -158,7 +163,8 @@ class Session:
         path = self.file("summary.csv")
         if not path.is_file():
             raise SessionError(
-                f"the session {self.path} has no summary.csv; it was written without behaviour measures"
+                f"the session {self.path} has no summary.csv; it was written without behaviour "
+                "measures"
             )
         with reading_from(path):
             table = pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
@@ -174,7 +180,9 @@ class Session:
 
     @cached_property
     def camera(self) -> Camera:
-        """The depth camera, an ideal one in air; `metadata["camera"]["optics"]` says what was undone for that."""
+        """The depth camera, an ideal one in air; `metadata["camera"]["optics"]` says what was
+        undone for that.
+        """
         with reading_from(self.path / "session.json"):
             return Camera.from_dict(self.metadata["camera"])
 
@@ -203,8 +211,8 @@ class Session:
             return path.read_text(encoding="utf-8")
 
     def narrowed(self, **wanted: Sequence[str]) -> Session:
-        """The same session of whose named tables no more is read than these columns, as far as it has them: of hours of
-        recording all of them take much memory.
+        """The same session of whose named tables no more is read than these columns, as far as it
+        has them: of hours of recording all of them take much memory.
         """
         import pyarrow.parquet as pq
 
@@ -222,7 +230,9 @@ class Session:
     def table(
         self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
     ) -> pd.DataFrame:
-        """A table by its name; of a long one perhaps only some columns, and the rows of some frames."""
+        """A table by its name; of a long one perhaps only some columns, and the rows of some
+        frames.
+        """
         import pandas as pd
 
         path = self.file(f"{name}.parquet")
@@ -248,7 +258,9 @@ def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
 
 
 def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
-    """The rows of some frames of a long table, of which no more than a group of rows is in memory."""
+    """The rows of some frames of a long table, of which no more than a group of rows is in
+    memory.
+    """
     import pandas as pd
     import pyarrow.parquet as pq
 
@@ -265,7 +277,9 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
 
 
 def _keep_inside(metadata: dict[str, Any]) -> None:
-    """Sections that others rely on have the right kind; the pictures that it names are in the session's own folder."""
+    """Sections that others rely on have the right kind; the pictures that it names are in the
+    session's own folder.
+    """
     for name, kind in {"session_id": str, "camera": dict, "animal": dict}.items():
         if name in metadata and not isinstance(metadata[name], kind):
             raise TypeError(name)

@@ -1,7 +1,8 @@
-"""Stretches of a recording that other processes look at, side by side: each is written whole in a folder of its own.
+"""Stretches of a recording that other processes look at, side by side: each is written whole in a
+folder of its own.
 
-They lie inside the unfinished session until it takes them over, in order. A stretch may be written twice, by a worker
-that died and another one: it becomes whole by a rename, and both say the same.
+They lie inside the unfinished session until it takes them over, in order. A stretch may be written
+twice, by a worker that died and another one: it becomes whole by a rename, and both say the same.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from liex_lab.sessions.writer import seen_rows
 if TYPE_CHECKING:
     from liex_lab.recordings.frame import DepthFrame
 
-_SIZES, _SEEN = "stretch.json", "seen"
+_SIZES = "stretch.json"
+_SEEN = "seen"
 
 
 def stretch_folder(unfinished: Path, start: int, stop: int) -> Path:
-    """Where frames start to stop (exclusive) of the unfinished session in a folder lie when they are whole."""
+    """Where frames start to stop (exclusive) of the unfinished session in a folder lie when they
+    are whole.
+    """
     return unfinished / STRETCHES / f"{start:09d}-{stop:09d}"
 
 
@@ -41,26 +45,32 @@ def is_whole(folder: Path) -> bool:
 
 
 def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
-    """Make a whole stretch the next part of an unfinished session, which has n_frames frames then."""
+    """Make a whole stretch the next part of an unfinished session, which has n_frames
+    frames then.
+    """
     held.seen.append(Columns(folder / _SEEN).read())
     held.take(n_frames, seconds, {log: folder / log for log in LOGS})
     shutil.rmtree(folder, ignore_errors=True)
 
 
 class StretchWriter:
-    """Depth of consecutive frames and what was seen in them. In a `with` block: whole at its end, or not there."""
+    """Depth of consecutive frames and what was seen in them. In a `with` block: whole at its end,
+    or not there.
+    """
 
     def __init__(self, folder: Path, origin: Provenance, first_ns: int | None) -> None:
         """first_ns: when the recording's first frame was; None where that is in this stretch."""
         from liex_lab.sessions.mcap import McapWriter
         from liex_lab.sessions.rrd import ReplayWriter
 
-        self._whole, self._folder = folder, folder.with_name(f".{folder.name}.{os.getpid()}")
+        self._whole = folder
+        self._folder = folder.with_name(f".{folder.name}.{os.getpid()}")
         shutil.rmtree(self._folder, ignore_errors=True)
         (self._folder / _SEEN).mkdir(parents=True)
         self._seen = Columns(self._folder / _SEEN)
         replay, messages = (self._folder / log for log in LOGS)
-        self._replay, self._mcap = ReplayWriter(replay, origin), McapWriter(messages, origin)
+        self._replay = ReplayWriter(replay, origin)
+        self._mcap = McapWriter(messages, origin)
         if first_ns is not None:
             self._replay.go_on(first_ns)
 
@@ -71,10 +81,8 @@ class StretchWriter:
         """The next frames."""
         from liex_lab.recordings.rvl import to_millimetres
 
-        depth, times = (
-            [to_millimetres(frame.depth) for frame in frames],
-            [int(frame.time_ns) for frame in frames],
-        )
+        depth = [to_millimetres(frame.depth) for frame in frames]
+        times = [int(frame.time_ns) for frame in frames]
         self._replay.add([int(frame.index) for frame in frames], times, depth)
         self._mcap.add(times, depth)
         self._seen.append(seen_rows(frames, seen))

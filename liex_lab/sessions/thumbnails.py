@@ -1,4 +1,6 @@
-"""A few depth pictures kept along the way, cut around the animal, so that the report can show what was fitted."""
+"""A few depth pictures kept along the way, cut around the animal, so that the report can show what
+was fitted.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ class Keepsakes:
             self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
 
     def again(self, n_frames: int, read: Callable[[int], NDArray[np.uint16]]) -> None:
-        """As if the first `n_frames` had been added; `read` gives the depth of one of them by its row."""
+        """As if the first `n_frames` had been added; `read` gives the depth of one of them by its
+        row.
+        """
         for row in range(n_frames):
             if row % self._every == 0:
                 self._kept[row] = np.empty(0, np.uint16)
@@ -48,7 +52,9 @@ class Keepsakes:
         self._seen = n_frames
 
     def save(self, folder: Path, rows: Rows, camera: Camera) -> list[dict[str, Any]]:
-        """Write up to sixteen 16-bit PNG pictures, mm, 0 unread, and say where in the frame each was cut."""
+        """Write up to sixteen 16-bit PNG pictures, mm, 0 unread, and say where in the frame each
+        was cut.
+        """
         import cv2
 
         observed = rows.track.observed
@@ -77,7 +83,8 @@ class Keepsakes:
         return entries
 
     def _cut(self, row: int, rows: Rows, camera: Camera) -> tuple[int, int, NDArray[np.uint16]]:
-        depth, uv = self._kept[row], rows.track.uv_px[row]
+        depth = self._kept[row]
+        uv = rows.track.uv_px[row]
         centre = np.nanmean(uv, axis=0)
         extent = np.nanmax(np.linalg.norm(uv - centre, axis=1))
         near = depth[depth > 0]
@@ -88,13 +95,16 @@ class Keepsakes:
             16.0,
         )
         half_px = int(np.ceil(half))
-        left, top = int(np.round(centre[0])) - half_px, int(np.round(centre[1])) - half_px
+        left = int(np.round(centre[0])) - half_px
+        top = int(np.round(centre[1])) - half_px
         padded = np.zeros(
             (2 * half_px, 2 * half_px), np.uint16
         )  # beyond the picture's edge nothing was read
         height, width = depth.shape
-        x0, x1 = max(left, 0), min(left + 2 * half_px, width)
-        y0, y1 = max(top, 0), min(top + 2 * half_px, height)
+        x0 = max(left, 0)
+        x1 = min(left + 2 * half_px, width)
+        y0 = max(top, 0)
+        y1 = min(top + 2 * half_px, height)
         if x1 > x0 and y1 > y0:
             padded[y0 - top : y1 - top, x0 - left : x1 - left] = depth[y0:y1, x0:x1]
         return left, top, padded

@@ -38,11 +38,15 @@ def skeleton_of(session: Session) -> Skeleton:
 def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     """The track of a session, whole; what an older session does not tell is as in `Track.empty`."""
     skeleton = skeleton or skeleton_of(session)
-    frames, n, j = session.frames, len(session.frames), skeleton.n_joints
-    poses, rotations = session.poses, session.rotations
+    frames = session.frames
+    n = len(session.frames)
+    j = skeleton.n_joints
+    poses = session.poses
+    rotations = session.rotations
     if len(poses) != n * j or len(rotations) != n * (j + 1):
         raise SessionError(
-            f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it again"
+            f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it "
+            "again"
         )
     track = Track.empty(skeleton, frames["time_ns"].to_numpy(np.int64))
     track.joints_mm[:] = _columns(poses, [f"{a}_mm" for a in "xyz"]).reshape(n, j, 3)
@@ -50,7 +54,8 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     track.sd_mm[:] = poses["sd_mm"].to_numpy(float).reshape(n, j)
     turns = _columns(rotations, [f"w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
     spread = _columns(rotations, [f"sd_w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
-    track.angles_rad[:], track.sd_angles_rad[:] = turns[:, 1:], spread[:, 1:]
+    track.angles_rad[:] = turns[:, 1:]
+    track.sd_angles_rad[:] = spread[:, 1:]
     seen = np.isfinite(turns[:, 0]).all(axis=1)
     track.root_rotation[seen] = so3.exp(turns[seen, 0])
     track.root_mm[:] = _columns(rotations, [f"t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
@@ -68,8 +73,8 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
 
 
 def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
-    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6); of an older session these
-    alone are known.
+    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6); of an
+    older session these alone are known.
     """
     out = np.zeros((len(sd), 6, 6))
     out[:, range(6), range(6)] = sd**2

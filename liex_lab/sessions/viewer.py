@@ -42,7 +42,9 @@ def has_screen() -> bool:
 
 
 def replays_with(replay: Path) -> list[Path]:
-    """What is opened for a session's replay: where there are corrections theirs first, for the first layout holds."""
+    """What is opened for a session's replay: where there are corrections theirs first, for the
+    first layout holds.
+    """
     from liex_lab.sessions.corrections import REPLAY
     from liex_lab.sessions.session import Session
 
@@ -56,7 +58,8 @@ def replays_with(replay: Path) -> list[Path]:
 def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     """Open a .rrd in a window at a time, s since its first frame.
 
-    The viewer listens on 127.0.0.1 alone and ends with this process. Raises LiexError where it does not come up.
+    The viewer listens on 127.0.0.1 alone and ends with this process. Raises LiexError where it does
+    not come up.
     """
     if not replay.is_file():
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
@@ -72,7 +75,8 @@ def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     process = _begin(
         "--port", str(port), "--hide-welcome-screen", *(["--headless"] if headless else [])
     )
-    ends, seen = time.monotonic() + _PATIENCE_S, ""
+    ends = time.monotonic() + _PATIENCE_S
+    seen = ""
     while time.monotonic() < ends and process.poll() is None:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")

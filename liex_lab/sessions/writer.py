@@ -1,4 +1,6 @@
-"""Writing a session: a folder beside the final place, renamed when whole; interrupted, the work goes on there."""
+"""Writing a session: a folder beside the final place, renamed when whole; interrupted, the work
+goes on there.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ if TYPE_CHECKING:
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.offline import Subject
 
-INDEX, TIMES = "frame_index", "frame_time_ns"
+INDEX = "frame_index"
+TIMES = "frame_time_ns"
 _BEHIND = 4  # batches of 16 frames that the logs may be behind, both together
 Kept = TypeVar("Kept")
 
@@ -52,13 +55,16 @@ ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in
 
 
 class SessionWriter:
-    """Begins a session; takes depth and track part by part; `close` writes the tables and puts it in its place.
+    """Begins a session; takes depth and track part by part; `close` writes the tables and puts it
+    in its place.
 
-    Depth goes straight to session.rrd and session.mcap, so memory does not grow with it. Use it in a `with` block: an
-    exception goes on, and leaves nothing behind but a folder NAME.part where there is a checkpoint in it. A writer of
-    the same session then begins with `n_frames` frames that need not be given again.
+    Depth goes straight to session.rrd and session.mcap, so memory does not grow with it. Use it in
+    a `with` block: an exception goes on, and leaves nothing behind but a folder NAME.part where
+    there is a checkpoint in it. A writer of the same session then begins with `n_frames` frames
+    that need not be given again.
 
-    blueprint: makes the replay's layout from session.json's content; report: writes report.html into the folder.
+    blueprint: makes the replay's layout from session.json's content; report: writes report.html
+    into the folder.
     """
 
     def __init__(
@@ -72,10 +78,13 @@ class SessionWriter:
     ) -> None:
         path = Path(path)
         check_place(path, overwrite)
-        self.path, self.origin = path, origin
-        self._overwrite, self._report = overwrite, report
+        self.path = path
+        self.origin = origin
+        self._overwrite = overwrite
+        self._report = report
         self._document = origin.document()
-        self._started, self._seconds = time.perf_counter(), 0.0
+        self._started = time.perf_counter()
+        self._seconds = 0.0
         self._held = TrackBuffer(origin.skeleton, 0)
         self._flips: Sequence[Flip] = ()
         self._candidates: Observations | None = None
@@ -130,11 +139,15 @@ class SessionWriter:
 
     @property
     def n_frames(self) -> int:
-        """Frames that are in the session already; more than none where an interrupted one goes on."""
+        """Frames that are in the session already; more than none where an interrupted one
+        goes on.
+        """
         return len(self._index)
 
     def go_on(self, depth: Callable[[int], NDArray[np.float32]]) -> None:
-        """Look once more at the few frames of the report, where some are in already; depth: of a row, (H, W) mm."""
+        """Look once more at the few frames of the report, where some are in already; depth: of a
+        row, (H, W) mm.
+        """
         from liex_lab.recordings.rvl import to_millimetres
 
         self._keepsakes.again(self.n_frames, lambda row: to_millimetres(depth(row)))
@@ -147,7 +160,8 @@ class SessionWriter:
     ) -> None:
         """Consecutive frames and, unless `close` gets the whole track, their part of it.
 
-        seen: what was seen in them, kept on disk until the session is whole: the work can go on from there, see `seen`.
+        seen: what was seen in them, kept on disk until the session is whole: the work can go on
+        from there, see `seen`.
         """
         from liex_lab.recordings.rvl import to_millimetres
 
@@ -179,7 +193,9 @@ class SessionWriter:
         self._seconds += time.perf_counter() - began
 
     def seen(self, kind: Callable[..., Kept]) -> Kept:
-        """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its columns in order."""
+        """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its
+        columns in order.
+        """
         kept = self._checkpoint.seen.read()
         return kind(
             self.origin.skeleton,
@@ -187,7 +203,9 @@ class SessionWriter:
         )
 
     def _settle(self, behind: int = 0) -> None:
-        """Wait until the logs are at most so many batches behind; what went wrong is raised here."""
+        """Wait until the logs are at most so many batches behind; what went wrong is raised
+        here.
+        """
         while len(self._logging) > behind:
             self._logging.popleft().result()
 
@@ -196,7 +214,9 @@ class SessionWriter:
             logger.shutdown(cancel_futures=True)
 
     def _take_down(self) -> None:
-        """A checkpoint: everything so far need not be done again. Only what `seen` was given for can go on."""
+        """A checkpoint: everything so far need not be done again. Only what `seen` was given for
+        can go on.
+        """
         self._settle()
         sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
         if len(self._checkpoint.seen) == len(self._index):
@@ -206,7 +226,9 @@ class SessionWriter:
 
     @property
     def room(self) -> Room:
-        """Where a track of hours may lie until the session is whole: on the disk that it will be on."""
+        """Where a track of hours may lie until the session is whole: on the disk that it will be
+        on.
+        """
         return on_disk(self._folder)
 
     @property
@@ -221,8 +243,11 @@ class SessionWriter:
         self._held = TrackBuffer.of(track)
 
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
-        """The track of all frames so far, what was found out about its flips, and what it was made of."""
-        self.track, self._flips = tracked.track, tracked.flips
+        """The track of all frames so far, what was found out about its flips, and what it was made
+        of.
+        """
+        self.track = tracked.track
+        self._flips = tracked.flips
         give_back()  # hours of recording leave much behind
         self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
@@ -244,7 +269,9 @@ class SessionWriter:
         )
 
     def note(self, **sections: Any) -> None:
-        """Add facts found on the way to session.json: tables are merged, lists extended, the rest replaced."""
+        """Add facts found on the way to session.json: tables are merged, lists extended, the rest
+        replaced.
+        """
         for name, value in sections.items():
             known = self._document.get(name)
             if isinstance(known, dict) and isinstance(value, Mapping):
@@ -269,9 +296,9 @@ class SessionWriter:
     ) -> Session:
         """Write everything else and put the session in its place.
 
-        results: tables by name (kinematics, bouts, summary and others); columns: describe theirs, of bouts those beyond
-        `tables.BOUTS`; actions: the ethogram's vocabulary, word -> definition; record: what else session.json should
-        hold (see `note`).
+        results: tables by name (kinematics, bouts, summary and others); columns: describe theirs,
+        of bouts those beyond `tables.BOUTS`; actions: the ethogram's vocabulary, word ->
+        definition; record: what else session.json should hold (see `note`).
         """
         from liex_lab.sessions.session import Session
 
@@ -290,7 +317,8 @@ class SessionWriter:
             results["bouts"] = tables.empty_table(
                 [*tables.BOUTS, *(c for c in columns if c.table == "bouts")]
             )
-        bouts, kinematics = results["bouts"], results.setdefault("kinematics", rows_only(rows))
+        bouts = results["bouts"]
+        kinematics = results.setdefault("kinematics", rows_only(rows))
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
         rows.track.rest()
@@ -384,7 +412,9 @@ class SessionWriter:
 
 
 def seen_rows(frames: Sequence[DepthFrame], seen: Columnar) -> dict[str, NDArray[Any]]:
-    """What is kept on disk of consecutive frames: what was seen in them, their count and their time."""
+    """What is kept on disk of consecutive frames: what was seen in them, their count and their
+    time.
+    """
     index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
     return {**columns_of(seen), INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
 
@@ -397,6 +427,6 @@ def unfinished(path: Path, origin: Provenance) -> Checkpoint:
 def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:
     if not np.array_equal(times_ns, track.times_ns):
         raise SessionError(
-            f"a track has one row for every frame written, got {track.n_frames} rows for {len(times_ns)} frames or "
-            "other time stamps; pass the track of exactly these frames"
+            f"a track has one row for every frame written, got {track.n_frames} rows for "
+            f"{len(times_ns)} frames or other time stamps; pass the track of exactly these frames"
         )

@@ -1,4 +1,6 @@
-"""Kernels that compose an ideal depth picture: floor and wall along the rays, meshes drawn over them."""
+"""Kernels that compose an ideal depth picture: floor and wall along the rays, meshes drawn over
+them.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,10 @@ from liex_lab.simulation._sensor_kernels import (
     smooth_field,
 )
 
-# columns of a wall: its outward normal in the floor (2), distance from the arena's origin, height, depth of the
-# rounding that multiple reflections leave at its foot and how far that reaches, all mm; distance 0 is no wall
+# columns of a wall: its outward normal in the floor (2), distance from the arena's origin, height,
+# depth of the
+# rounding that multiple reflections leave at its foot and how far that reaches, all mm; distance 0
+# is no wall
 WALL_COLUMNS = 6
 
 
@@ -27,18 +31,20 @@ WALL_COLUMNS = 6
 def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, rough, depth, what):
     """Ideal depth and kind of a window (H, W) on a floor with at most one straight wall.
 
-    rotation (3, 3) and height mm: T_arena_camera; picture: (width, height), outside it nothing is read; uneven (H, W)
-    times `rough` mm raises the floor.
+    rotation (3, 3) and height mm: T_arena_camera; picture: (width, height), outside it nothing is
+    read; uneven (H, W) times `rough` mm raises the floor.
     """
     rows, columns = depth.shape
     for r in range(rows):
         v = v0 + r
         for c in range(columns):
             u = u0 + c
-            depth[r, c], what[r, c] = 0.0, NOTHING
+            depth[r, c] = 0.0
+            what[r, c] = NOTHING
             if u < 0 or v < 0 or u >= picture[0] or v >= picture[1]:
                 continue
-            x, y = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1]
+            x = (u - intrinsics[2]) / intrinsics[0]
+            y = (v - intrinsics[3]) / intrinsics[1]
             dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
             dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
             dz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
@@ -52,41 +58,56 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
                 if beyond > 0.0:
                     t = wall[2] / across
                     if height + t * dz < wall[3]:
-                        depth[r, c], what[r, c] = t, STILL
+                        depth[r, c] = t
+                        what[r, c] = STILL
                     continue
                 raised += wall[4] * np.exp(beyond / wall[5])
-            depth[r, c], what[r, c] = t + raised / dz, STILL
+            depth[r, c] = t + raised / dz
+            what[r, c] = STILL
 
 
 @njit(cache=True)
 def merge(inverse, label, top, left, depth, what):
-    """Put a drawn mesh (inverse depth, h, w) at row `top`, column `left` in front of what is farther, as `label`."""
+    """Put a drawn mesh (inverse depth, h, w) at row `top`, column `left` in front of what is
+    farther, as `label`.
+    """
     for r in range(inverse.shape[0]):
         for c in range(inverse.shape[1]):
             if inverse[r, c] > 0.0:
                 z = 1.0 / inverse[r, c]
                 if depth[top + r, left + c] == 0.0 or z < depth[top + r, left + c]:
-                    depth[top + r, left + c], what[top + r, left + c] = z, label
+                    depth[top + r, left + c] = z
+                    what[top + r, left + c] = label
 
 
 @njit(cache=True)
 def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label, depth, what):
-    """Draw a mesh over a picture or window (H, W) whose first pixel is (u0, v0), touching only the mesh's own box."""
-    low_u, low_v, high_u, high_v = 1e9, 1e9, -1e9, -1e9
+    """Draw a mesh over a picture or window (H, W) whose first pixel is (u0, v0), touching only the
+    mesh's own box.
+    """
+    low_u = 1e9
+    low_v = 1e9
+    high_u = -1e9
+    high_v = -1e9
     for i in range(len(vertices)):
-        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        x = vertices[i, 0]
+        y = vertices[i, 1]
+        z = vertices[i, 2]
         zc = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
         if zc <= 1.0:
             continue
         xc = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
         yc = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-        u, v = intrinsics[0] * xc / zc + intrinsics[2], intrinsics[1] * yc / zc + intrinsics[3]
-        low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
-    left, top = max(0, int(low_u) - int(u0) - 1), max(0, int(low_v) - int(v0) - 1)
-    right, bottom = (
-        min(depth.shape[1], int(high_u) - int(u0) + 2),
-        min(depth.shape[0], int(high_v) - int(v0) + 2),
-    )
+        u = intrinsics[0] * xc / zc + intrinsics[2]
+        v = intrinsics[1] * yc / zc + intrinsics[3]
+        low_u = min(low_u, u)
+        high_u = max(high_u, u)
+        low_v = min(low_v, v)
+        high_v = max(high_v, v)
+    left = max(0, int(low_u) - int(u0) - 1)
+    top = max(0, int(low_v) - int(v0) - 1)
+    right = min(depth.shape[1], int(high_u) - int(u0) + 2)
+    bottom = min(depth.shape[0], int(high_v) - int(v0) + 2)
     if low_u > high_u or left >= right or top >= bottom:
         return
     inverse = np.zeros((bottom - top, right - left))
@@ -126,10 +147,13 @@ def _window(
     depth_out,
     background_out,
 ):
-    """One training window: the still scene, its estimate, the animal, perhaps a thing beside it, and the sensor."""
+    """One training window: the still scene, its estimate, the animal, perhaps a thing beside it,
+    and the sensor.
+    """
     shape = depth_out.shape
     state = np.array([seed], np.uint64)
-    field, depth = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    field = np.empty(shape, np.float32)
+    depth = np.empty(shape, np.float32)
     what = np.empty(shape, np.uint8)
     smooth_field(state, table, 24.0, field)
     floor_and_wall(
@@ -148,14 +172,16 @@ def _window(
     smooth_field(state, table, 9.0, field)
     for r in range(shape[0]):
         for c in range(shape[1]):
-            # a background is learned from many frames: nearly free of noise, a little off in patches
+            # a background is learned from many frames: nearly free of noise, a little off in
+            # patches
             error = sensor[BACKGROUND] * (0.4 * field[r, c] + 0.3 * normal(state, table))
             background_out[r, c] = (
                 int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
             )
     rotation = np.ascontiguousarray(R_arena_camera.T)
     translation = -height * rotation[:, 2]
-    u0, v0 = float(origin[0]), float(origin[1])
+    u0 = float(origin[0])
+    v0 = float(origin[1])
     draw_onto(animal, faces, rotation, translation, intrinsics, u0, v0, ANIMAL, depth, what)
     if has_thing:
         draw_onto(
@@ -163,7 +189,8 @@ def _window(
         )
     for r in range(shape[0]):
         for c in range(shape[1]):
-            u, v = origin[0] + c, origin[1] + r
+            u = origin[0] + c
+            v = origin[1] + r
             if u < 0 or v < 0 or u >= picture[0] or v >= picture[1]:
                 depth[r, c] = 0.0
     sense(
@@ -238,7 +265,9 @@ def frame(
     table,
     out,
 ):
-    """One full frame (H, W) uint16 mm: the still scene (H, W) mm, the animal and perhaps a thing, and the sensor."""
+    """One full frame (H, W) uint16 mm: the still scene (H, W) mm, the animal and perhaps a thing,
+    and the sensor.
+    """
     state = np.array([seed], np.uint64)
     depth = still.copy()
     what = np.where(still > 0, np.uint8(STILL), np.uint8(NOTHING))
@@ -269,7 +298,9 @@ def frames_parallel(
     table,
     out,
 ):
-    """`frame` for a batch: animal, thing, has_thing, sensor, seed and out (n, ...) differ, the rest is shared."""
+    """`frame` for a batch: animal, thing, has_thing, sensor, seed and out (n, ...) differ, the rest
+    is shared.
+    """
     for i in prange(len(animal)):
         frame(
             still,

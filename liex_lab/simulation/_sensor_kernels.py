@@ -1,8 +1,10 @@
-"""Kernels of the sensor models: what a PrimeSense, a Kinect v2 or a light field makes of an ideal depth picture.
+"""Kernels of the sensor models: what a PrimeSense, a Kinect v2 or a light field makes of an ideal
+depth picture.
 
-Every random number comes from a small generator whose state (1,) uint64 belongs to one picture, so a picture depends on
-its seed alone, never on threads or on order. Arguments that all kernels share: depth (H, W) mm, 0 = nothing in range;
-what (H, W) uint8: NOTHING, STILL (background), ANIMAL, OBJECT; `p`: one row of sensor parameters, indexed as below.
+Every random number comes from a small generator whose state (1,) uint64 belongs to one picture, so
+a picture depends on its seed alone, never on threads or on order. Arguments that all kernels share:
+depth (H, W) mm, 0 = nothing in range; what (H, W) uint8: NOTHING, STILL (background), ANIMAL,
+OBJECT; `p`: one row of sensor parameters, indexed as below.
 """
 
 from __future__ import annotations
@@ -10,9 +12,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-NOTHING, STILL, ANIMAL, OBJECT = 0, 1, 2, 3
+NOTHING = 0
+STILL = 1
+ANIMAL = 2
+OBJECT = 3
 
-PRIMESENSE_KIND, KINECT_V2_KIND, LIGHT_FIELD_KIND = 0, 1, 2
+PRIMESENSE_KIND = 0
+KINECT_V2_KIND = 1
+LIGHT_FIELD_KIND = 2
 BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
 SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
 
@@ -34,13 +41,13 @@ SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
     JITTER,
     FLYING,
 ) = range(15)
-UNIT, BACKGROUND, OUTLIERS = (
-    15,
-    16,
-    17,
-)  # mm a step of the picture; error of a learned background; outliers' rarity
+# mm a step of the picture; error of a learned background; outliers' rarity
+UNIT = 15
+BACKGROUND = 16
+OUTLIERS = 17
 N_PARAMETERS = 18
-TYPICAL_MM = 250.0  # from a light field's main lens: its parameters hold there, its range noise grows with z^2
+# from a light field's main lens: its parameters hold there, its range noise grows with z^2
+TYPICAL_MM = 250.0
 
 _TABLE_BITS = 13
 _SHIFT = 64 - _TABLE_BITS
@@ -82,18 +89,24 @@ def normal(state, table):
 
 @njit(cache=True)
 def smooth_field(state, table, spacing, out):
-    """Fill out (H, W) with noise of unit deviation at its nodes, `spacing` pixels apart, linear between them."""
+    """Fill out (H, W) with noise of unit deviation at its nodes, `spacing` pixels apart, linear
+    between them.
+    """
     height, width = out.shape
     n_columns = int(width / spacing) + 3
-    above, below = np.empty(n_columns, np.float32), np.empty(n_columns, np.float32)
-    start_u, start_v = uniform(state), uniform(state)
-    column_of, share_of = np.empty(width, np.int32), np.empty(width, np.float32)
+    above = np.empty(n_columns, np.float32)
+    below = np.empty(n_columns, np.float32)
+    start_u = uniform(state)
+    start_v = uniform(state)
+    column_of = np.empty(width, np.int32)
+    share_of = np.empty(width, np.float32)
     for u in range(width):
         at = u / spacing + start_u
         column_of[u] = int(at)
         share_of[u] = at - int(at)
     for k in range(n_columns):
-        above[k], below[k] = normal(state, table), normal(state, table)
+        above[k] = normal(state, table)
+        below[k] = normal(state, table)
     node = 0
     for v in range(height):
         at = v / spacing + start_v
@@ -104,19 +117,20 @@ def smooth_field(state, table, spacing, out):
                 below[k] = normal(state, table)
         t = np.float32(at - node)
         for u in range(width):
-            k, s = column_of[u], share_of[u]
-            a, b = (
-                above[k] + s * (above[k + 1] - above[k]),
-                below[k] + s * (below[k + 1] - below[k]),
-            )
+            k = column_of[u]
+            s = share_of[u]
+            a = above[k] + s * (above[k + 1] - above[k])
+            b = below[k] + s * (below[k + 1] - below[k])
             out[v, u] = a + t * (b - a)
 
 
 @njit(cache=True)
 def soften(depth, what, p, state, table, field):
-    """What fur does before any sensor looks: lumps, a bias of dark hair, and an outline that returns less, in place.
+    """What fur does before any sensor looks: lumps, a bias of dark hair, and an outline that
+    returns less, in place.
 
-    `erosion` pixels of the animal's outline go to whatever stands behind, and a share of the next ones, after FUR.
+    `erosion` pixels of the animal's outline go to whatever stands behind, and a share of the next
+    ones, after FUR.
     """
     height, width = depth.shape
     smooth_field(state, table, p[GRID] * 1.3, field)
@@ -128,13 +142,16 @@ def soften(depth, what, p, state, table, field):
     for k in range(rounds + 1):
         share = 1.0 if k < rounds else 0.5 * p[FUR]
         lost = np.empty((height * width // 4, 2), np.int32)
-        behind, n_lost = np.empty(len(lost), np.float32), 0
+        behind = np.empty(len(lost), np.float32)
+        n_lost = 0
         for v in range(1, height - 1):
             for u in range(1, width - 1):
                 if what[v, u] == ANIMAL and n_lost < len(lost):
                     far = _outside(depth, what, v, u)
                     if far > depth[v, u] + 2.0 and uniform(state) < share:
-                        lost[n_lost, 0], lost[n_lost, 1], behind[n_lost] = v, u, far
+                        lost[n_lost, 0] = v
+                        lost[n_lost, 1] = u
+                        behind[n_lost] = far
                         n_lost += 1
         for i in range(n_lost):
             depth[lost[i, 0], lost[i, 1]] = behind[i]
@@ -160,7 +177,8 @@ def _outside(depth, what, v, u):
 def _step(depth, v, u):
     """Largest difference in mm to the four neighbours that exist, with its sign."""
     height, width = depth.shape
-    here, worst = depth[v, u], np.float32(0.0)
+    here = depth[v, u]
+    worst = np.float32(0.0)
     if v > 0 and depth[v - 1, u] > 0 and abs(depth[v - 1, u] - here) > abs(worst):
         worst = depth[v - 1, u] - here
     if v < height - 1 and depth[v + 1, u] > 0 and abs(depth[v + 1, u] - here) > abs(worst):
@@ -174,18 +192,23 @@ def _step(depth, v, u):
 
 @njit(cache=True)
 def primesense(depth, what, p, focal, state, table, out):
-    """Structured light: out (H, W) uint16 mm, 0 = unread. See `soften` and the module's head for the arguments.
+    """Structured light: out (H, W) uint16 mm, 0 = unread. See `soften` and the module's head for
+    the arguments.
 
-    Disparity f b / z is read over a window (smooth errors, outlines displaced by about a pixel), in eighths of a pixel;
-    what the projector cannot see, beside anything that stands up, is unread, and so are grazing surfaces.
+    Disparity f b / z is read over a window (smooth errors, outlines displaced by about a pixel), in
+    eighths of a pixel; what the projector cannot see, beside anything that stands up, is unread,
+    and so are grazing surfaces.
     """
     height, width = depth.shape
-    field, move_u = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    field = np.empty((height, width), np.float32)
+    move_u = np.empty((height, width), np.float32)
     move_v = np.empty((height, width), np.float32)
     smooth_field(state, table, p[GRID], field)
     smooth_field(state, table, 2.5, move_u)
     smooth_field(state, table, 2.5, move_v)
-    strength, jitter, fb = p[NOISE], p[JITTER], focal * BASELINE_MM
+    strength = p[NOISE]
+    jitter = p[JITTER]
+    fb = focal * BASELINE_MM
     shadow = np.empty(width, np.bool_)
     for v in range(height):
         _shadow(depth[v], fb, p[SIDE], shadow)
@@ -210,10 +233,11 @@ def primesense(depth, what, p, focal, state, table, out):
 
 @njit(cache=True)
 def _shadow(row, fb, side, shadow):
-    """Which pixels of one row of depths (W,) the projector cannot see; it stands to the right (side > 0) or left.
+    """Which pixels of one row of depths (W,) the projector cannot see; it stands to the right (side
+    > 0) or left.
 
-    Seen from the projector a point moves by its disparity; points that come to lie behind an already passed, nearer one
-    are hidden by it.
+    Seen from the projector a point moves by its disparity; points that come to lie behind an
+    already passed, nearer one are hidden by it.
     """
     width = len(row)
     front = 1e9
@@ -229,10 +253,11 @@ def _shadow(row, fb, side, shadow):
 
 @njit(cache=True)
 def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
-    """Time of flight: out (H, W) uint16 mm, 0 = unread. (centre_u, centre_v): the optical axis in window pixels.
+    """Time of flight: out (H, W) uint16 mm, 0 = unread. (centre_u, centre_v): the optical axis in
+    window pixels.
 
-    Noise grows with the squared distance, towards the corners and on slopes, part of it smooth; at an outline a pixel
-    mixes the near and the far surface (flying pixels) or is unread.
+    Noise grows with the squared distance, towards the corners and on slopes, part of it smooth; at
+    an outline a pixel mixes the near and the far surface (flying pixels) or is unread.
     """
     height, width = depth.shape
     field = np.empty((height, width), np.float32)
@@ -265,37 +290,35 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
 def light_field(depth, what, p, state, table, out):
     """A plenoptic camera: out (H, W) uint16 in steps of p[UNIT] mm, 0 = unread.
 
-    Depth comes from matched texture. Range noise is large and mostly smooth; outlines lie some pixels off, often
-    outwards; where the surface bears no texture (DARK of the animal's, HOLES of the rest) there is no reading, or
-    (FLYING > 0.5) what lies around was drawn over it; patches are matched wrongly, the rarer the larger OUTLIERS.
+    Depth comes from matched texture. Range noise is large and mostly smooth; outlines lie some
+    pixels off, often outwards; where the surface bears no texture (DARK of the animal's, HOLES of
+    the rest) there is no reading, or (FLYING > 0.5) what lies around was drawn over it; patches are
+    matched wrongly, the rarer the larger OUTLIERS.
     """
     height, width = depth.shape
     fields = np.empty((6, height, width), np.float32)
-    fine, coarse, blank, wrong, move_u, move_v = (
-        fields[0],
-        fields[1],
-        fields[2],
-        fields[3],
-        fields[4],
-        fields[5],
-    )
+    fine = fields[0]
+    coarse = fields[1]
+    blank = fields[2]
+    wrong = fields[3]
+    move_u = fields[4]
+    move_v = fields[5]
     smooth_field(state, table, p[GRID], fine)
     smooth_field(state, table, 4.0 * p[GRID], coarse)
     smooth_field(state, table, 2.0 * p[GRID], blank)
     smooth_field(state, table, 1.0 * p[GRID], wrong)
     smooth_field(state, table, 1.5 * p[GRID], move_u)
     smooth_field(state, table, 1.5 * p[GRID], move_v)
-    strength, jitter, per_mm, per_step = (
-        p[NOISE],
-        np.float32(p[JITTER]),
-        1.0 / TYPICAL_MM,
-        1.0 / p[UNIT],
-    )
+    strength = p[NOISE]
+    jitter = np.float32(p[JITTER])
+    per_mm = 1.0 / TYPICAL_MM
+    per_step = 1.0 / p[UNIT]
     for v in range(height):
         for u in range(width):
             row = min(max(int(v + jitter * move_v[v, u] + np.float32(0.5)), 0), height - 1)
             column = min(max(int(u + jitter * move_u[v, u] + np.float32(0.5)), 0), width - 1)
-            z, here = depth[row, column], depth[v, u]
+            z = depth[row, column]
+            here = depth[v, u]
             if p[SIDE] > 0.0 and here > 0.0 and here < z:  # a near surface grows outwards only
                 z = here
             if z <= 0.0:
@@ -319,7 +342,9 @@ def light_field(depth, what, p, state, table, out):
 
 @njit(cache=True)
 def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
-    """One picture through its sensor: depth and what are consumed, `field` (H, W) float32 is scratch space."""
+    """One picture through its sensor: depth and what are consumed, `field` (H, W) float32 is
+    scratch space.
+    """
     soften(depth, what, p, state, table, field)
     if int(p[KIND]) == PRIMESENSE_KIND:
         primesense(depth, what, p, focal, state, table, out)

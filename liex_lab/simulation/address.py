@@ -27,18 +27,21 @@ _SIZES = (0.5, 2.9)  # of the home length
 
 
 def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
-    """The virtual recording of an address, as in synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
+    """The virtual recording of an address, as in
+    synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
 
-    walk: a mouse, swim: a fish, gesture: a hand, move: the animal of a skeleton's TOML, animal=snake.toml. Each setting
-    may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn from the seed. track-easy and
-    track-hard: the test sequences of `simulation.tracking_sequences`, of a mouse, or animal=fish or animal=hand, with a
-    seed or more frames others of their kind. camera: taken for the one that made the pictures, to see what a wrong one
-    does.
+    walk: a mouse, swim: a fish, gesture: a hand, move: the animal of a skeleton's TOML,
+    animal=snake.toml. Each setting may be left out: seed 0, 300 frames, the animal's usual sensor,
+    and a size drawn from the seed. track-easy and track-hard: the test sequences of
+    `simulation.tracking_sequences`, of a mouse, or animal=fish or animal=hand, with a seed or more
+    frames others of their kind. camera: taken for the one that made the pictures, to see what a
+    wrong one does.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
     if kind not in _KINDS:
         raise RecordingError(
-            f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in {_EXAMPLE}"
+            f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in "
+            f"{_EXAMPLE}"
         )
     stated = dict(parse_qsl(query, keep_blank_values=True))
     animal = (
@@ -62,10 +65,12 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     world = world_of(skeleton)
     session: TrueRecording
     if kind in _SEQUENCES:
-        seed, n_frames = values.pop("seed", None), values.pop("frames", None)
+        seed = values.pop("seed", None)
+        n_frames = values.pop("frames", None)
         session = tracking_sequence(world, _SEQUENCES[kind], seed=seed, n_frames=n_frames, **values)
     else:
-        seed, n_frames = values.pop("seed", 0), values.pop("frames", 300)
+        seed = values.pop("seed", 0)
+        n_frames = values.pop("frames", 300)
         session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
     if camera is not None:
         session.camera = fitting(

@@ -1,4 +1,6 @@
-"""What goes wrong while a real animal is recorded, as a script of events, and how each of them looks in the picture."""
+"""What goes wrong while a real animal is recorded, as a script of events, and how each of them
+looks in the picture.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +36,12 @@ _FAINT_LOST = (0.4, 0.75)  # of the readings of an animal that floats
 _HOLE = (0.1, 0.26)  # radius, of the animal's length
 _CELL = 3  # pixels a side that come and go together
 # an occluder: half its width and how far it comes from, of the animal's length; how long it is
-_BAR_HALF, _BAR_FROM, _BAR_LONG = (0.12, 0.5), 2.0, 2.5
+_BAR_HALF = (0.12, 0.5)
+_BAR_FROM = 2.0
+_BAR_LONG = 2.5
 # a thing held beside a hand: half its sides, and how far from the hand, of the hand's length
-_HELD, _HELD_ASIDE = (0.08, 0.3), (0.1, 0.5)
+_HELD = (0.08, 0.3)
+_HELD_ASIDE = (0.1, 0.5)
 _AWAY = np.array([0.0, 0.0, 1e6])  # behind the camera
 
 TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max() + 1)])
@@ -44,8 +49,8 @@ TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max(
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happens in frames start to stop (exclusive); kind: a word of `EVENTS`, or 'hidden', the frames in
-    which less than half of the animal can be seen.
+    """Something that happens in frames start to stop (exclusive); kind: a word of `EVENTS`, or
+    'hidden', the frames in which less than half of the animal can be seen.
     """
 
     kind: str
@@ -56,12 +61,14 @@ class Event:
 def draw_script(
     rng: np.random.Generator, n_frames: int, step_s: float
 ) -> tuple[list[Event], NDArray[np.int64]]:
-    """Events over n frames, and how many steps of the camera's clock lie before each frame (n,), 1 as a rule.
+    """Events over n frames, and how many steps of the camera's clock lie before each frame (n,), 1
+    as a rule.
 
-    The events come in shuffled decks, the first with one of each, so that none is long absent. Frames that are dropped
-    are missing afterwards: an event 'dropped' is the one frame after them.
+    The events come in shuffled decks, the first with one of each, so that none is long absent.
+    Frames that are dropped are missing afterwards: an event 'dropped' is the one frame after them.
     """
-    events, steps = [], np.ones(n_frames, np.int64)
+    events = []
+    steps = np.ones(n_frames, np.int64)
     deck = [str(name) for name in rng.permutation(list(EVENTS))]
     at = round(1.0 / step_s)  # a second of calm to begin with
     while at < n_frames:
@@ -98,8 +105,9 @@ def draw_things(
     beside: Beside,
     floats: bool = True,
 ) -> Array:
-    """Meshes (n, 2 V, 3) mm of the occluder and of a second object in each frame; behind the camera where there is
-    none. joints (n, J, 3) mm: the animal's, arena frame, where eye (3,) is the camera.
+    """Meshes (n, 2 V, 3) mm of the occluder and of a second object in each frame; behind the camera
+    where there is none. joints (n, J, 3) mm: the animal's, arena frame, where eye (3,) is the
+    camera.
     """
     one = int(THING_FACES.max()) + 1
     things = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
@@ -121,8 +129,10 @@ def _passing(
     share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the lens to the animal
     over = eye[:2] + (target[:2] - eye[:2]) * share
     way = rng.uniform(-np.pi, np.pi)
-    half, s = rng.uniform(*_BAR_HALF) * length_mm * share, np.linspace(-1.0, 1.0, len(joints))
-    centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
+    half = rng.uniform(*_BAR_HALF) * length_mm * share
+    s = np.linspace(-1.0, 1.0, len(joints))
+    centre = np.zeros((N_PARTS, 3))
+    radii = np.zeros((N_PARTS, 3))
     radii[0] = [half, _BAR_LONG * length_mm * share, 0.1 * length_mm]
     mesh = rounded(centre, radii, np.full(N_PARTS, way), np.full(N_PARTS, 8.0)).reshape(-1, 3)
     along = s[:, None] * _BAR_FROM * length_mm * share * np.array([np.cos(way), np.sin(way)])
@@ -133,10 +143,13 @@ def _passing(
 def beside_animal(
     rng: np.random.Generator, stage: Stage, joints: Array, length_mm: float, kinds: tuple[str, ...]
 ) -> Array:
-    """A thing (n, V, 3) mm that stands beside the animal's way for a while, near it where there is room."""
+    """A thing (n, V, 3) mm that stands beside the animal's way for a while, near it where there is
+    room.
+    """
     mesh = draw_thing(rng, str(rng.choice(kinds)), length_mm)
     way = joints[..., :2].reshape(-1, 2)
-    best, best_cost = np.zeros(2), np.inf
+    best = np.zeros(2)
+    best_cost = np.inf
     for _ in range(60):
         place = joints[rng.integers(len(joints)), 0, :2] + rng.normal(0.0, 1.6, 2) * length_mm
         reach = np.abs(mesh[:, :2]).max()
@@ -147,13 +160,15 @@ def beside_animal(
             + 50.0 * (free < 0)
         )
         if cost < best_cost:
-            best, best_cost = place, cost
+            best = place
+            best_cost = cost
     return np.broadcast_to(mesh + np.array([*best, 0.0]), (len(joints), *mesh.shape))
 
 
 def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
     """A block or a ball (n, V, 3) mm that is held beside a hand for a while, at about its depth."""
-    centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
+    centre = np.zeros((N_PARTS, 3))
+    radii = np.zeros((N_PARTS, 3))
     radii[0] = rng.uniform(*_HELD, 3) * length_mm
     power = np.full(N_PARTS, rng.choice([2.0, 8.0]))
     mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(
@@ -173,9 +188,9 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
 
 @dataclass(frozen=True)
 class Loss:
-    """Readings that are lost in n frames: discs, u, v and radius px, of frame i in discs[i]; faint_mm (n,): what stands
-    out from the still scene by less is read as the still scene; dropout (n,): this share of the animal's surroundings
-    is not read.
+    """Readings that are lost in n frames: discs, u, v and radius px, of frame i in discs[i];
+    faint_mm (n,): what stands out from the still scene by less is read as the still scene; dropout
+    (n,): this share of the animal's surroundings is not read.
     """
 
     discs: tuple[Array, ...]
@@ -194,7 +209,8 @@ class Loss:
         """What is lost in n frames of these events; joints (n, J, 3) mm: camera frame."""
         n = len(joints)
         discs: list[Array] = [np.zeros((0, 3))] * n
-        faint, dropout = np.zeros(n), np.zeros(n)
+        faint = np.zeros(n)
+        dropout = np.zeros(n)
         for event in events:
             span = slice(event.start, event.stop)
             if event.kind == "faint" and floats:
@@ -223,8 +239,9 @@ class Loss:
         middle_px: Array,
         reach_px: Array,
     ) -> None:
-        """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W) mm, where anything is
-        lost in it; middle_px (n, 2) and reach_px (n,): where the animal is in the picture.
+        """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W)
+        mm, where anything is lost in it; middle_px (n, 2) and reach_px (n,): where the animal is in
+        the picture.
         """
         height, width = depths.shape[1:]
         v, u = np.mgrid[:height, :width]
@@ -244,7 +261,8 @@ class Loss:
 
 
 def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
-    """Share (n,) of the animal's vertices (n, V, 3) that no thing (n, W, 3) hides, 1 in frames other than `rows`.
+    """Share (n,) of the animal's vertices (n, V, 3) that no thing (n, W, 3) hides, 1 in frames
+    other than `rows`.
 
     Camera frame.
 
@@ -254,7 +272,8 @@ def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[
 
     share = np.ones(len(vertices))
     for i in rows:
-        shadow, animal = camera.project(things[i]), camera.project(vertices[i])
+        shadow = camera.project(things[i])
+        animal = camera.project(vertices[i])
         share[i] = 1.0 - float((Delaunay(shadow).find_simplex(animal) >= 0).mean())
     return share
 

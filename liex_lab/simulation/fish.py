@@ -1,4 +1,6 @@
-"""A zebrafish in a tank before a light-field camera: its bodies, its bends, and where in the water it hangs."""
+"""A zebrafish in a tank before a light-field camera: its bodies, its bends, and where in the water
+it hangs.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ TANK = Setting(
     clutter=("pellet", "plant"),
     scale=0.3,
 )
-# at rest or gliding, scooting with waves down the body, J: the hind half bent, C: both halves, S: against each other
+# at rest or gliding, scooting with waves down the body, J: the hind half bent, C: both halves, S:
+# against each other
 KINDS = ("glide", "scoot", "j", "c", "s")
 SHARES = (0.28, 0.30, 0.14, 0.14, 0.14)
 _NEAREST_MM = 180.0  # to the camera: nearer, a large fish is not in the picture as a whole
@@ -77,8 +80,9 @@ class FishHabits:
 def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.int64]) -> Array:
     """Yaw (n, J) rad at each joint for kinds (n,) of posture, within the skeleton's limits.
 
-    Two arcs, a wave that travels down the body, and a little of every part's own. Degrees are those of a chain of 20
-    bones; the hind half bends about twice as much as the front half, up to some 7 degrees a joint in a turn.
+    Two arcs, a wave that travels down the body, and a little of every part's own. Degrees are those
+    of a chain of 20 bones; the hind half bends about twice as much as the front half, up to some 7
+    degrees a joint in a turn.
     """
     n = len(kind)
     way = rng.choice([-1.0, 1.0], n)
@@ -107,11 +111,9 @@ def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.in
     amplitude = np.choose(
         kind, [0.4, 1.0 + 5.0 * strong[0], 1.5 * strong[0], 1.5 * strong[0], 2.0 * strong[0]]
     )
-    phase, length, middle = (
-        rng.uniform(-np.pi, np.pi, n),
-        rng.uniform(0.7, 1.4, n),
-        rng.normal(_FRONT, 0.06, n),
-    )
+    phase = rng.uniform(-np.pi, np.pi, n)
+    length = rng.uniform(0.7, 1.4, n)
+    middle = rng.normal(_FRONT, 0.06, n)
     own = rng.normal(0.0, 0.5, (n, 4))
     return bend_profile(skeleton, front, hind, amplitude, phase, length, middle, own)
 
@@ -128,8 +130,8 @@ def bend_profile(
 ) -> Array:
     """Yaw (n, J) rad of two arcs with a wave over them.
 
-    front, hind, amplitude (n,): degrees a joint; phase rad, length of the wave and where the arcs meet (n,), of the
-    body's length; own (n, 4): slow waves that stand, degrees.
+    front, hind, amplitude (n,): degrees a joint; phase rad, length of the wave and where the arcs
+    meet (n,), of the body's length; own (n, 4): slow waves that stand, degrees.
     """
     s = joint_reaches(skeleton)
     joint = 20.0 / max(1, skeleton.n_joints - 1)
@@ -147,7 +149,9 @@ def bend_profile(
 
 
 def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
-    """Poses (n) with these bends (n, J) and base rotations (n, 3, 3), their joints' mean at the origin."""
+    """Poses (n) with these bends (n, J) and base rotations (n, 3, 3), their joints' mean at the
+    origin.
+    """
     angles = np.zeros((*yaw.shape, 3))
     angles[..., 2] = yaw
     pose = Pose(SE3(rotation, np.zeros((len(yaw), 3))), angles, np.asarray(size, float))

@@ -1,4 +1,6 @@
-"""Any animal of which nothing but a skeleton and a surface is known: how it may lie, hang and move."""
+"""Any animal of which nothing but a skeleton and a surface is known: how it may lie, hang
+and move.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ _SMALL_MM = 35.0  # a shorter animal takes a camera made for the near
 _LIKE_NEXT = 0.75  # correlation of a joint's bend with its parent's
 _UNLIMITED_RAD = np.radians(100.0)  # an axis with a wider range was given no limits
 _USUAL_RAD = np.radians(45.0)  # and is taken to turn by this much
-_TILTS, _TILT_RAD = 8, 0.35  # of an animal that falls onto the floor, some lie lower than others
+# of an animal that falls onto the floor, some lie lower than others
+_TILTS = 8
+_TILT_RAD = 0.35
 _REARED_SHARE = 0.15  # and not all lie as low as they can
 _NEAR_SHARE = 0.55  # of the camera's height: no animal that floats comes nearer
 _CHANGE_S = 0.5  # a posture is held about this long
@@ -34,7 +38,9 @@ _CHANGE_S = 0.5  # a posture is held about this long
 
 @dataclass(frozen=True)
 class GenericHabits:
-    """An animal that lies on the floor, or (view frame 'camera') hangs above it, in any posture its joints allow."""
+    """An animal that lies on the floor, or (view frame 'camera') hangs above it, in any posture its
+    joints allow.
+    """
 
     skeleton: Skeleton
     sizes: tuple[float, float] = (0.9, 1.1)
@@ -56,7 +62,8 @@ class GenericHabits:
         """A place in which it is seen as a whole from anywhere, and not too small."""
         length = self.skeleton.length
         scale = float(np.clip(self.skeleton.relative_size, 0.3, 2.0))
-        # seen across the picture, with room to go about; no camera of this kind reads nearer than its least distance
+        # seen across the picture, with room to go about; no camera of this kind reads nearer than
+        # its least distance
         least = ARENA.camera_mm[0] if self.sensors == SENSORS else 230.0
         near = max(
             least,
@@ -127,15 +134,19 @@ class GenericHabits:
 
 
 def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
-    """Angles (n, J, 3) rad about the free axes, within the limits, each like its parent's; some bodies nearly straight.
+    """Angles (n, J, 3) rad about the free axes, within the limits, each like its parent's; some
+    bodies nearly straight.
 
-    A standard normal number goes down every chain; its quantile says where between the limits the joint stands.
+    A standard normal number goes down every chain; its quantile says where between the limits the
+    joint stands.
     """
     from scipy.special import ndtr
 
-    low, high = skeleton.limits[..., 0], skeleton.limits[..., 1]
+    low = skeleton.limits[..., 0]
+    high = skeleton.limits[..., 1]
     wide = high - low > 2.0 * _UNLIMITED_RAD
-    low, high = np.where(wide, -_USUAL_RAD, low), np.where(wide, _USUAL_RAD, high)
+    low = np.where(wide, -_USUAL_RAD, low)
+    high = np.where(wide, _USUAL_RAD, high)
     bent = rng.beta(1.2, 1.0, (n, 1, 1))  # how far this body leaves its home pose
     number = rng.standard_normal((n, skeleton.n_joints, 3))
     for j in range(1, skeleton.n_joints):
@@ -169,16 +180,20 @@ def moving_session(
     spine_mm: float | None = None,
     name: str = "moving",
 ) -> SyntheticSession:
-    """n_frames of one animal that goes about and changes its posture; arguments as in `SyntheticSession.draw`."""
+    """n_frames of one animal that goes about and changes its posture; arguments as in
+    `SyntheticSession.draw`.
+    """
     rng = np.random.default_rng(seed)
-    skeleton, sensor = habits.skeleton, sensor or habits.sensors[-1]
+    skeleton = habits.skeleton
+    sensor = sensor or habits.sensors[-1]
     length = (
         skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
     )
     stage = Stage.draw(rng, sensor.camera, length, habits.setting)
     shape = habits.shapes(rng, family, 1)
     step_s = habits.frame_ns * 1e-9
-    size, slow = np.full(n_frames, length / skeleton.length), _CHANGE_S / step_s
+    size = np.full(n_frames, length / skeleton.length)
+    slow = _CHANGE_S / step_s
     change = np.maximum.accumulate(
         np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0)
     )
@@ -186,7 +201,8 @@ def moving_session(
     angles = smoothed(drawn, 0.4 * slow).reshape(n_frames, -1, 3)
     speed = np.maximum(smoothed(rng.normal(0.4, 0.8, (n_frames, 1)), slow)[:, 0], 0.0)
     turning = smoothed(rng.normal(0.0, 3.0, (n_frames, 1)), slow)[:, 0]
-    level, body = np.zeros(n_frames), shape[0].broadcast(n_frames)
+    level = np.zeros(n_frames)
+    body = shape[0].broadcast(n_frames)
     flat = _centred(skeleton, angles, root_rotation(level, level, level), size)
     low, high = habits._extent(flat, body, size)
     top = (

@@ -1,5 +1,6 @@
-"""Synthetic recordings in which an animal moves as one: a mouse walks, turns, pauses, rears, hunches and curls; a fish
-scoots, glides, turns, rises, dives and rests; any animal wanders through its place and stays within the picture.
+"""Synthetic recordings in which an animal moves as one: a mouse walks, turns, pauses, rears,
+hunches and curls; a fish scoots, glides, turns, rises, dives and rests; any animal wanders through
+its place and stays within the picture.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from liex_lab.simulation.species import MouseHabits
 Array = NDArray[np.float64]
 
 _RATE_HZ = 30.0
-# the stretches of a walk: how many in a shuffled deck, shortest and longest duration in s, speed in spines a second
+# the stretches of a walk: how many in a shuffled deck, shortest and longest duration in s, speed in
+# spines a second
 _WALK, _CURL, _REAR, _HUNCH, _REACH = range(len(KINDS))
 _STRETCHES = {
     _WALK: (4, 0.7, 3.0, (0.6, 2.8)),
@@ -32,11 +34,15 @@ _BLEND_S = 0.12  # postures flow into one another over about this long
 _STRIDE_HZ_PER_SPINE = 1.6
 
 _NEAREST_MM = 180.0  # to the camera
-_BOUT_S, _REST_S = (0.15, 0.6), (0.1, 1.2)  # of beating, and of gliding or hanging still between
+# of beating, and of gliding or hanging still between
+_BOUT_S = (0.15, 0.6)
+_REST_S = (0.1, 1.2)
 _GLIDE_S = 0.35  # a glide has slowed down by a factor e after this long
 _LENGTHS_S = (1.0, 5.0)  # speed that a bout reaches
 _BEAT_HZ = (4.0, 9.0)
-_TURN_SHARE, _TURN_RAD_S = 0.35, (4.0, 16.0)  # of the bouts begin with a turn, which lasts _TURN_S
+# of the bouts begin with a turn, which lasts _TURN_S
+_TURN_SHARE = 0.35
+_TURN_RAD_S = (4.0, 16.0)
 _TURN_S = 0.14
 _BEND_PER_TURN = 0.55  # degrees a joint for each rad/s of turning
 _CLIMB_RAD = np.radians(25.0)
@@ -55,7 +61,9 @@ def walking_session(
     habits: MouseHabits | None = None,
     name: str = "walking",
 ) -> SyntheticSession:
-    """n_frames of one animal at 30 frames/s, drawn from the seed; arguments as in `SyntheticSession.draw`."""
+    """n_frames of one animal at 30 frames/s, drawn from the seed; arguments as in
+    `SyntheticSession.draw`.
+    """
     rng = np.random.default_rng(seed)
     habits = MouseHabits() if habits is None else habits
     skeleton = habits.skeleton
@@ -94,7 +102,8 @@ def walking_session(
 
 def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
     """What the animal does in each frame (n,), and how fast it goes (n,) spines/s."""
-    kinds, speed = np.empty(n, np.int64), np.empty(n)
+    kinds = np.empty(n, np.int64)
+    speed = np.empty(n)
     deck: list[int] = []
     at = 0
     while at < n:
@@ -108,7 +117,8 @@ def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], A
         kind = deck.pop()
         _, shortest, longest, (slow, fast) = _STRETCHES[kind]
         stop = at + int(_RATE_HZ * rng.uniform(shortest, longest))
-        kinds[at:stop], speed[at:stop] = kind, rng.uniform(slow, fast)
+        kinds[at:stop] = kind
+        speed[at:stop] = rng.uniform(slow, fast)
         at = stop
     return kinds, np.maximum(_smooth(speed[:, None])[:, 0], 0.0)
 
@@ -116,7 +126,9 @@ def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], A
 def _flow(
     rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]
 ) -> Posture:
-    """One posture a stretch, held with slow changes within it, and blended where the next begins."""
+    """One posture a stretch, held with slow changes within it, and blended where the next
+    begins.
+    """
     drawn = draw_postures(rng, skeleton, kinds, shape)
     n = len(kinds)
     change = np.concatenate([[True], (kinds[1:] != kinds[:-1]) | (rng.random(n - 1) < 0.04)])
@@ -139,8 +151,11 @@ def _smooth(rows: Array) -> Array:
 def _path(
     rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array
 ) -> tuple[Array, Array]:
-    """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back before a wall."""
-    n, camera = len(speed), stage.camera
+    """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back
+    before a wall.
+    """
+    n = len(speed)
+    camera = stage.camera
     middle = floor_point(
         camera,
         stage.T_arena_camera,
@@ -148,8 +163,11 @@ def _path(
     )
     home = stage.centre if stage.freedom(stage.centre) > stage.freedom(middle) else middle
     margin = min(0.85 * spine_mm, 0.7 * stage.freedom(home))
-    position, heading = np.empty((n, 2)), np.empty(n)
-    at, way, rate = home + rng.normal(0.0, 0.2 * margin, 2), rng.uniform(-np.pi, np.pi), 0.0
+    position = np.empty((n, 2))
+    heading = np.empty(n)
+    at = home + rng.normal(0.0, 0.2 * margin, 2)
+    way = rng.uniform(-np.pi, np.pi)
+    rate = 0.0
     for i in range(n):
         rate = 0.93 * rate + rng.normal(0.0, 0.25)
         back = np.arctan2(home[1] - at[1], home[0] - at[0])
@@ -161,7 +179,8 @@ def _path(
         step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
         if stage.freedom(at + step) > margin or stage.freedom(at + step) > stage.freedom(at):
             at = at + step
-        position[i], heading[i] = at, way
+        position[i] = at
+        heading[i] = way
     return position, heading
 
 
@@ -178,7 +197,9 @@ def swimming_session(
     habits: FishHabits | None = None,
     name: str = "swimming",
 ) -> SyntheticSession:
-    """n_frames of one fish at 50 frames/s, drawn from the seed; arguments as in `SyntheticSession.draw`."""
+    """n_frames of one fish at 50 frames/s, drawn from the seed; arguments as in
+    `SyntheticSession.draw`.
+    """
     rng = np.random.default_rng(seed)
     habits = FishHabits() if habits is None else habits
     skeleton = habits.skeleton
@@ -227,19 +248,21 @@ def swimming_session(
 def _swim_script(
     rng: np.random.Generator, n: int, step_s: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,) rad of the tail."""
+    """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,)
+    rad of the tail.
+    """
     speed, turning, amplitude, rate = np.zeros((4, n))
-    at, pace = 0, 0.0
+    at = 0
+    pace = 0.0
     while at < n:
-        reached, beats = rng.uniform(*_LENGTHS_S), rng.uniform(*_BEAT_HZ)
+        reached = rng.uniform(*_LENGTHS_S)
+        beats = rng.uniform(*_BEAT_HZ)
         beating, resting = (max(2, int(rng.uniform(*span) / step_s)) for span in (_BOUT_S, _REST_S))
         stop = min(at + beating, n)
         pace = max(reached, pace)
         speed[at:stop] = pace
-        amplitude[at:stop], rate[at:stop] = (
-            rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1]),
-            beats,
-        )
+        amplitude[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1])
+        rate[at:stop] = beats
         if rng.random() < _TURN_SHARE:
             brief = min(at + max(2, int(_TURN_S / step_s)), n)
             turning[at:brief] = rng.choice([-1.0, 1.0]) * rng.uniform(*_TURN_RAD_S)
@@ -269,9 +292,11 @@ def wander(
     water: tuple[float, float],
     step_s: float,
 ) -> tuple[Array, Array]:
-    """Positions (n, 3) mm of the body's middle between two heights of the water, and headings (n,) rad.
+    """Positions (n, 3) mm of the body's middle between two heights of the water, and headings (n,)
+    rad.
 
-    The fish turns away from walls and from the border of the picture; where there is no way on it stays.
+    The fish turns away from walls and from the border of the picture; where there is no way on it
+    stays.
     """
     n = len(speed)
     centre = stage.camera.unproject(
@@ -284,8 +309,10 @@ def wander(
         stage.T_arena_camera.translation + ray * (stage.T_arena_camera.translation[2] - z) / -ray[2]
     )[:2]
     margin = 0.6 * length
-    position, headings = np.empty((n, 3)), np.empty(n)
-    xy, way = home + rng.normal(0.0, 0.1 * length, 2), rng.uniform(-np.pi, np.pi)
+    position = np.empty((n, 3))
+    headings = np.empty(n)
+    xy = home + rng.normal(0.0, 0.1 * length, 2)
+    way = rng.uniform(-np.pi, np.pi)
     for i in range(n):
         back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
         away = (back - way + np.pi) % (2 * np.pi) - np.pi
@@ -297,7 +324,8 @@ def wander(
         if free > margin or free > stage.freedom(xy, z):
             xy = xy + step
         z = float(np.clip(z + run * np.sin(pitch[i]), low, high))
-        position[i], headings[i] = [*xy, z], way
+        position[i] = [*xy, z]
+        headings[i] = way
     return position, headings
 
 

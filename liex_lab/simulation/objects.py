@@ -1,4 +1,6 @@
-"""Things beside the animal: blocks, balls, cables, a hand, pellets, plants, a fish; meshes made of rounded parts."""
+"""Things beside the animal: blocks, balls, cables, a hand, pellets, plants, a fish; meshes made of
+rounded parts.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ Array = NDArray[np.float64]
 
 THINGS = ("block", "ball", "cable", "hand")
 N_PARTS = 8
-_RINGS, _SEGMENTS = 7, 14
+_RINGS = 7
+_SEGMENTS = 14
 
 
 def _unit_sphere() -> Array:
@@ -31,11 +34,14 @@ PART_FACES = joined_faces([(_RINGS, _SEGMENTS)])
 
 
 def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
-    """Vertices (..., V, 3) mm of superellipsoids: power 2 is an ellipsoid, a large power a block; turned by yaw rad."""
+    """Vertices (..., V, 3) mm of superellipsoids: power 2 is an ellipsoid, a large power a block;
+    turned by yaw rad.
+    """
     p = np.asarray(power, float)[..., None, None]
     unit = SPHERE / (np.abs(SPHERE) ** p).sum(axis=-1, keepdims=True) ** (1.0 / p)
     local = unit * np.asarray(radii, float)[..., None, :]
-    c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
+    c = np.cos(yaw)[..., None]
+    s = np.sin(yaw)[..., None]
     turned = np.stack(
         [
             c * local[..., 0] - s * local[..., 1],
@@ -70,59 +76,66 @@ def _fish(
     rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
 ) -> None:
     """Another fish, well smaller than the animal: a body and a tail."""
-    long, heading = spine_mm * rng.uniform(0.30, 0.55), rng.uniform(-np.pi, np.pi)
+    long = spine_mm * rng.uniform(0.30, 0.55)
+    heading = rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(heading), np.sin(heading)])
     lift = spine_mm * rng.uniform(0.15, 1.5)
     for k, (at, length, wide, high) in enumerate(
         [(0.12, 0.40, 0.075, 0.11), (-0.32, 0.22, 0.02, 0.07)]
     ):
         centre[k] = [*(at * long * ahead), lift]
-        radii[k], yaw[k] = long * np.array([length, wide, high]), heading
+        radii[k] = long * np.array([length, wide, high])
+        yaw[k] = heading
 
 
 _IN_WATER = {"pellet": _pellet, "plant": _plant, "fish": _fish}
 
 
 def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
-    """Vertices (N_PARTS * V, 3) mm of one thing standing on the floor around the origin, faces as in THING_FACES.
+    """Vertices (N_PARTS * V, 3) mm of one thing standing on the floor around the origin, faces as
+    in THING_FACES.
 
-    Blocks and balls are from a third of to somewhat over the animal's size; pellets sink, plants stand and another fish
-    swims in a tank. Unused parts shrink to nothing.
+    Blocks and balls are from a third of to somewhat over the animal's size; pellets sink, plants
+    stand and another fish swims in a tank. Unused parts shrink to nothing.
     """
-    centre, radii = np.zeros((N_PARTS, 3)), np.zeros((N_PARTS, 3))
-    yaw, power = np.zeros(N_PARTS), np.full(N_PARTS, 2.0)
+    centre = np.zeros((N_PARTS, 3))
+    radii = np.zeros((N_PARTS, 3))
+    yaw = np.zeros(N_PARTS)
+    power = np.full(N_PARTS, 2.0)
     if kind in ("block", "ball"):
         radii[0] = spine_mm * rng.uniform(0.16, 0.55, 3) * [1.0, 0.75, 0.6]
         if kind == "block":
-            yaw[0], power[0] = rng.uniform(-np.pi, np.pi), 12.0
+            yaw[0] = rng.uniform(-np.pi, np.pi)
+            power[0] = 12.0
         else:
             radii[0] = radii[0].mean() * rng.uniform(0.9, 1.1, 3)
         centre[0, 2] = radii[0, 2]
     elif kind in _IN_WATER:
         _IN_WATER[kind](rng, spine_mm, centre, radii, yaw)
     elif kind == "cable":
-        step, thick, heading, bend = (
-            rng.uniform(10, 22),
-            rng.uniform(3, 7),
-            rng.uniform(-3, 3),
-            rng.normal(0, 0.25),
-        )
+        step = rng.uniform(10, 22)
+        thick = rng.uniform(3, 7)
+        heading = rng.uniform(-3, 3)
+        bend = rng.normal(0, 0.25)
         at = np.array([-3.5 * step * np.cos(heading), -3.5 * step * np.sin(heading)])
         for k in range(N_PARTS):
-            centre[k], radii[k], yaw[k] = [*at, thick], [0.8 * step, thick, thick], heading
+            centre[k] = [*at, thick]
+            radii[k] = [0.8 * step, thick, thick]
+            yaw[k] = heading
             at = at + step * np.array([np.cos(heading), np.sin(heading)])
             heading += bend + rng.normal(0, 0.15)
     else:
-        lift, size, pointing = rng.uniform(0, 50), rng.uniform(0.8, 1.1), rng.uniform(-np.pi, np.pi)
-        centre[0], radii[0], power[0], yaw[0] = (
-            [0, 0, lift + 16],
-            size * np.array([42.0, 38.0, 15.0]),
-            3.0,
-            pointing,
-        )
+        lift = rng.uniform(0, 50)
+        size = rng.uniform(0.8, 1.1)
+        pointing = rng.uniform(-np.pi, np.pi)
+        centre[0] = [0, 0, lift + 16]
+        radii[0] = size * np.array([42.0, 38.0, 15.0])
+        power[0] = 3.0
+        yaw[0] = pointing
         for k in range(1, 6):
             fan = pointing + (k - 3) * 0.28
             reach = size * (70.0 if k < 5 else 55.0)
             centre[k] = [reach * np.cos(fan), reach * np.sin(fan), lift + 12]
-            radii[k], yaw[k] = size * np.array([34.0, 8.0, 8.0]), fan
+            radii[k] = size * np.array([34.0, 8.0, 8.0])
+            yaw[k] = fan
     return rounded(centre, radii, yaw, power).reshape(-1, 3)

@@ -1,4 +1,6 @@
-"""The postures a mouse-like animal takes: a prior to draw from, every one of them standing on the floor."""
+"""The postures a mouse-like animal takes: a prior to draw from, every one of them standing on the
+floor.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
 
-# share of frames: going about, curled up, reared up, hunched (grooming, eating), reaching with the head
+# share of frames: going about, curled up, reared up, hunched (grooming, eating), reaching with the
+# head
 KINDS = ("walk", "curl", "rear", "hunch", "reach")
 SHARES = (0.42, 0.17, 0.17, 0.10, 0.14)
 STRETCH = (0.93, 1.07)  # of the spine, from frame to frame
@@ -27,8 +30,8 @@ _MAX_GAP_MM = 3.0  # between the floor and the lowest point of the body
 
 @dataclass(frozen=True)
 class Posture:
-    """Bone elevations (n, J - 1) rad above the floor, turns (n, J) rad to the left at each joint, roll (n,) rad and
-    stretch (n,): what a posture is before it stands anywhere.
+    """Bone elevations (n, J - 1) rad above the floor, turns (n, J) rad to the left at each joint,
+    roll (n,) rad and stretch (n,): what a posture is before it stands anywhere.
     """
 
     elevation: Array
@@ -45,10 +48,11 @@ def sample_postures(
     shape: BodyShape | None = None,
     kinds: NDArray[np.int64] | None = None,
 ) -> tuple[Pose, Array]:
-    """N poses in the arena frame, rump above the origin, heading uniform; and the girth (n,) of their bodies.
+    """N poses in the arena frame, rump above the origin, heading uniform; and the girth (n,) of
+    their bodies.
 
-    size (n,) of the animals over home size, shape (n) their bodies, kinds (n,) indices into `KINDS` (None draws them
-    by `SHARES`). A stretched animal is thinner, a compressed one fatter.
+    size (n,) of the animals over home size, shape (n) their bodies, kinds (n,) indices into `KINDS`
+    (None draws them by `SHARES`). A stretched animal is thinner, a compressed one fatter.
     """
     bodies = (BodyShape.default(skeleton) if shape is None else shape).broadcast(n)
     size = np.broadcast_to(np.asarray(size, float), (n,))
@@ -63,14 +67,16 @@ def draw_postures(
     rng: np.random.Generator, skeleton: Skeleton, kinds: NDArray[np.int64], shape: BodyShape
 ) -> Posture:
     """Postures of the given kinds (n,), for bodies of the given shapes (n)."""
-    n, n_bones = len(kinds), skeleton.n_joints - 1
+    n = len(kinds)
+    n_bones = skeleton.n_joints - 1
     bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
     rest = resting_heights(skeleton, shape)
 
     def is_kind(name: str) -> NDArray[np.bool_]:
         return (kinds == KINDS.index(name))[:, None]
 
-    # going about: the mid-axis lies as high as the body is thick, a little more towards the front; the nose is low
+    # going about: the mid-axis lies as high as the body is thick, a little more towards the front;
+    # the nose is low
     height = rest + np.linspace(0.5, 4.0, n_bones + 1) * rng.random((n, n_bones + 1))
     height[:, -1] = rng.uniform(4.0, 15.0, n)
     low = np.arcsin(np.clip(np.diff(height, axis=1) / bones, -0.9, 0.9))
@@ -102,8 +108,11 @@ def _draw_turns(
     curled: NDArray[np.bool_],
     reaching: NDArray[np.bool_],
 ) -> Array:
-    """Turns (n, J) rad to the left at the joints: slight, or up to 100 degrees in all, and the head's own."""
-    n, inner = len(curled), skeleton.n_joints - 2
+    """Turns (n, J) rad to the left at the joints: slight, or up to 100 degrees in all, and the
+    head's own.
+    """
+    n = len(curled)
+    inner = skeleton.n_joints - 2
     turn = np.zeros((n, skeleton.n_joints))
     slight = np.radians(rng.normal(0.0, 8.0, (n, inner)))
     total = np.radians(rng.uniform(30.0, 100.0, (n, 1))) * rng.choice([-1.0, 1.0], (n, 1))
@@ -117,7 +126,9 @@ def _draw_turns(
 
 
 def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
-    """Heights (n, J) mm at scale 1 at which the joints lie when the trunk just touches the floor under each."""
+    """Heights (n, J) mm at scale 1 at which the joints lie when the trunk just touches the floor
+    under each.
+    """
     stations = np.asarray(skeleton.surface["stations"], float)
     reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
     return np.stack([np.interp(reach / reach[-1], stations, high) for high in shape.half_height])
@@ -126,20 +137,23 @@ def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
 def stand(
     skeleton: Skeleton, posture: Posture, heading: Array, size: Array, shape: BodyShape, gap: Array
 ) -> tuple[Pose, Array]:
-    """Put postures (n) on the floor z = 0, rump above the origin: poses in the arena frame and girths (n,).
+    """Put postures (n) on the floor z = 0, rump above the origin: poses in the arena frame and
+    girths (n,).
 
-    The rear part of the trunk comes to lie `gap` (n,) mm above the floor; where the front would go below it, the whole
-    animal tips up around the rump.
+    The rear part of the trunk comes to lie `gap` (n,) mm above the floor; where the front would go
+    below it, the whole animal tips up around the rump.
     """
     angles = np.zeros((len(size), skeleton.n_joints, 3))
     angles[:, 1:-1, 1] = -np.diff(posture.elevation, axis=1)
     angles[..., 2] = posture.turn
     angles = np.clip(angles, skeleton.limits[..., 0], skeleton.limits[..., 1])
     angles[:, 0] = 0.0
-    scale, girth = size * posture.stretch, size / np.sqrt(posture.stretch)
+    scale = size * posture.stretch
+    girth = size / np.sqrt(posture.stretch)
     stations = np.asarray(skeleton.surface["stations"], float)
     elevation = posture.elevation[:, 0].copy()
-    rear, pose = stations <= _REAR_PART, Pose.home(skeleton, len(size))
+    rear = stations <= _REAR_PART
+    pose = Pose.home(skeleton, len(size))
     for _ in range(6):
         rotation = root_rotation(heading, elevation, posture.roll)
         pose = Pose(SE3(rotation, np.zeros((len(size), 3))), angles, scale)
@@ -178,12 +192,11 @@ def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
 def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out):
     """Fill out (n, R) mm with the lowest point of the trunk's ellipse at every station."""
     for i in prange(len(joints)):
-        arc, frame = np.empty(joints.shape[1]), np.empty((4, 3))
+        arc = np.empty(joints.shape[1])
+        frame = np.empty((4, 3))
         chain_arc(joints[i], arc)
         for r in range(len(stations)):
             spine_frame(joints[i], rotations[i], arc, stations[r], frame)
-            side, rise = (
-                girth[i] * half_width[i, r] * frame[2, 2],
-                girth[i] * half_height[i, r] * frame[3, 2],
-            )
+            side = girth[i] * half_width[i, r] * frame[2, 2]
+            rise = girth[i] * half_height[i, r] * frame[3, 2]
             out[i, r] = frame[0, 2] - np.sqrt(side * side + rise * rise)

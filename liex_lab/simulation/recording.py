@@ -1,6 +1,8 @@
-"""Synthetic recordings: a virtual animal in a virtual arena before an imitated sensor, with the exact truth.
+"""Synthetic recordings: a virtual animal in a virtual arena before an imitated sensor, with the
+exact truth.
 
-Frames are made when asked for, from a seed, in any order. `test_split` holds the splits on which accuracy is told.
+Frames are made when asked for, from a seed, in any order. `test_split` holds the splits on which
+accuracy is told.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from liex_lab.simulation.species import Habits, MouseHabits
 Array = NDArray[np.float64]
 
 FRAME_NS = MouseHabits.frame_ns
-N_SESSIONS, N_FRAMES = 40, 50
+N_SESSIONS = 40
+N_FRAMES = 50
 # name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
 SPLITS = {
     "clean": (71_001, "train", 1.0, 0, 0.0),
@@ -42,9 +45,9 @@ SPLITS = {
 class Cast:
     """Everything in front of a virtual camera that moves, and the camera's own errors.
 
-    pose (n), arena frame; girth (n,); shape: one animal; bends (n, TAIL_RINGS) rad: its tail. things (n, V, 3) mm:
-    other objects, shown where `shown` (n,). parameters (n, N_PARAMETERS) of the sensor, seeds (n,) of its noise.
-    thing_faces (F, 3): of the other objects' meshes.
+    pose (n), arena frame; girth (n,); shape: one animal; bends (n, TAIL_RINGS) rad: its tail.
+    things (n, V, 3) mm: other objects, shown where `shown` (n,). parameters (n, N_PARAMETERS) of
+    the sensor, seeds (n,) of its noise. thing_faces (F, 3): of the other objects' meshes.
     """
 
     skeleton: Skeleton
@@ -63,8 +66,9 @@ class Cast:
 class TrueRecording(Recording):
     """A virtual recording and its truth.
 
-    spine_mm: the animal's size over the session; pose (n): root T_camera_root, angles, scale; joints_camera (n, J, 3)
-    and joints_arena (n, J, 3) mm; T_arena_camera: exact; floor: the exact plane, or what stands for it.
+    spine_mm: the animal's size over the session; pose (n): root T_camera_root, angles, scale;
+    joints_camera (n, J, 3) and joints_arena (n, J, 3) mm; T_arena_camera: exact; floor: the exact
+    plane, or what stands for it.
     """
 
     skeleton: Skeleton
@@ -92,12 +96,12 @@ class SyntheticSession(TrueRecording):
         super().__init__(
             name=name, format="synthetic", camera=stage.camera, times_ns=times, read=self._depth
         )
-        self.stage, self.cast, self.skeleton = stage, cast, cast.skeleton
-        self.surface, self.shape, self.spine_mm = (
-            Surface.of(cast.skeleton),
-            cast.shape,
-            cast.spine_mm,
-        )
+        self.stage = stage
+        self.cast = cast
+        self.skeleton = cast.skeleton
+        self.surface = Surface.of(cast.skeleton)
+        self.shape = cast.shape
+        self.spine_mm = cast.spine_mm
         self.T_arena_camera = stage.T_arena_camera
         normal = -self.T_arena_camera.rotation[2]
         self.floor = Floor.from_plane(
@@ -112,7 +116,9 @@ class SyntheticSession(TrueRecording):
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth (n, H, W) mm of frames start to stop, made on all threads."""
-        cast, part, camera = self.cast, slice(start, stop), self.stage.camera
+        cast = self.cast
+        part = slice(start, stop)
+        camera = self.stage.camera
         pose = Pose(
             SE3(cast.pose.root.rotation[part], cast.pose.root.translation[part]),
             cast.pose.angles[part],
@@ -163,10 +169,12 @@ class SyntheticSession(TrueRecording):
         habits: Habits | None = None,
         name: str | None = None,
     ) -> SyntheticSession:
-        """A session of independent postures and places: one camera, arena and animal, all drawn from the seed.
+        """A session of independent postures and places: one camera, arena and animal, all drawn
+        from the seed.
 
-        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws it. thing_share: of frames with
-        another object in view. See `Sensor.draw` for noise and erosion_px, `draw_shapes` for family.
+        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws it.
+        thing_share: of frames with another object in view. See `Sensor.draw` for noise and
+        erosion_px, `draw_shapes` for family.
         """
         rng = np.random.default_rng(seed)
         habits = MouseHabits() if habits is None else habits
@@ -178,10 +186,8 @@ class SyntheticSession(TrueRecording):
         spine = drawn if spine_mm is None else float(spine_mm)
         stage = Stage.draw(rng, sensor.camera, spine, habits.setting)
         shape = habits.shapes(rng, family, 1)
-        size, camera_mm = (
-            np.full(n_frames, spine / home),
-            np.full(n_frames, stage.T_arena_camera.translation[2]),
-        )
+        size = np.full(n_frames, spine / home)
+        camera_mm = np.full(n_frames, stage.T_arena_camera.translation[2])
         pose, girth, _ = habits.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
         cast = assemble(
             rng,
@@ -217,7 +223,9 @@ def assemble(
     thing_share: float,
     scatter: bool,
 ) -> Cast:
-    """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things beside it."""
+    """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things
+    beside it.
+    """
     n = len(girth)
     surface = Surface.of(habits.skeleton)
     bends = habits.bends(rng, n)
@@ -245,10 +253,13 @@ def _beside(
     habits: Habits,
     stride: int,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """One thing for a session, at a free place of its own in every frame: (n, V, 3) mm and where it is shown (n,)."""
+    """One thing for a session, at a free place of its own in every frame: (n, V, 3) mm and where it
+    is shown (n,).
+    """
     mesh = draw_thing(rng, str(rng.choice(habits.things)), spine_mm)
     n = len(trunk)
-    things, shown = np.repeat(mesh[None], n, axis=0), rng.random(n) < share
+    things = np.repeat(mesh[None], n, axis=0)
+    shown = rng.random(n) < share
     reach = 1.1 * stage.half
     for i in np.flatnonzero(shown):
         own = trunk[i, ::3, :2]
@@ -270,10 +281,8 @@ def _beside(
 def _covers(stage: Stage, thing: Array, trunk: Array, margin_px: float) -> bool:
     """Whether the thing and the animal overlap in the picture or nearly so."""
     T_camera_arena = stage.T_arena_camera.inverse()
-    a, b = (
-        stage.camera.project(T_camera_arena @ thing),
-        stage.camera.project(T_camera_arena @ trunk),
-    )
+    a = stage.camera.project(T_camera_arena @ thing)
+    b = stage.camera.project(T_camera_arena @ trunk)
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
     around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()
@@ -287,10 +296,12 @@ def test_split(
     habits: Habits | None = None,  # noqa: PT028
     seed: int | None = None,  # noqa: PT028
 ) -> list[SyntheticSession]:
-    """The sessions of a fixed split: 'clean', 'hard' or 'other-body', 40 of 50 frames, as many from each sensor.
+    """The sessions of a fixed split: 'clean', 'hard' or 'other-body', 40 of 50 frames, as many from
+    each sensor.
 
-    spine_mm sets the animals' size instead of drawing it; n_sessions takes only the first ones; habits: of the animal,
-    None a mouse; seed: another one makes recordings like those of the split, to develop on.
+    spine_mm sets the animals' size instead of drawing it; n_sessions takes only the first ones;
+    habits: of the animal, None a mouse; seed: another one makes recordings like those of the split,
+    to develop on.
     """
     if name not in SPLITS:
         raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")

@@ -1,4 +1,6 @@
-"""A virtual arena in front of a virtual camera: floor, walls, clutter, and where in it an animal can be."""
+"""A virtual arena in front of a virtual camera: floor, walls, clutter, and where in it an animal
+can be.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from liex_lab.simulation.objects import THING_FACES, draw_thing
 
 Array = NDArray[np.float64]
 
-ROUND, BOX = "round", "box"
+ROUND = "round"
+BOX = "box"
 _EDGE_PX = 6.0  # an animal stays this far inside the picture
 _WALL_MM = 3.0  # and its trunk this far from walls
 _CLUTTER_MM = 12.0  # and from what stands around
@@ -25,9 +28,9 @@ _TRIES = 64
 class Setting:
     """What surrounds an animal, as a rule: lengths in mm.
 
-    camera_mm: heights of cameras above the floor, tilted by up to tilt_rad; walls_mm: heights of walls, and a share
-    `open_share` of the places has none; clutter: what stands around; scale: of corners, unevenness, distances and
-    estimation errors, over those of a mouse's arena.
+    camera_mm: heights of cameras above the floor, tilted by up to tilt_rad; walls_mm: heights of
+    walls, and a share `open_share` of the places has none; clutter: what stands around; scale: of
+    corners, unevenness, distances and estimation errors, over those of a mouse's arena.
     """
 
     camera_mm: tuple[float, float] = (500.0, 1000.0)
@@ -45,9 +48,10 @@ ARENA = Setting()
 class Stage:
     """What a virtual camera looks at.
 
-    still (H, W) float32 mm: the ideal depth without the animal, 0 = nothing in range; T_arena_camera: exact; kind:
-    round or box; centre (2,) mm and half (2,) mm extents (or radii) of the walls in the arena frame, turned by yaw rad;
-    clutter (n, 2) mm: outline points of what stands around.
+    still (H, W) float32 mm: the ideal depth without the animal, 0 = nothing in range;
+    T_arena_camera: exact; kind: round or box; centre (2,) mm and half (2,) mm extents (or radii) of
+    the walls in the arena frame, turned by yaw rad; clutter (n, 2) mm: outline points of what
+    stands around.
     """
 
     camera: Camera
@@ -70,7 +74,8 @@ class Stage:
         height = float(T_arena_camera.translation[2])
         view = height * np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2.0
         kind = str(rng.choice([ROUND, BOX]))
-        least, most = 1.6 * spine_mm, 420.0 * max(setting.scale, 1.0)
+        least = 1.6 * spine_mm
+        most = 420.0 * max(setting.scale, 1.0)
         if kind == ROUND:
             half = np.full(2, max(least, rng.uniform(0.75, 1.15) * min(view[1], most)))
         else:
@@ -78,10 +83,8 @@ class Stage:
         middle = np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0])
         centre = floor_point(camera, T_arena_camera, middle) + rng.uniform(-0.15, 0.15, 2) * half
         low, high = setting.walls_mm
-        yaw, wall_mm = (
-            float(rng.uniform(-0.3, 0.3)),
-            float(rng.uniform(low, min(high, 0.7 * height))),
-        )
+        yaw = float(rng.uniform(-0.3, 0.3))
+        wall_mm = float(rng.uniform(low, min(high, 0.7 * height)))
         if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
         stage = Stage(
@@ -100,7 +103,8 @@ class Stage:
     def _furnished(self, rng: np.random.Generator, spine_mm: float, setting: Setting) -> Stage:
         """The same with its still picture, and in a third of them a thing or two near the wall."""
         still = self._ideal_depth(rng, setting.scale)
-        T_camera_arena, outline = self.T_arena_camera.inverse(), []
+        T_camera_arena = self.T_arena_camera.inverse()
+        outline = []
         for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
             mesh = draw_thing(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
             way = rng.uniform(-np.pi, np.pi)
@@ -125,7 +129,8 @@ class Stage:
     @staticmethod
     def _turned(xy: Array, yaw: float) -> Array:
         """Points (..., 2) turned by yaw rad."""
-        c, s = np.cos(yaw), np.sin(yaw)
+        c = np.cos(yaw)
+        s = np.sin(yaw)
         return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
 
     def room(self, xy: Array) -> Array:
@@ -136,7 +141,9 @@ class Stage:
         return np.min(self.half - np.abs(local), axis=-1)
 
     def freedom(self, xy: Array, z: float = 0.0) -> float:
-        """How far (mm) a point of the floor, or z mm above it, is from walls, clutter and the border of the picture."""
+        """How far (mm) a point of the floor, or z mm above it, is from walls, clutter and the
+        border of the picture.
+        """
         c = self.camera
         p = self.T_arena_camera.inverse() @ np.array([xy[0], xy[1], z])
         uv = c.project(p)
@@ -147,8 +154,11 @@ class Stage:
         return free
 
     def _ideal_depth(self, rng: np.random.Generator, scale: float) -> NDArray[np.float32]:
-        """Depth (H, W) mm along every ray: floor within the walls, walls up to their height, beyond them little."""
-        T, camera = self.T_arena_camera, self.camera
+        """Depth (H, W) mm along every ray: floor within the walls, walls up to their height, beyond
+        them little.
+        """
+        T = self.T_arena_camera
+        camera = self.camera
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         d = camera.unproject(np.stack([u, v], axis=-1), np.ones(u.shape)) @ T.rotation.T
         height = T.translation[2]
@@ -158,7 +168,8 @@ class Stage:
         raised = _unevenness(rng, ground, scale)
         room = self.room(ground)
         # multiple reflections fill the corner between floor and wall
-        corner, spread = rng.uniform(0.0, 12.0) * scale, rng.uniform(6.0, 25.0) * scale
+        corner = rng.uniform(0.0, 12.0) * scale
+        spread = rng.uniform(6.0, 25.0) * scale
         raised += corner * np.exp(-np.maximum(room, 0.0) / spread) * (self.wall_mm > 0)
         inside = (room > 0) & (d[..., 2] < -1e-3)
         depth = np.where(inside, floor - raised / fall, 0.0)
@@ -176,11 +187,14 @@ class Stage:
         return np.where((depth > 100.0) & (depth < 4500.0), depth, 0.0).astype(np.float32)
 
     def _wall_distance(self, direction: Array) -> Array:
-        """Depth (H, W) mm at which rays from the camera leave the walls' outline; 0 when they never do."""
+        """Depth (H, W) mm at which rays from the camera leave the walls' outline; 0 when they never
+        do.
+        """
         start = self._turned(-self.centre, -self.yaw)
         d = self._turned(direction[..., :2], -self.yaw)
         if self.kind == ROUND:
-            a, b = np.sum(d * d, axis=-1), d @ start
+            a = np.sum(d * d, axis=-1)
+            b = d @ start
             c = start @ start - self.half[0] ** 2
             root = b * b - a * c
             return np.where(
@@ -195,10 +209,11 @@ class Stage:
     def places(
         self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None
     ) -> Array:
-        """Shifts (n, 2) mm that bring each of n bodies to a random free place on the floor, whole and in the picture.
+        """Shifts (n, 2) mm that bring each of n bodies to a random free place on the floor, whole
+        and in the picture.
 
-        outline (n, K, 2) mm: outermost points of the bodies on the floor; tops, bottoms (n,) mm: how high they reach
-        and begin, None on the floor.
+        outline (n, K, 2) mm: outermost points of the bodies on the floor; tops, bottoms (n,) mm:
+        how high they reach and begin, None on the floor.
         """
         n = len(outline)
         middle = outline.mean(axis=1)
@@ -206,7 +221,8 @@ class Stage:
         aim = self.centre + rng.uniform(-reach, reach, (n, _TRIES, 2))
         points = outline[:, None] - middle[:, None, None] + aim[:, :, None]
         room = self.room(points).min(axis=2) - _WALL_MM
-        T_camera_arena, c = self.T_arena_camera.inverse(), self.camera
+        T_camera_arena = self.T_arena_camera.inverse()
+        c = self.camera
         for height in (np.zeros(n) if bottoms is None else bottoms, tops):
             above = np.broadcast_to(height[:, None, None, None], (*points.shape[:-1], 1))
             uv = c.project(T_camera_arena @ np.concatenate([points, above], axis=-1))
@@ -230,7 +246,8 @@ class Stage:
 
 def draw_views(rng: np.random.Generator, m: int, setting: Setting = ARENA) -> SE3:
     """T_arena_camera (m) of cameras that look down on a setting, tilted in any direction."""
-    tilt, toward = setting.tilt_rad * np.sqrt(rng.random(m)), rng.uniform(-np.pi, np.pi, m)
+    tilt = setting.tilt_rad * np.sqrt(rng.random(m))
+    toward = rng.uniform(-np.pi, np.pi, m)
     up = -np.stack(
         [np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)], axis=-1
     )
@@ -255,10 +272,13 @@ def outline_of(vertices: Array, n_directions: int = 24) -> Array:
 
 
 def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
-    """Heights (H, W) mm of a floor that is not quite flat: a few long waves over points (H, W, 2) mm."""
+    """Heights (H, W) mm of a floor that is not quite flat: a few long waves over points (H, W, 2)
+    mm.
+    """
     waves = np.zeros(ground.shape[:-1])
     for _ in range(4):
-        way, length = rng.uniform(-np.pi, np.pi), rng.uniform(70.0, 350.0) * scale
+        way = rng.uniform(-np.pi, np.pi)
+        length = rng.uniform(70.0, 350.0) * scale
         along = ground @ np.array([np.cos(way), np.sin(way)])
         waves += (
             rng.uniform(0.0, 0.7)

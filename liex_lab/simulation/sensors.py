@@ -1,4 +1,6 @@
-"""The depth sensors we imitate: their cameras and the range of their habits, none of them fitted to a recording."""
+"""The depth sensors we imitate: their cameras and the range of their habits, none of them fitted to
+a recording.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ Array = NDArray[np.float64]
 class Sensor:
     """A kind of depth sensor: its camera and how it errs.
 
-    unit_mm: of its depth; stride: its pictures are so large that only every so many-th pixel is looked at.
+    unit_mm: of its depth; stride: its pictures are so large that only every so many-th pixel is
+    looked at.
     """
 
     name: str
@@ -27,14 +30,16 @@ class Sensor:
     stride: int = 1
 
     def coarse(self, parameters: Array) -> Array:
-        """Parameters (n, N_PARAMETERS) of this sensor's units for pictures of every `stride`-th pixel."""
+        """Parameters (n, N_PARAMETERS) of this sensor's units for pictures of every `stride`-th
+        pixel.
+        """
         coarse = parameters.copy()
         coarse[:, [k.GRID, k.JITTER]] /= self.stride
         return coarse
 
     def spread_mm(self, parameters: Array, distance_mm: Array) -> Array | float:
-        """Standard deviation (n,) mm of what units of a light-field camera read of one surface; of others 0, for it is
-        small beside everything that they are used for.
+        """Standard deviation (n,) mm of what units of a light-field camera read of one surface; of
+        others 0, for it is small beside everything that they are used for.
         """
         if self.kind != k.LIGHT_FIELD_KIND:
             return 0.0
@@ -44,18 +49,19 @@ class Sensor:
     def draw(
         self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0
     ) -> Array:
-        """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given fur (n,).
+        """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given
+        fur (n,).
 
-        noise multiplies random errors and the rate of holes; erosion_px strips pixels off the animal's outline.
+        noise multiplies random errors and the rate of holes; erosion_px strips pixels off the
+        animal's outline.
         """
         p = np.zeros((n, k.N_PARAMETERS))
-        p[:, k.UNIT], p[:, k.BACKGROUND] = self.unit_mm, 1.0
-        p[:, k.KIND], p[:, k.NOISE], p[:, k.EROSION], p[:, k.FUR] = (
-            self.kind,
-            noise,
-            erosion_px,
-            fur,
-        )
+        p[:, k.UNIT] = self.unit_mm
+        p[:, k.BACKGROUND] = 1.0
+        p[:, k.KIND] = self.kind
+        p[:, k.NOISE] = noise
+        p[:, k.EROSION] = erosion_px
+        p[:, k.FUR] = fur
         p[:, k.HOLES] = 10 ** rng.uniform(-4.5, -3.0, n)
         dark = rng.random(n) < 0.4
         p[:, k.DARK] = np.where(dark, 10 ** rng.uniform(-3.0, -1.7, n), 0.0)
@@ -88,9 +94,11 @@ def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
     p[:, k.LUMPS] = rng.uniform(0.05, 0.25, n)
     p[:, k.GRID] = rng.uniform(5.0, 11.0, n)  # the footprint of a few micro lenses, pixels
     p[:, k.JITTER] = rng.uniform(0.5, 2.5, n)
-    p[:, k.BACKGROUND], p[:, k.BIAS] = 0.5, 0.0
+    p[:, k.BACKGROUND] = 0.5
+    p[:, k.BIAS] = 0.0
     p[:, k.OUTLIERS] = rng.uniform(2.3, 3.2, n)  # standard deviations of a field
-    # quantiles of a field: from a few per cent to a third of the smooth skin bears no texture, less of the rest
+    # quantiles of a field: from a few per cent to a third of the smooth skin bears no texture, less
+    # of the rest
     p[:, k.DARK] = rng.uniform(-2.6, -0.45, n)
     p[:, k.HOLES] = rng.uniform(-4.0, -1.2, n)
     p[:, k.FLYING] = rng.random(n) < 0.5  # whether the maker's software fills what is unread

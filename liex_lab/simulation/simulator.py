@@ -1,4 +1,6 @@
-"""The worlds that animals are rendered in: training images, test splits and continuous recordings of each of them."""
+"""The worlds that animals are rendered in: training images, test splits and continuous recordings
+of each of them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from liex_lab.simulation.training_patches import TrainingWindows
 
 
 class World(Protocol):
-    """Where an animal's training and test data come from. Everything is drawn from seeds, in any order."""
+    """Where an animal's training and test data come from. Everything is drawn from seeds, in any
+    order.
+    """
 
     @property
     def skeleton(self) -> Skeleton:
@@ -56,7 +60,9 @@ class World(Protocol):
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
     ) -> Sequence[TrueRecording]:
-        """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing it."""
+        """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing
+        it.
+        """
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
         """A recording in which one animal moves; settings as in `locomotion.walking_session`."""
@@ -78,8 +84,8 @@ class RenderedWorld:
     def protocol(self) -> str:
         """What to say of the test splits beside figures measured on them."""
         return (
-            "each with its own camera, arena, animal; the background, the floor, the blob and the animal's size are "
-            "found by the product, nothing is handed over. "
+            "each with its own camera, arena, animal; the background, the floor, the blob and the "
+            "animal's size are found by the product, nothing is handed over. "
         )
 
     @property

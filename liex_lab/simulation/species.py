@@ -1,4 +1,6 @@
-"""What the renderer needs to know of an animal: who looks at it from where, its body, and how it lies or floats."""
+"""What the renderer needs to know of an animal: who looks at it from where, its body, and how it
+lies or floats.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ Array = NDArray[np.float64]
 
 
 class Postures(NamedTuple):
-    """Poses (n) in the arena frame, base above the origin, the girths (n,) of their bodies, and their kinds (n,)."""
+    """Poses (n) in the arena frame, base above the origin, the girths (n,) of their bodies, and
+    their kinds (n,).
+    """
 
     pose: Pose
     girth: Array
@@ -29,10 +33,11 @@ class Postures(NamedTuple):
 
 
 class Habits(Protocol):
-    """An animal as the renderer knows it. Everything drawn comes from the generator that is handed over.
+    """An animal as the renderer knows it. Everything drawn comes from the generator that is handed
+    over.
 
-    sizes: smallest and largest animal over the nominal size; floats: it is somewhere above the floor, not on it;
-    frame_ns: between two frames of a recording.
+    sizes: smallest and largest animal over the nominal size; floats: it is somewhere above the
+    floor, not on it; frame_ns: between two frames of a recording.
     """
 
     @property
@@ -62,8 +67,8 @@ class Habits(Protocol):
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
     ) -> Postures:
-        """A posture for each of n animals of the given sizes (n,) over home and shapes (n), anywhere on or above the
-        floor, under cameras camera_mm (n,) above it.
+        """A posture for each of n animals of the given sizes (n,) over home and shapes (n),
+        anywhere on or above the floor, under cameras camera_mm (n,) above it.
         """
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:

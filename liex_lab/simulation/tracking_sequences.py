@@ -1,4 +1,6 @@
-"""Sequences to measure tracking on: one animal that moves, as a sensor sees it or as on a bad day, with the truth."""
+"""Sequences to measure tracking on: one animal that moves, as a sensor sees it or as on a bad day,
+with the truth.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sequence:
-    """A fixed test sequence: frames, seed, and how bad the day is. The lengths are those of the paper's."""
+    """A fixed test sequence: frames, seed, and how bad the day is. The lengths are those of the
+    paper's.
+    """
 
     n_frames: int
     seed: int
@@ -42,7 +46,9 @@ SEQUENCES = {
 
 
 class TestSequence(TrueRecording):
-    """A recording with its truth and what happens in it: events, in order of their start; scene: without the losses."""
+    """A recording with its truth and what happens in it: events, in order of their start; scene:
+    without the losses.
+    """
 
     __test__ = False
 
@@ -58,12 +64,15 @@ class TestSequence(TrueRecording):
         )
         for fact in _TRUTH:
             setattr(self, fact, getattr(scene, fact))
-        self.scene, self.events, self._loss = scene, events, loss
+        self.scene = scene
+        self.events = events
+        self._loss = loss
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth (n, H, W) mm of frames start to stop."""
         depths = self.scene.depths(start, stop)
-        camera, middle = self.camera, self.joints_camera.mean(axis=1)
+        camera = self.camera
+        middle = self.joints_camera.mean(axis=1)
         reach = 1.2 * self.spine_mm * camera.fx / middle[:, 2]
         still = self.scene.stage.still if isinstance(self.scene, SyntheticSession) else None
         self._loss.apply(depths, still, start, self.scene.cast.seeds, camera.project(middle), reach)
@@ -100,19 +109,22 @@ def tracking_sequence(
     sensor: Sensor | None = None,
     spine_mm: float | None = None,
 ) -> TestSequence:
-    """The fixed sequence 'easy' or 'hard' of an animal's world; other seeds make sequences of its kind, to develop on.
+    """The fixed sequence 'easy' or 'hard' of an animal's world; other seeds make sequences of its
+    kind, to develop on.
 
-    hard: bursts of holes, frames dropped, a bar passing between camera and animal, a second object, an animal that is
-    lost in the floor or in glare, and stretches at several times the speed.
+    hard: bursts of holes, frames dropped, a bar passing between camera and animal, a second object,
+    an animal that is lost in the floor or in glare, and stretches at several times the speed.
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
     sensor, step_ns, floats = _setting(world, sensor)
     kind = SEQUENCES[name]
-    n, own_seed = n_frames or kind.n_frames, [kind.seed if seed is None else seed]
+    n = n_frames or kind.n_frames
+    own_seed = [kind.seed if seed is None else seed]
     rng = np.random.default_rng([*own_seed, 1])
     events: list[Event] = []
-    steps, pace = np.ones(n, np.int64), np.ones(n, np.int64)
+    steps = np.ones(n, np.int64)
+    pace = np.ones(n, np.int64)
     if kind.hazards:
         events, steps = hazards.draw_script(rng, n, step_ns * 1e-9)
         pace = hazards.pace(rng, events, n)
@@ -157,7 +169,8 @@ def _hands(
 ) -> tuple[HandSession, list[Event]]:
     """Some moments of a hand, with things before and beside it, and when it is hidden."""
     assert isinstance(base, HandSession)
-    cast, hidden = base.cast[rows], list[Event]()
+    cast = base.cast[rows]
+    hidden = list[Event]()
     if events:
         arena = hazards.draw_things(
             rng,
@@ -187,7 +200,10 @@ def _animals(
     """As `_hands` of an animal."""
     assert isinstance(base, SyntheticSession)
     assert isinstance(world, RenderedWorld)
-    cast, stage, habits, hidden = _taken(base.cast, rows), base.stage, world.habits, list[Event]()
+    cast = _taken(base.cast, rows)
+    stage = base.stage
+    habits = world.habits
+    hidden = list[Event]()
 
     def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
         return hazards.beside_animal(rng, stage, joints, length_mm, habits.things)
@@ -205,7 +221,8 @@ def _animals(
         cast = replace(
             cast, things=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES
         )
-        surface, T_camera_arena = Surface.of(base.skeleton), base.T_arena_camera.inverse()
+        surface = Surface.of(base.skeleton)
+        T_camera_arena = base.T_arena_camera.inverse()
         body = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[
             :, : surface.n_trunk_vertices
         ]
@@ -233,7 +250,9 @@ def _taken(cast: Cast, rows: NDArray[np.int64]) -> Cast:
 
 
 def _hidden(camera: Camera, body: Array, things: Array, events: list[Event]) -> list[Event]:
-    """The stretches in which the occluder hides the animal; meshes (n, V, 3) mm in the camera frame."""
+    """The stretches in which the occluder hides the animal; meshes (n, V, 3) mm in the camera
+    frame.
+    """
     spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
     rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
     one = things.shape[1] // 2

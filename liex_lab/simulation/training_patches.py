@@ -1,7 +1,8 @@
 """Training images by the thousand: a window of depth around an animal, with the truth, from a seed.
 
-Images come in mini-sessions of `PER_SESSION` that share camera, floor, animal and sensor, as a recording's frames do.
-They are made in blocks; a block depends on the seed and its own number alone, so any part of a set can be made again.
+Images come in mini-sessions of `PER_SESSION` that share camera, floor, animal and sensor, as a
+recording's frames do. They are made in blocks; a block depends on the seed and its own number
+alone, so any part of a set can be made again.
 """
 
 from __future__ import annotations
@@ -27,22 +28,24 @@ Array = NDArray[np.float64]
 
 PER_SESSION = 8
 BLOCK = 512  # images made from one generator
-_THING_SHARE, _WALL_SHARE = 0.10, 0.35
+_THING_SHARE = 0.10
+_WALL_SHARE = 0.35
 
 
 @dataclass(frozen=True)
 class TrainingWindows:
     """n windows of S x S pixels around an animal, and the truth behind each.
 
-    depth, background (n, S, S) uint16, steps of unit_mm, 0 = unread: the picture, and the still scene as a recording
-    would have taught it. origin (n, 2) int32: the full picture's pixel (u, v) of window pixel (0, 0); intrinsics (n,
-    4): fx, fy, cx, cy of the full picture. floor, floor_true (n, 3): 1 / z = a u + b v + c in its pixels, as estimated
-    and exact.
-    T_arena_camera (n), exact. root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones;
-    joints_mm (n, J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
-    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of posture. spread_mm
-    (n,): standard deviation of the floor's readings, where it matters. own_bones: `joints_mm` are those of each
-    body's own proportions, from which the skeleton's differ.
+    depth, background (n, S, S) uint16, steps of unit_mm, 0 = unread: the picture, and the still
+    scene as a recording would have taught it. origin (n, 2) int32: the full picture's pixel (u, v)
+    of window pixel (0, 0); intrinsics (n, 4): fx, fy, cx, cy of the full picture. floor, floor_true
+    (n, 3): 1 / z = a u + b v + c in its pixels, as estimated and exact. T_arena_camera (n), exact.
+    root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones; joints_mm (n,
+    J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
+    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of
+    posture. spread_mm (n,): standard deviation of the floor's readings, where it matters.
+    own_bones: `joints_mm` are those of each body's own proportions, from which the skeleton's
+    differ.
     """
 
     depth: NDArray[np.uint16]
@@ -99,7 +102,9 @@ class TrainingWindows:
 
 @dataclass(frozen=True)
 class _Looks:
-    """Who looks at whom, one row an image (n): camera, floor, sensor, animal; constant within a mini-session."""
+    """Who looks at whom, one row an image (n): camera, floor, sensor, animal; constant within a
+    mini-session.
+    """
 
     sensor: NDArray[np.int64]
     intrinsics: Array
@@ -126,7 +131,8 @@ def training_windows(
     parallel: bool = True,
 ) -> TrainingWindows:
     """N training images; the first n of `training_blocks`, which explains the arguments."""
-    parts, left = [], n
+    parts = []
+    left = n
     for block in training_blocks(
         seed,
         -(-n // BLOCK),
@@ -158,12 +164,13 @@ def training_blocks(
     window_px: int = 144,
     parallel: bool = True,
 ) -> Iterator[TrainingWindows]:
-    """Blocks of `BLOCK` training images from block `first` on, bit for bit the same for a seed, whatever the threads.
+    """Blocks of `BLOCK` training images from block `first` on, bit for bit the same for a seed,
+    whatever the threads.
 
-    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see `Sensor.draw`; a share
-    `degraded_share` of the mini-sessions has 1 to 2.5 times the noise and half of those an outline eroded by a pixel.
-    spine_mm: the animals' mean size, None the skeleton's own; window_px must hold the animal with a margin: 144 does up
-    to mice of 70 mm.
+    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see
+    `Sensor.draw`; a share `degraded_share` of the mini-sessions has 1 to 2.5 times the noise and
+    half of those an outline eroded by a pixel. spine_mm: the animals' mean size, None the
+    skeleton's own; window_px must hold the animal with a margin: 144 does up to mice of 70 mm.
     """
     habits = MouseHabits() if habits is None else habits
     surface = Surface.of(habits.skeleton)
@@ -184,15 +191,21 @@ def _draw_looks(
     degraded_share: float,
     spine_mm: float | None,
 ) -> _Looks:
-    """Cameras, floors and animals of one block's mini-sessions, repeated for each of their images."""
-    m, skeleton = BLOCK // PER_SESSION, habits.skeleton
+    """Cameras, floors and animals of one block's mini-sessions, repeated for each of their
+    images.
+    """
+    m = BLOCK // PER_SESSION
+    skeleton = habits.skeleton
     sensor = np.arange(m) % len(habits.sensors)
     shape = habits.shapes(rng, family, m)
-    intrinsics, picture = np.empty((m, 4)), np.empty((m, 2), np.int64)
+    intrinsics = np.empty((m, 4))
+    picture = np.empty((m, 2), np.int64)
     parameters = np.empty((m, 0))
     for k, kind in enumerate(habits.sensors):
-        rows, camera = sensor == k, kind.camera.every(kind.stride)
-        # units of one make differ by a few per cent in focal length, and by some pixels in the optical axis
+        rows = sensor == k
+        camera = kind.camera.every(kind.stride)
+        # units of one make differ by a few per cent in focal length, and by some pixels in the
+        # optical axis
         focal = rng.uniform(0.97, 1.03, (m, 1)) * [camera.fx, camera.fy]
         axis = rng.normal(0.0, 4.0, (m, 2)) + np.array([camera.cx, camera.cy])
         intrinsics[rows] = np.concatenate([focal, axis], axis=1)[rows]
@@ -220,7 +233,9 @@ def _draw_looks(
 def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
     """Give a share of the sensors more noise and holes, and half of those an eroded outline."""
     m = len(parameters)
-    worse, factor, eroded = rng.random(m) < share, rng.uniform(1.0, 2.5, m), rng.random(m) < 0.5
+    worse = rng.random(m) < share
+    factor = rng.uniform(1.0, 2.5, m)
+    eroded = rng.random(m) < 0.5
     parameters[worse, NOISE] *= factor[worse]
     parameters[worse & eroded, EROSION] += 1
 
@@ -230,7 +245,8 @@ def inverse_depth_plane(
 ) -> Array:
     """Coefficients (n, 3) of the floor: 1 / z = a u + b v + c. Optionally of one wrongly estimated.
 
-    tilt_and_lift (n, 3): slopes of the wrong floor along the arena's x and y, rad, and its height below the camera, mm.
+    tilt_and_lift (n, 3): slopes of the wrong floor along the arena's x and y, rad, and its height
+    below the camera, mm.
     """
     wrong = np.zeros((len(intrinsics), 3)) if tilt_and_lift is None else tilt_and_lift
     slope = np.stack([wrong[:, 0], wrong[:, 1], -np.ones(len(wrong))], axis=-1)
@@ -238,7 +254,8 @@ def inverse_depth_plane(
         "nji,nj->ni", T_arena_camera.rotation, slope / np.linalg.norm(slope, axis=-1, keepdims=True)
     )
     distance = T_arena_camera.translation[:, 2] + wrong[:, 2]
-    a, b = normal[:, 0] / intrinsics[:, 0] / distance, normal[:, 1] / intrinsics[:, 1] / distance
+    a = normal[:, 0] / intrinsics[:, 0] / distance
+    b = normal[:, 1] / intrinsics[:, 1] / distance
     return np.stack(
         [a, b, normal[:, 2] / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]], axis=-1
     )
@@ -254,7 +271,9 @@ def _draw_block(
     parallel: bool,
 ) -> TrainingWindows:
     """The images of one block."""
-    n, skeleton, scale = len(looks.size), habits.skeleton, habits.setting.scale
+    n = len(looks.size)
+    skeleton = habits.skeleton
+    scale = habits.setting.scale
     pose, girth, kinds = habits.postures(
         rng, looks.size, looks.shape, looks.T_arena_camera.translation[:, 2]
     )
@@ -266,10 +285,8 @@ def _draw_block(
     thing, has_thing = _draw_neighbours(
         rng, trunk, looks.size * skeleton.length, scale, habits.floats
     )
-    walls, seeds = (
-        _draw_walls(rng, trunk, habits.setting),
-        rng.integers(1, 2**63, n).astype(np.uint64),
-    )
+    walls = _draw_walls(rng, trunk, habits.setting)
+    seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
@@ -316,7 +333,9 @@ def _draw_block(
 
 def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) -> None:
     """Move the poses over the floor so that each animal is somewhere in its picture, whole."""
-    n, T, skeleton = len(pose.scale), looks.T_arena_camera, habits.skeleton
+    n = len(pose.scale)
+    T = looks.T_arena_camera
+    skeleton = habits.skeleton
     middle = pose.joints(skeleton).mean(axis=1)
     height = T.translation[:, 2] - (middle[:, 2] if habits.floats else 0.0)
     margin = 0.85 * pose.scale * skeleton.length * looks.intrinsics[:, 0] / height + 6.0
@@ -348,7 +367,8 @@ def window_origin(
 def _draw_neighbours(
     rng: np.random.Generator, trunk: Array, spine_mm: Array, scale: float, floats: bool
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """A block or ball (n, V, 3) beside each trunk, never touching it, and which images show theirs (n,).
+    """A block or ball (n, V, 3) beside each trunk, never touching it, and which images show theirs
+    (n,).
 
     Beside an animal that floats it is anywhere between the floor and the animal's back.
     """
@@ -376,7 +396,8 @@ def _draw_neighbours(
 
 def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Array:
     """A straight wall (n, WALL_COLUMNS) beyond some of the trunks, seen from the arena's inside."""
-    n, scale = len(trunk), setting.scale
+    n = len(trunk)
+    scale = setting.scale
     middle = trunk[..., :2].mean(axis=1)
     way = np.arctan2(middle[:, 1], middle[:, 0]) + rng.normal(0.0, 0.7, n)
     outward = np.stack([np.cos(way), np.sin(way)], axis=-1)
@@ -385,11 +406,9 @@ def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Arr
     )
     there = (rng.random(n) < _WALL_SHARE) & (distance > 40.0 * scale)
     low, high = setting.walls_mm
-    height, rounding, spread = (
-        rng.uniform(0.75 * low, high, n),
-        rng.uniform(0, 12, n),
-        rng.uniform(6, 25, n),
-    )
+    height = rng.uniform(0.75 * low, high, n)
+    rounding = rng.uniform(0, 12, n)
+    spread = rng.uniform(6, 25, n)
     return np.column_stack(
         [outward, np.where(there, distance, 0.0), height, scale * rounding, scale * spread]
     )

@@ -37,7 +37,9 @@ _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 @dataclass(frozen=True)
 class Rows:
-    """A track, the camera's frame count of its rows, the names that every row carries, and where the animal can be."""
+    """A track, the camera's frame count of its rows, the names that every row carries, and where
+    the animal can be.
+    """
 
     track: Track
     frame_index: NDArray[np.int64]
@@ -71,7 +73,9 @@ class Rows:
         return (self._pose_rows(part) for part in self._parts(self.track.skeleton.n_joints))
 
     def rotations(self) -> Iterator[Block]:
-        """The table `rotations`: per frame the row of the root's rigid transform, then one row per joint."""
+        """The table `rotations`: per frame the row of the root's rigid transform, then one row per
+        joint.
+        """
         return (self._rotation_rows(part) for part in self._parts(self.track.skeleton.n_joints + 1))
 
     def _frame_rows(self, part: slice, missing: NDArray[np.int64]) -> Block:
@@ -96,7 +100,8 @@ class Rows:
         }
 
     def _pose_rows(self, part: slice) -> Block:
-        track, n_joints = self.track[part], self.track.skeleton.n_joints
+        track = self.track[part]
+        n_joints = self.track.skeleton.n_joints
         return {
             **self._who,
             **self._when(part, n_joints),
@@ -110,12 +115,15 @@ class Rows:
         }
 
     def _rotation_rows(self, part: slice) -> Block:
-        track, n_rows = self.track[part], self.track.skeleton.n_joints + 1
+        track = self.track[part]
+        n_rows = self.track.skeleton.n_joints + 1
         turn = np.concatenate([_log(track.root_rotation)[:, None], track.angles_rad], axis=1)
         sd_root = track.sd_root
         spread = np.concatenate([sd_root[:, None, :3], track.sd_angles_rad], axis=1)
-        shift, sd_shift = np.full(turn.shape, np.nan), np.full(turn.shape, np.nan)
-        shift[:, 0], sd_shift[:, 0] = track.root_mm, sd_root[:, 3:]
+        shift = np.full(turn.shape, np.nan)
+        sd_shift = np.full(turn.shape, np.nan)
+        shift[:, 0] = track.root_mm
+        sd_shift[:, 0] = sd_root[:, 3:]
         together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
         together[:, 0] = track.cov_root[:, *np.triu_indices(6, 1)]
         return {
@@ -141,7 +149,8 @@ class Rows:
     def gaps(self) -> Block:
         """The table `gaps`, in order of time.
 
-        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames without a pose.
+        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames
+        without a pose.
         """
         time = self.time_s
         count = frame_count(self.frame_index)
@@ -163,7 +172,8 @@ class Rows:
 
     def flips(self, flips: Sequence[Flip]) -> Block:
         """The table `flips`, in order of time."""
-        time, count = self.time_s, frame_count(self.frame_index)
+        time = self.time_s
+        count = frame_count(self.frame_index)
         stops = stop_times(time)
         return {
             **self._who,
@@ -179,7 +189,8 @@ class Rows:
 
     def _camera_gaps(self) -> list[_Found]:
         """Where the recording's time is not a steady camera's, as rows of the table `gaps`."""
-        time, found = self.time_s, []
+        time = self.time_s
+        found = []
         stops = stop_times(time)
         for gap in self.camera_gaps:
             row = int(
@@ -235,7 +246,9 @@ def _log(rotation: Array) -> Array:
 
 
 def nearness(sd: Array, radius: Array) -> Array:
-    """Probability that a Gaussian point in space with `sd` along each axis lies within `radius` of its mean."""
+    """Probability that a Gaussian point in space with `sd` along each axis lies within `radius` of
+    its mean.
+    """
     from scipy.special import erf
 
     r = radius / np.maximum(sd, 1e-9)
@@ -259,7 +272,9 @@ def gap_follows(time_s: Array) -> NDArray[np.bool_]:
 
 
 def stop_times(time_s: Array) -> Array:
-    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median step later."""
+    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median
+    step later.
+    """
     stops: Array = np.append(time_s[1:], np.nan)[: len(time_s)]
     alone = gap_follows(time_s)
     stops[alone] = time_s[alone] + median_step(time_s)
@@ -287,7 +302,8 @@ def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.D
     """The columns that every table `bouts` has, from the table `frames` of the ethogram's times."""
     import pandas as pd
 
-    times_ns, index = frames["time_ns"].to_numpy(np.int64), frames["frame_index"].to_numpy(np.int64)
+    times_ns = frames["time_ns"].to_numpy(np.int64)
+    index = frames["frame_index"].to_numpy(np.int64)
     first = int(times_ns[0]) if len(times_ns) else 0
     start_ns = np.array([bout.start_ns for bout in ethogram], np.int64)
     stop_ns = np.array([bout.stop_ns for bout in ethogram], np.int64)

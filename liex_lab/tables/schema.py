@@ -1,7 +1,8 @@
 """The tables of a session: every column listed once, and the one way a table gets to disk and back.
 
-The schema, the writer, the reader, columns.json and the report's glossary all read `TABLES`. Tables that other rooms
-make (behaviour) bring their own `Column` entries; a column without an entry is refused by `write_table`.
+The schema, the writer, the reader, columns.json and the report's glossary all read `TABLES`. Tables
+that other rooms make (behaviour) bring their own `Column` entries; a column without an entry is
+refused by `write_table`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table, and what a reader has to know about it. An empty unit means a number without one."""
+    """One column of a table, and what a reader has to know about it. An empty unit means a number
+    without one.
+    """
 
     table: str
     name: str
@@ -179,8 +182,8 @@ FRAMES = columns(
         "zone",
         "string",
         "",
-        "the zones that the centroid lies in, in the order of the zones' file, with ; between them; "
-        "empty outside all of them and where there is no centroid",
+        "the zones that the centroid lies in, in the order of the zones' file, with ; between "
+        "them; empty outside all of them and where there is no centroid",
         "",
         "arena.zones of the plan",
     ),
@@ -207,7 +210,8 @@ FRAMES = columns(
         "bool",
         "",
         "nothing was measured; the pose is what lies between two measured ones, of which the "
-        "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour leave it out",
+        "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour "
+        "leave it out",
         "",
         "tracker",
     ),
@@ -216,8 +220,8 @@ FRAMES = columns(
         "string",
         "",
         "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
-        "person placed joints of it; not_found or no_depth: nothing was measured, and there is no pose where it is not "
-        "bridged",
+        "person placed joints of it; not_found or no_depth: nothing was measured, and there is "
+        "no pose where it is not bridged",
         "",
         "tracker",
     ),
@@ -265,7 +269,10 @@ POSES = columns(
     ),
 )
 
-_TURN = "rotation vector relative to the parent joint; row 'root': the body's base relative to the arena"
+_TURN = (
+    "rotation vector relative to the parent joint; row 'root': the body's base relative to the "
+    "arena"
+)
 _SHIFT = (
     "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
 )
@@ -369,10 +376,11 @@ GAPS = columns(
         "reason",
         "string",
         "",
-        "camera_dropped: never recorded, start_frame = stop_frame = the next frame; clock_jumped: "
-        "the camera was stopped, or its clock set, before the frame; stamp_repeated, stamp_out_of_order: this frame's own "
-        "time stamp could not be true and was moved; no_depth: recorded without any depth; tracker_lost: nothing in the "
-        "frame looks like the animal",
+        "camera_dropped: never recorded, start_frame = stop_frame = the next frame; "
+        "clock_jumped: the camera was stopped, or its clock set, before the frame; "
+        "stamp_repeated, stamp_out_of_order: this frame's own time stamp could not be true and "
+        "was moved; no_depth: recorded without any depth; tracker_lost: nothing in the frame "
+        "looks like the animal",
     ),
 )
 
@@ -420,7 +428,8 @@ SESSIONS = columns(
         "float64",
         "s",
         "time with a pose",
-        "sum over frames with a pose of the time to the next frame; before a gap or the end, the median dt",
+        "sum over frames with a pose of the time to the next frame; before a gap or the end, the "
+        "median dt",
     ),
     ("fps_median", "float64", "1/s", "frames per second", "1 / median dt"),
     ("calibration_hash", "string", "", "hash of the camera's numbers and its place in the arena"),
@@ -433,7 +442,9 @@ TABLES: dict[str, tuple[Column, ...]] = {
 
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
-    """The content of columns.json: every column of `TABLES`, then those of other rooms, each as a plain dict."""
+    """The content of columns.json: every column of `TABLES`, then those of other rooms, each as a
+    plain dict.
+    """
     entries = [column for rows in TABLES.values() for column in rows] + [
         column for rows in extra for column in rows
     ]
@@ -464,7 +475,8 @@ def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Sc
 def write_table(
     path: Path, schema: Sequence[Column], blocks: Iterable[Block], metadata: Mapping[str, Any]
 ) -> int:
-    """Write a parquet table block by block (row groups of about `ROWS_PER_GROUP` rows) and return its rows.
+    """Write a parquet table block by block (row groups of about `ROWS_PER_GROUP` rows) and return
+    its rows.
 
     Equal blocks give equal bytes: zstd, strings as dictionaries, no time stamps.
     """
@@ -498,13 +510,14 @@ def _arrow_block(block: Block, schema: Sequence[Column], arrow: pa.Schema) -> pa
 
 def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:
     """Refuse a table whose columns are not exactly those of its schema."""
-    written, described = list(names), [column.name for column in schema]
+    written = list(names)
+    described = [column.name for column in schema]
     undescribed = [name for name in written if name not in described]
     absent = [name for name in described if name not in written]
     if undescribed or absent:
         raise SessionError(
-            f"table {table or schema[0].table} has columns without a description {undescribed} and lacks {absent}; "
-            "every column is listed once, with its meaning, in the table's schema"
+            f"table {table or schema[0].table} has columns without a description {undescribed} and "
+            f"lacks {absent}; every column is listed once, with its meaning, in the table's schema"
         )
 
 
@@ -539,7 +552,9 @@ class Words:
 
 
 def harmless(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe before it."""
+    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe
+    before it.
+    """
     return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
 
 
@@ -586,7 +601,9 @@ def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
 
 
 def let_table_go(table: pd.DataFrame) -> None:
-    """Let go of the memory of a table's columns that lie on disk, until they are looked at again."""
+    """Let go of the memory of a table's columns that lie on disk, until they are looked at
+    again.
+    """
     let_go(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
 
 

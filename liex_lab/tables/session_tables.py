@@ -1,4 +1,6 @@
-"""What can be read from a measured session: the face that `sessions.Session` shows to the rooms below it."""
+"""What can be read from a measured session: the face that `sessions.Session` shows to the rooms
+below it.
+"""
 
 from __future__ import annotations
 

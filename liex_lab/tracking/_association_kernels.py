@@ -10,14 +10,17 @@ NONE = -1
 
 @njit(cache=True)
 def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling):
-    """How unlikely it is, in nats, that an animal of this length mm gets from joints (J, 3) mm to others in dt s.
+    """How unlikely it is, in nats, that an animal of this length mm gets from joints (J, 3) mm to
+    others in dt s.
 
-    The middle and the posture about it move by standard deviations of levels[1] and levels[2] lengths a second, and are
-    measured to levels[0] of the predicted errors mm. Animals seldom dart, but they do: costs above levels[3] nats grow
-    as logarithms; at most `ceiling`.
+    The middle and the posture about it move by standard deviations of levels[1] and levels[2]
+    lengths a second, and are measured to levels[0] of the predicted errors mm. Animals seldom dart,
+    but they do: costs above levels[3] nats grow as logarithms; at most `ceiling`.
     """
     n = joints_a.shape[0]
-    shift, bend, middle = 0.0, 0.0, np.zeros(3)
+    shift = 0.0
+    bend = 0.0
+    middle = np.zeros(3)
     for j in range(n):
         for k in range(3):
             middle[k] += (float(joints_b[j, k]) - float(joints_a[j, k])) / n
@@ -38,18 +41,23 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
 def extend(
     t, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent
 ):
-    """Add frame t to the chain: fill cost[t] (H,) and parent[t] (H, 2), and put its hypotheses among the `live` ones.
+    """Add frame t to the chain: fill cost[t] (H,) and parent[t] (H, 2), and put its hypotheses
+    among the `live` ones.
 
-    live (B, 2): frame and hypothesis of the n_live best chains' last links; idle (n + 1,): what it has cost up to each
-    frame to pass by all hypotheses. A chain passes a frame by at that price. Returns how many are live.
+    live (B, 2): frame and hypothesis of the n_live best chains' last links; idle (n + 1,): what it
+    has cost up to each frame to pass by all hypotheses. A chain passes a frame by at that price.
+    Returns how many are live.
     """
     for h in range(joints.shape[1]):
-        cost[t, h], parent[t, h, 0], parent[t, h, 1] = np.inf, NONE, NONE
+        cost[t, h] = np.inf
+        parent[t, h, 0] = NONE
+        parent[t, h, 1] = NONE
         if not np.isfinite(emission[t, h]):
             continue
         best = idle[t]  # the chain begins here
         for k in range(n_live):
-            a, g = live[k, 0], live[k, 1]
+            a = live[k, 0]
+            g = live[k, 1]
             so_far = cost[a, g] + idle[t] - idle[a + 1]
             if so_far >= best and parent[t, h, 0] != NONE:
                 continue
@@ -64,7 +72,9 @@ def extend(
                 ceiling,
             )
             if so_far + leap < best:
-                best, parent[t, h, 0], parent[t, h, 1] = so_far + leap, a, g
+                best = so_far + leap
+                parent[t, h, 0] = a
+                parent[t, h, 1] = g
         cost[t, h] = best + emission[t, h]
     return _keep_best(t, live, n_live, idle, cost, joints.shape[1])
 
@@ -78,11 +88,14 @@ def _keep_best(t, live, n_live, idle, cost, n_hypotheses):
     n = 0
     for k in range(n_live + n_hypotheses):
         if k < n_live:
-            a, h = live[k, 0], live[k, 1]
+            a = live[k, 0]
+            h = live[k, 1]
         else:
-            a, h = t, k - n_live
+            a = t
+            h = k - n_live
         if np.isfinite(cost[a, h]):
-            all_of[n, 0], all_of[n, 1] = a, h
+            all_of[n, 0] = a
+            all_of[n, 1] = h
             costs[n] = cost[a, h] + idle[t + 1] - idle[a + 1]
             n += 1
     order = np.argsort(costs[:n], kind="mergesort")
@@ -131,7 +144,9 @@ def extend_all(
 
 @njit(cache=True)
 def trace_back(frame, hypothesis, parent, first, path):
-    """Follow the links from a hypothesis back to frame `first`, into path (n,), NONE where a frame was passed by."""
+    """Follow the links from a hypothesis back to frame `first`, into path (n,), NONE where a frame
+    was passed by.
+    """
     path[first:] = NONE
     while frame >= first:
         path[frame] = hypothesis
@@ -140,12 +155,14 @@ def trace_back(frame, hypothesis, parent, first, path):
 
 @njit(cache=True)
 def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
-    """Probability (n,) of the second of two ways round of each frame: joints one and two (n, J, 3) mm.
+    """Probability (n,) of the second of two ways round of each frame: joints one and two (n, J, 3)
+    mm.
 
     evidence (n,): by how many nats a frame is for the first way.
     """
     n = times.size
-    stay, leap = np.empty((n, 2)), np.empty((n, 2))
+    stay = np.empty((n, 2))
+    leap = np.empty((n, 2))
     for t in range(1, n):
         dt = times[t] - times[t - 1]
         stay[t, 0] = leap_cost(
@@ -160,7 +177,9 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
         leap[t, 1] = leap_cost(
             two[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
         )
-    first, second = np.zeros(n), np.zeros(n)  # logarithms of what the past says of each way
+    # logarithms of what the past says of each way
+    first = np.zeros(n)
+    second = np.zeros(n)
     second[0] = -evidence[0]
     for t in range(1, n):
         first[t] = np.logaddexp(first[t - 1] - stay[t, 0], second[t - 1] - leap[t, 1])
@@ -170,7 +189,9 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
         top = max(first[t], second[t])
         first[t] -= top
         second[t] -= top
-    a, b = 0.0, 0.0  # and what the future says
+    # and what the future says
+    a = 0.0
+    b = 0.0
     for t in range(n - 1, -1, -1):
         doubt[t] = 1.0 / (1.0 + np.exp(min(first[t] + a - second[t] - b, 700.0)))
         if t > 0:

@@ -1,9 +1,11 @@
-"""Kernels of the smoother: a filter of value and velocity and its way back, for vectors and for rotations.
+"""Kernels of the smoother: a filter of value and velocity and its way back, for vectors and for
+rotations.
 
-All coordinates of a group share one covariance (2, 2) of value and velocity, so only gains are computed per frame, and
-every coordinate is moved by them. The velocity dies away within `fade` seconds and is driven by white noise of density
-q (an integrated Ornstein-Uhlenbeck process; Johnson et al. 2008); a frame's value is measured with variance r, infinite
-where nothing was measured. Within dt the value goes on by go[t] times the velocity, of which keep[t] is left.
+All coordinates of a group share one covariance (2, 2) of value and velocity, so only gains are
+computed per frame, and every coordinate is moved by them. The velocity dies away within `fade`
+seconds and is driven by white noise of density q (an integrated Ornstein-Uhlenbeck process; Johnson
+et al. 2008); a frame's value is measured with variance r, infinite where nothing was measured.
+Within dt the value goes on by go[t] times the velocity, of which keep[t] is left.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from liex_lab.body._kernels import exp_so3
 @njit(cache=True)
 def steps(times, fade, keep, go):
     """Fill keep (n,) and go (n,) s of the steps that lead to each frame."""
-    keep[0], go[0] = 1.0, 0.0
+    keep[0] = 1.0
+    go[0] = 0.0
     for t in range(1, times.size):
         keep[t] = np.exp(-(times[t] - times[t - 1]) / fade)
         go[t] = fade * (1.0 - keep[t])
@@ -25,31 +28,41 @@ def steps(times, fade, keep, go):
 
 @njit(cache=True)
 def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted, smoothed):
-    """Gains and variances of n frames: forward (n, 2) of value and velocity, back (n, 2, 2) of the way back.
+    """Gains and variances of n frames: forward (n, 2) of value and velocity, back (n, 2, 2) of the
+    way back.
 
-    filtered, predicted, smoothed (n, 2, 2) are covariances; start: the first frame that was measured.
+    filtered, predicted, smoothed (n, 2, 2) are covariances; start: the first frame that was
+    measured.
     """
     n = times.size
     p = np.empty((2, 2))
     steps(times, fade, keep, go)
     for t in range(start, n):
         if t == start:
-            p[0, 0], p[0, 1], p[1, 0] = r[t], 0.0, 0.0
+            p[0, 0] = r[t]
+            p[0, 1] = 0.0
+            p[1, 0] = 0.0
             p[1, 1] = 0.5 * q * fade
             predicted[t] = p
-            forward[t, 0], forward[t, 1] = 1.0, 0.0
+            forward[t, 0] = 1.0
+            forward[t, 1] = 0.0
         else:
-            k, g = keep[t], go[t]
-            a, b, c = p[0, 0], p[0, 1], p[1, 1]
+            k = keep[t]
+            g = go[t]
+            a = p[0, 0]
+            b = p[0, 1]
+            c = p[1, 1]
             p[0, 0] = a + 2 * g * b + g * g * c + q * _way(times[t] - times[t - 1], fade)
             p[0, 1] = k * (b + g * c) + q * 0.5 * g * g
             p[1, 1] = k * k * c + q * 0.5 * fade * (1 - k * k)
             p[1, 0] = p[0, 1]
             predicted[t] = p
             s = p[0, 0] + r[t]
-            forward[t, 0], forward[t, 1] = p[0, 0] / s, p[0, 1] / s
+            forward[t, 0] = p[0, 0] / s
+            forward[t, 1] = p[0, 1] / s
             if np.isfinite(r[t]):
-                k0, k1 = forward[t, 0], forward[t, 1]
+                k0 = forward[t, 0]
+                k1 = forward[t, 1]
                 p[1, 1] -= k1 * p[0, 1]
                 p[0, 1] = (1 - k0) * p[0, 1]
                 p[0, 0] = (1 - k0) * p[0, 0]
@@ -57,12 +70,16 @@ def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted
         filtered[t] = p
     smoothed[n - 1] = filtered[n - 1]
     for t in range(n - 2, start - 1, -1):
-        k, g = keep[t + 1], go[t + 1]
-        f, m = filtered[t], predicted[t + 1]
+        k = keep[t + 1]
+        g = go[t + 1]
+        f = filtered[t]
+        m = predicted[t + 1]
         det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
         # filtered @ transition^T @ inverse of predicted
-        u00, u01 = f[0, 0] + g * f[0, 1], k * f[0, 1]
-        u10, u11 = f[1, 0] + g * f[1, 1], k * f[1, 1]
+        u00 = f[0, 0] + g * f[0, 1]
+        u01 = k * f[0, 1]
+        u10 = f[1, 0] + g * f[1, 1]
+        u11 = k * f[1, 1]
         back[t, 0, 0] = (u00 * m[1, 1] - u01 * m[1, 0]) / det
         back[t, 0, 1] = (u01 * m[0, 0] - u00 * m[0, 1]) / det
         back[t, 1, 0] = (u10 * m[1, 1] - u11 * m[1, 0]) / det
@@ -82,11 +99,15 @@ def _way(dt, fade):
 
 @njit(cache=True)
 def run_vector(y, known, start, keep, go, forward, back, out, rate):
-    """Filter values y (n,), smooth them into out (n,) and their rates (n,) per second; known (n,): measured."""
+    """Filter values y (n,), smooth them into out (n,) and their rates (n,) per second; known (n,):
+    measured.
+    """
     n = y.size
-    out[start], rate[start] = y[start], 0.0
+    out[start] = y[start]
+    rate[start] = 0.0
     for t in range(start + 1, n):
-        out[t], rate[t] = out[t - 1] + go[t] * rate[t - 1], keep[t] * rate[t - 1]
+        out[t] = out[t - 1] + go[t] * rate[t - 1]
+        rate[t] = keep[t] * rate[t - 1]
         if known[t]:
             off = y[t] - out[t]
             out[t] += forward[t, 0] * off
@@ -102,13 +123,19 @@ def run_vector(y, known, start, keep, go, forward, back, out, rate):
 
 @njit(cache=True)
 def run_place(times, y, r, known, start, drive, fade, out, spread):
-    """Filter places y (n, 3) mm measured with covariances r (n, 3, 3) and smooth them into out (n, 3), with their
-    covariances `spread` (n, 3, 3); drive (3,): along each axis. Products are loops: matrices so small are not for BLAS.
+    """Filter places y (n, 3) mm measured with covariances r (n, 3, 3) and smooth them into out (n,
+    3), with their covariances `spread` (n, 3, 3); drive (3,): along each axis. Products are loops:
+    matrices so small are not for BLAS.
     """
     n = y.shape[0]
-    state, p = np.zeros((n, 6)), np.zeros((n, 6, 6))
-    ahead, m = np.zeros((n, 6)), np.zeros((n, 6, 6))
-    s, gain, inverse, work = np.zeros((3, 3)), np.zeros((6, 3)), np.zeros((6, 6)), np.zeros((6, 6))
+    state = np.zeros((n, 6))
+    p = np.zeros((n, 6, 6))
+    ahead = np.zeros((n, 6))
+    m = np.zeros((n, 6, 6))
+    s = np.zeros((3, 3))
+    gain = np.zeros((6, 3))
+    inverse = np.zeros((6, 6))
+    work = np.zeros((6, 6))
     for k in range(3):
         m[start, 3 + k, 3 + k] = 0.5 * drive[k] * fade
         for i in range(3):
@@ -118,7 +145,8 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
     for t in range(start, n):
         if t > start:
             _go_on(state[t - 1], p[t - 1], times[t] - times[t - 1], drive, fade, ahead[t], m[t])
-        state[t], p[t] = ahead[t], m[t]
+        state[t] = ahead[t]
+        p[t] = m[t]
         if not known[t]:
             continue
         for i in range(3):
@@ -142,7 +170,8 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
                 p[t, j, i] = p[t, i, j]
     _way_back(times, fade, start, state, p, ahead, m)
     for t in range(n):
-        out[t], spread[t] = state[max(t, start), :3], p[max(t, start), :3, :3]
+        out[t] = state[max(t, start), :3]
+        spread[t] = p[max(t, start), :3, :3]
 
 
 @njit(cache=True)
@@ -152,7 +181,8 @@ def _go_on(state, p, dt, drive, fade, ahead, m):
     go = fade * (1.0 - keep)
     way = _way(dt, fade)
     for k in range(3):
-        ahead[k], ahead[3 + k] = state[k] + go * state[3 + k], keep * state[3 + k]
+        ahead[k] = state[k] + go * state[3 + k]
+        ahead[3 + k] = keep * state[3 + k]
         for i in range(3):
             m[i, k] = p[i, k] + go * (p[3 + i, k] + p[i, 3 + k]) + go * go * p[3 + i, 3 + k]
             m[i, 3 + k] = keep * (p[i, 3 + k] + go * p[3 + i, 3 + k])
@@ -168,22 +198,18 @@ def _go_on(state, p, dt, drive, fade, ahead, m):
 @njit(cache=True)
 def _way_back(times, fade, start, state, p, ahead, m):
     """Turn filtered states (n, 6) and covariances (n, 6, 6) into smoothed ones."""
-    inverse, work, forth, back = (
-        np.zeros((6, 6)),
-        np.zeros((6, 6)),
-        np.zeros((6, 6)),
-        np.zeros((6, 6)),
-    )
+    inverse = np.zeros((6, 6))
+    work = np.zeros((6, 6))
+    forth = np.zeros((6, 6))
+    back = np.zeros((6, 6))
     change = np.zeros((6, 6))
     for t in range(times.size - 2, start - 1, -1):
         keep = np.exp(-(times[t + 1] - times[t]) / fade)
         go = fade * (1.0 - keep)
         for i in range(6):
             for k in range(3):
-                forth[i, k], forth[i, 3 + k] = (
-                    p[t, i, k] + go * p[t, i, 3 + k],
-                    keep * p[t, i, 3 + k],
-                )
+                forth[i, k] = p[t, i, k] + go * p[t, i, 3 + k]
+                forth[i, 3 + k] = keep * p[t, i, 3 + k]
         _invert(m[t + 1], inverse, work)
         _times(forth, inverse, back)
         for i in range(6):
@@ -212,7 +238,9 @@ def _times(a, b, out):
 
 @njit(cache=True)
 def _invert(a, out, work):
-    """Out = the inverse of a symmetric positive definite matrix (k, k), by its Cholesky factor in `work`."""
+    """Out = the inverse of a symmetric positive definite matrix (k, k), by its Cholesky factor in
+    `work`.
+    """
     n = a.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -235,21 +263,41 @@ def _invert(a, out, work):
 
 @njit(cache=True)
 def log_so3(r, out):
-    """Rotation vector (3,) rad of a rotation (3, 3), through the quaternion of the largest component."""
+    """Rotation vector (3,) rad of a rotation (3, 3), through the quaternion of the largest
+    component.
+    """
     q = np.empty(4)
-    d0, d1, d2 = r[0, 0], r[1, 1], r[2, 2]
+    d0 = r[0, 0]
+    d1 = r[1, 1]
+    d2 = r[2, 2]
     squares = np.array([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2])
-    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    wx = r[2, 1] - r[1, 2]
+    wy = r[0, 2] - r[2, 0]
+    wz = r[1, 0] - r[0, 1]
+    xy = r[0, 1] + r[1, 0]
+    xz = r[0, 2] + r[2, 0]
+    yz = r[1, 2] + r[2, 1]
     pivot = int(np.argmax(squares))
     if pivot == 0:
-        q[0], q[1], q[2], q[3] = squares[0], wx, wy, wz
+        q[0] = squares[0]
+        q[1] = wx
+        q[2] = wy
+        q[3] = wz
     elif pivot == 1:
-        q[0], q[1], q[2], q[3] = wx, squares[1], xy, xz
+        q[0] = wx
+        q[1] = squares[1]
+        q[2] = xy
+        q[3] = xz
     elif pivot == 2:
-        q[0], q[1], q[2], q[3] = wy, xy, squares[2], yz
+        q[0] = wy
+        q[1] = xy
+        q[2] = squares[2]
+        q[3] = yz
     else:
-        q[0], q[1], q[2], q[3] = wz, xz, yz, squares[3]
+        q[0] = wz
+        q[1] = xz
+        q[2] = yz
+        q[3] = squares[3]
     if q[0] < 0.0:
         q = -q
     length = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
@@ -281,13 +329,16 @@ def _between(a, b, out):
 
 @njit(cache=True)
 def run_rotations(y, known, start, keep, go, forward, back, out, rate):
-    """As `run_vector` for rotations y (n, 3, 3): the velocity is the body's own angular velocity (n, 3) rad/s, the
-    error a rotation vector on the right (left-invariant). Each axis of the body has its own gains: keep and go (3, n),
-    forward (3, n, 2), back (3, n, 2, 2).
+    """As `run_vector` for rotations y (n, 3, 3): the velocity is the body's own angular velocity
+    (n, 3) rad/s, the error a rotation vector on the right (left-invariant). Each axis of the body
+    has its own gains: keep and go (3, n), forward (3, n, 2), back (3, n, 2, 2).
     """
     n = known.size
-    w, off, ahead = np.empty(3), np.empty(3), np.empty((3, 3))
-    out[start], rate[start] = y[start], 0.0
+    w = np.empty(3)
+    off = np.empty(3)
+    ahead = np.empty((3, 3))
+    out[start] = y[start]
+    rate[start] = 0.0
     for t in range(start + 1, n):
         for k in range(3):
             w[k] = go[k, t] * rate[t - 1, k]
@@ -300,7 +351,8 @@ def run_rotations(y, known, start, keep, go, forward, back, out, rate):
                 w[k] = forward[k, t, 0] * off[k]
                 rate[t, k] += forward[k, t, 1] * off[k]
             _moved(ahead, w, out[t])
-    here, expected = np.empty((3, 3)), np.empty((3, 3))
+    here = np.empty((3, 3))
+    expected = np.empty((3, 3))
     for t in range(n - 2, start - 1, -1):
         for k in range(3):
             w[k] = go[k, t + 1] * rate[t, k]

@@ -1,4 +1,6 @@
-"""Kernel of the smoother: all coordinates of a pose at once, outliers weighed down in a few passes."""
+"""Kernel of the smoother: all coordinates of a pose at once, outliers weighed down in a few
+passes.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ _PASSES = 4
 
 
 class Body(NamedTuple):
-    """A skeleton for the kernels, see `place_joints`; free (m, 2): joint and axis of each angle; length_mm; tip."""
+    """A skeleton for the kernels, see `place_joints`; free (m, 2): joint and axis of each angle;
+    length_mm; tip.
+    """
 
     parents: NDArray[np.int64]
     offsets: NDArray[np.float64]
@@ -27,7 +31,9 @@ class Body(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """A `Motion` for the kernels: rows of error, drive and fade; place_error (3,), place_drive (3,) lengths^2/s^3."""
+    """A `Motion` for the kernels: rows of error, drive and fade; place_error (3,), place_drive (3,)
+    lengths^2/s^3.
+    """
 
     place_error: NDArray[np.float64]
     place_drive: NDArray[np.float64]
@@ -41,7 +47,9 @@ class Moves(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Of n frames: rotation (n, 3, 3), place (n, 3) mm, angles (n, J, 3), log_scale (n,), joints (n, J, 3) mm."""
+    """Of n frames: rotation (n, 3, 3), place (n, 3) mm, angles (n, J, 3), log_scale (n,), joints
+    (n, J, 3) mm.
+    """
 
     rotation: NDArray[np.float64]
     place: NDArray[np.float64]
@@ -51,8 +59,8 @@ class Poses(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Of n frames: covariance of the joints' middle (n, 3, 3) mm^2; variances of the base's rotation about its own axes
-    and of the other joints' angles (n, 3) rad^2.
+    """Of n frames: covariance of the joints' middle (n, 3, 3) mm^2; variances of the base's
+    rotation about its own axes and of the other joints' angles (n, 3) rad^2.
     """
 
     middle: NDArray[np.float64]
@@ -62,9 +70,13 @@ class Spread(NamedTuple):
 
 @njit(cache=True)
 def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
-    """Fill `made` and `spread` with the curve through `seen`, and used (n,) with the frames that it goes by."""
-    n, n_joints = error.size, body.parents.size
-    weight, middle = np.ones(n), np.empty((n, 3))
+    """Fill `made` and `spread` with the curve through `seen`, and used (n,) with the frames that it
+    goes by.
+    """
+    n = error.size
+    n_joints = body.parents.size
+    weight = np.ones(n)
+    middle = np.empty((n, 3))
     frame = np.empty((n, 3, 3))
     for t in range(n):
         used[t] = known[t]
@@ -98,11 +110,13 @@ def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
 @njit(cache=True)
 def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, used):
     """One way forward and back, with each measurement's variance divided by its weight."""
-    n, m = error.size, body.free.shape[0]
+    n = error.size
+    m = body.free.shape[0]
     start = 0
     while not used[start]:
         start += 1
-    variance, r = np.full(n, np.inf), np.zeros((n, 3, 3))
+    variance = np.full(n, np.inf)
+    r = np.zeros((n, 3, 3))
     for t in range(n):
         if used[t]:
             variance[t] = (1.0 - moves.lasting**2) * error[t] ** 2 / weight[t]
@@ -115,11 +129,18 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
                             * variance[t]
                             * moves.place_error[a] ** 2
                         )
-    out, drive = np.empty((n, 3)), moves.place_drive * body.length_mm**2
+    out = np.empty((n, 3))
+    drive = moves.place_drive * body.length_mm**2
     run_place(times, middle, r, used, start, drive, moves.place_fade, out, spread.middle)
-    keep, go, forward = np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2))
-    back, filtered, predicted = np.zeros((3, n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
-    smoothed, rate, value = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n)
+    keep = np.zeros((3, n))
+    go = np.zeros((3, n))
+    forward = np.zeros((3, n, 2))
+    back = np.zeros((3, n, 2, 2))
+    filtered = np.zeros((n, 2, 2))
+    predicted = np.zeros((n, 2, 2))
+    smoothed = np.zeros((n, 2, 2))
+    rate = np.zeros(n)
+    value = np.zeros(n)
     for a in range(3):
         _gains_of(
             times,
@@ -259,10 +280,13 @@ def _own_frame(along, out):
     side = np.array([-a[1], a[0], 0.0])
     level = np.sqrt(side[0] ** 2 + side[1] ** 2)
     if level < 1e-6:
-        side[0], side[1], level = 0.0, 1.0, 1.0
+        side[0] = 0.0
+        side[1] = 1.0
+        level = 1.0
         a[0], a[1], a[2] = 0.0, 0.0, 1.0 if a[2] >= 0 else -1.0
     side /= level
-    out[:, 0], out[:, 1] = a, side
+    out[:, 0] = a
+    out[:, 1] = side
     out[0, 2] = a[1] * side[2] - a[2] * side[1]
     out[1, 2] = a[2] * side[0] - a[0] * side[2]
     out[2, 2] = a[0] * side[1] - a[1] * side[0]

@@ -1,7 +1,8 @@
-"""What the tracker believes of an animal: how it moves, how frames err, and what makes a chain of hypotheses likely.
+"""What the tracker believes of an animal: how it moves, how frames err, and what makes a chain of
+hypotheses likely.
 
-`tunings.toml` beside this module holds it for the bundled animals; `liex train tracking` finds it again, on rendered
-sequences whose seeds are not those of any test.
+`tunings.toml` beside this module holds it for the bundled animals; `liex train tracking` finds it
+again, on rendered sequences whose seeds are not those of any test.
 """
 
 from __future__ import annotations

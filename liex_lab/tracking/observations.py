@@ -24,13 +24,15 @@ N_HYPOTHESES = (
 
 @dataclass(frozen=True)
 class Observations:
-    """Hypotheses (n, H) of n frames, NaN where there is none; the first is the single frame's own answer.
+    """Hypotheses (n, H) of n frames, NaN where there is none; the first is the single frame's own
+    answer.
 
-    times_ns (n,); turn (n, H, 3) rad and place (n, H, 3) mm: T_arena_root, the rotation as its vector; angles (n, H, D)
-    rad about the skeleton's free axes, joint by joint; scale (n, H) of the bones; error_mm (n, H): expected mean joint
-    error; score (n, H): what the metric says of the candidates behind it, mm at home size; residual_mm (n, H): between
-    body and depth. Of the thing that it is a pose of: n_px, centroid_mm (n, H, 3) arena frame and centroid_px
-    (n, H, 2). has_depth (n,): anything was read. Single precision, for a recording may last hours.
+    times_ns (n,); turn (n, H, 3) rad and place (n, H, 3) mm: T_arena_root, the rotation as its
+    vector; angles (n, H, D) rad about the skeleton's free axes, joint by joint; scale (n, H) of the
+    bones; error_mm (n, H): expected mean joint error; score (n, H): what the metric says of the
+    candidates behind it, mm at home size; residual_mm (n, H): between body and depth. Of the thing
+    that it is a pose of: n_px, centroid_mm (n, H, 3) arena frame and centroid_px (n, H, 2).
+    has_depth (n,): anything was read. Single precision, for a recording may last hours.
     """
 
     skeleton: Skeleton
@@ -50,7 +52,9 @@ class Observations:
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
         """Frames in which nothing was found."""
-        n, h, d = len(times_ns), N_HYPOTHESES, int(skeleton.axes[1:].sum())
+        n = len(times_ns)
+        h = N_HYPOTHESES
+        d = int(skeleton.axes[1:].sum())
 
         def nothing(*shape: int) -> Small:
             return np.full((n, h, *shape), np.nan, np.float32)
@@ -75,7 +79,8 @@ class Observations:
         """Poses (n) in the arena frame as hypothesis h, NaN where there is none."""
         known = np.isfinite(pose.scale)
         self.turn[known, h] = so3.log(pose.root.rotation[known])
-        self.place[:, h], self.scale[:, h] = pose.root.translation, pose.scale
+        self.place[:, h] = pose.root.translation
+        self.scale[:, h] = pose.scale
         self.angles[:, h] = pose.angles[:, 1:][:, self.skeleton.axes[1:]]
 
     @staticmethod
@@ -107,7 +112,9 @@ class Observations:
         return np.isfinite(self.score)
 
     def pose(self, path: NDArray[np.int64]) -> Pose:
-        """The poses (n) of the hypotheses `path` (n,); NaN where it is negative or there is none."""
+        """The poses (n) of the hypotheses `path` (n,); NaN where it is negative or there is
+        none.
+        """
         turn, place, free, scale = (
             self.along(v, path) for v in (self.turn, self.place, self.angles, self.scale)
         )
@@ -116,13 +123,17 @@ class Observations:
         return Pose(SE3(so3.exp(turn), place), angles, scale)
 
     def along(self, values: NDArray[np.generic], path: NDArray[np.int64]) -> Array:
-        """Some of the hypotheses' values (n, H, ...) along a path (n,), NaN where it is negative."""
+        """Some of the hypotheses' values (n, H, ...) along a path (n,), NaN where it is
+        negative.
+        """
         taken = values[np.arange(len(path)), np.maximum(path, 0)].astype(np.float64)
         taken[path < 0] = np.nan
         return taken
 
     def joints(self, joints: Sequence[int], room: Room = np.empty) -> Small:
-        """Positions (n, H, len(joints), 3) mm of some joints in all hypotheses; room: where they are to lie."""
+        """Positions (n, H, len(joints), 3) mm of some joints in all hypotheses; room: where they
+        are to lie.
+        """
         out = room((*self.score.shape, len(joints), 3), np.float32)
         for start in range(0, len(self), _BLOCK):
             out[start : start + _BLOCK] = np.nan

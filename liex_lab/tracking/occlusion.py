@@ -1,8 +1,9 @@
-"""An animal of which something hides one end: where the rest of it lies is told by the end that is seen.
+"""An animal of which something hides one end: where the rest of it lies is told by the end that is
+seen.
 
-A pose that was found in what is seen of an animal lies in the middle of it. Which end is hidden is told by where things
-lie before the animal; the other end is where it is seen to end, less what is usually seen of it beyond or short of the
-chain's end.
+A pose that was found in what is seen of an animal lies in the middle of it. Which end is hidden is
+told by where things lie before the animal; the other end is where it is seen to end, less what is
+usually seen of it beyond or short of the chain's end.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ Array = NDArray[np.float64]
 
 _BEFORE = 2.0  # roots of the animal's area: what is so much nearer lies before it
 _WHOLE = 0.95  # of the animal's usual area: it is all there
-_ASIDE = 0.25  # of half of what is seen: where nothing lies so far to one end, no one knows which end is hidden
+# of half of what is seen: where nothing lies so far to one end, no one knows which end is hidden
+_ASIDE = 0.25
 _SLIDE = 0.45  # of the share that is hidden: a chain that was fitted to the rest slides no farther
 _REACH_PX = 3  # crop pixels from the animal: what lies before it is looked for
 
@@ -32,7 +34,8 @@ _REACH_PX = 3  # crop pixels from the animal: what lies before it is looked for
 class FreeEnds:
     """Slides poses along their axes to where the end that is seen says.
 
-    begins, ends: where what is seen of a whole animal begins and ends along the line from its base (0) to its tip (1).
+    begins, ends: where what is seen of a whole animal begins and ends along the line from its base
+    (0) to its tip (1).
     """
 
     skeleton: Skeleton
@@ -44,7 +47,9 @@ class FreeEnds:
     def fit(
         skeleton: Skeleton, scene: Foreground, pose: Pose, crops: Crops, depths: NDArray[np.float32]
     ) -> FreeEnds:
-        """From poses (n), camera frame, of frames (n, H, W) mm; crops: cut along the optical axis."""
+        """From poses (n), camera frame, of frames (n, H, W) mm; crops: cut along the
+        optical axis.
+        """
         ends = FreeEnds(skeleton, scene)
         sight = ends._sight(pose, crops, depths)
         whole = (sight[:, 0] > _WHOLE) & (sight[:, 1] == 0)
@@ -84,18 +89,26 @@ class FreeEnds:
 
 @njit(cache=True, parallel=True)
 def _look(heights, origin, step, distance, depths, ends, before, out):
-    """Along the line from base to tip, ends (n, 2, 2) px, into out (n, 5): pixels seen times their squared depth, how
-    many of them lie beside a thing that is nearer by `before` mm or beside the picture's edge, how far these are from
-    the middle of all over half of what is seen, and where that begins and ends.
+    """Along the line from base to tip, ends (n, 2, 2) px, into out (n, 5): pixels seen times their
+    squared depth, how many of them lie beside a thing that is nearer by `before` mm or beside the
+    picture's edge, how far these are from the middle of all over half of what is seen, and where
+    that begins and ends.
     """
     for i in prange(heights.shape[0]):
-        size, depth = heights.shape[1], depths[i]
+        size = heights.shape[1]
+        depth = depths[i]
         line = ends[i, 1] - ends[i, 0]
         squared = max(line[0] ** 2 + line[1] ** 2, 1.0)
-        n, covered, aside, middle, first, last = 0, 0, 0.0, 0.0, np.inf, -np.inf
+        n = 0
+        covered = 0
+        aside = 0.0
+        middle = 0.0
+        first = np.inf
+        last = -np.inf
         for r in range(size):
             for c in range(size):
-                v, u = origin[i, 1] + step[i] * r, origin[i, 0] + step[i] * c
+                v = origin[i, 1] + step[i] * r
+                u = origin[i, 0] + step[i] * c
                 if heights[i, r, c] <= 0 or not (
                     0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]
                 ):
@@ -104,12 +117,18 @@ def _look(heights, origin, step, distance, depths, ends, before, out):
                 if depth[v, u] > 0 and abs(depth[v, u] - z) > 0.5 * before:
                     continue  # a hole in the height map, filled from beside it
                 at = ((u - ends[i, 0, 0]) * line[0] + (v - ends[i, 0, 1]) * line[1]) / squared
-                n, middle, first, last = n + 1, middle + at, min(first, at), max(last, at)
+                n = n + 1
+                middle = middle + at
+                first = min(first, at)
+                last = max(last, at)
                 out[i, 0] += (step[i] * z) ** 2
                 if _beside(depth, v, u, step[i], z - before):
-                    covered, aside = covered + 1, aside + at
+                    covered = covered + 1
+                    aside = aside + at
         if n > 0:
-            out[i, 1], out[i, 3], out[i, 4] = covered, first, last
+            out[i, 1] = covered
+            out[i, 3] = first
+            out[i, 4] = last
         if covered > 0:
             out[i, 2] = (aside / covered - middle / n) / max(0.5 * (last - first), 1e-6)
 
@@ -119,7 +138,8 @@ def _beside(depth, v, u, step, nearer):
     """Whether a pixel lies beside one that is nearer than this, or beside the picture's edge."""
     for k in range(1, _REACH_PX + 1):
         for dv, du in ((k, 0), (-k, 0), (0, k), (0, -k)):
-            row, column = v + dv * step, u + du * step
+            row = v + dv * step
+            column = u + du * step
             if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
                 return True
             if 0 < depth[row, column] < nearer:

@@ -1,4 +1,6 @@
-"""From what single frames say to the track: the whole recording at once, head and tail told apart over all of it."""
+"""From what single frames say to the track: the whole recording at once, head and tail told apart
+over all of it.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,21 @@ from liex_lab.tracking.track import Flip, Track, Tracked
 
 Array = NDArray[np.float64]
 
-_BLOCK, MARGIN = 4096, 160  # frames smoothed at a time, and how many beside them have a say
-# nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was passed by is a
-# measurement after all, unless it shows less than this share of what the animal usually shows, or more than that many
-# times as much; of half an animal beside a bar the pose errs by this share of the length that is not seen. Each time
+# frames smoothed at a time, and how many beside them have a say
+_BLOCK = 4096
+MARGIN = 160
+# nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was
+# passed by is a
+# measurement after all, unless it shows less than this share of what the animal usually shows, or
+# more than that many
+# times as much; of half an animal beside a bar the pose errs by this share of the length that is
+# not seen. Each time
 # that some are taken, the curve comes nearer to others.
-_ADMIT, _LEAST, _MOST, _UNSEEN, _TIMES = 1.0, 0.5, 1.5, 0.4, 2
+_ADMIT = 1.0
+_LEAST = 0.5
+_MOST = 1.5
+_UNSEEN = 0.4
+_TIMES = 2
 _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 
@@ -34,10 +45,11 @@ _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 class Subject:
     """Whom a track is of, and before which camera.
 
-    length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long a
-    stretch without a measurement is bridged, and half as far into a longer one from both its ends; joint_share (J,):
-    each joint's error over the mean. stretch_sd: by which share all distances from the base may be off throughout, for
-    an animal whose ends a sensor eats is taken for a smaller one; None where nothing is known of it.
+    length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged;
+    bridge_s: so long a stretch without a measurement is bridged, and half as far into a longer one
+    from both its ends; joint_share (J,): each joint's error over the mean. stretch_sd: by which
+    share all distances from the base may be off throughout, for an animal whose ends a sensor eats
+    is taken for a smaller one; None where nothing is known of it.
     """
 
     skeleton: Skeleton
@@ -57,10 +69,11 @@ def track_whole(
     tuning: Tuning | None = None,
     room: Room = np.empty,
 ) -> Tracked:
-    """The track of a recording from what was seen in all of its frames; corrections: what a human says of flips.
+    """The track of a recording from what was seen in all of its frames; corrections: what a human
+    says of flips.
 
-    tuning: None takes the animal's own. room: where the track is to lie; of everything else no more than a block of
-    frames is in memory.
+    tuning: None takes the animal's own. room: where the track is to lie; of everything else no more
+    than a block of frames is in memory.
     """
     tuning = tuning or Tuning.of(subject.skeleton.name)
     chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
@@ -71,10 +84,12 @@ def track_whole(
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
     track = Track.empty(subject.skeleton, seen.times_ns, room=room)
-    used, seconds = np.zeros(len(seen), np.bool_), seen.seconds
+    used = np.zeros(len(seen), np.bool_)
+    seconds = seen.seconds
 
     def draw(rows: slice) -> None:
-        first, last = max(0, rows.start - MARGIN), min(len(seen), rows.stop + MARGIN)
+        first = max(0, rows.start - MARGIN)
+        last = min(len(seen), rows.stop + MARGIN)
         around = slice(first, last)
         pose = seen[around].pose(path[around])
         _reverse(subject.skeleton, pose, turned[around])
@@ -120,8 +135,9 @@ def _rest(track: Track, seen: Observations) -> None:
 def _turn_round(
     seen: Observations, path: NDArray[np.int64], doubt: Array, corrections: Sequence[Flip]
 ) -> NDArray[np.int64]:
-    """Exchange head and tail in the spans that a human says, of which there is no doubt then: in the path where a frame
-    has that hypothesis. Returns how often (n,) the pose itself is to be turned round elsewhere.
+    """Exchange head and tail in the spans that a human says, of which there is no doubt then: in
+    the path where a frame has that hypothesis. Returns how often (n,) the pose itself is to be
+    turned round elsewhere.
     """
     turned = np.zeros(len(seen), np.int64)
     for span in corrections:
@@ -142,11 +158,10 @@ def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
     """Turn poses (n) round so many times (n,) each, in place."""
     for t in np.repeat(np.arange(len(turned)), turned):
         other = reversed_pose(skeleton, pose[t : t + 1])
-        pose.root.rotation[t], pose.root.translation[t] = (
-            other.root.rotation[0],
-            other.root.translation[0],
-        )
-        pose.angles[t], pose.scale[t] = other.angles[0], other.scale[0]
+        pose.root.rotation[t] = other.root.rotation[0]
+        pose.root.translation[t] = other.root.translation[0]
+        pose.angles[t] = other.angles[0]
+        pose.scale[t] = other.scale[0]
 
 
 def _admit(
@@ -157,9 +172,11 @@ def _admit(
     track: Track,
     usual_px: float,
 ) -> None:
-    """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames that were passed by.
+    """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames
+    that were passed by.
 
-    It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an animal how it lies.
+    It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an
+    animal how it lies.
     """
     best = np.full(len(seen), _ADMIT)
     passed = (path == NONE) & np.isfinite(track.predicted_error_mm)
@@ -174,7 +191,9 @@ def _admit(
         off = np.linalg.norm(joints - track.joints_mm[rows], axis=-1).mean(axis=1)
         off /= np.hypot(said, track.predicted_error_mm[rows])
         better = off < best[rows]
-        path[rows[better]], best[rows[better]], error[rows[better]] = h, off[better], said[better]
+        path[rows[better]] = h
+        best[rows[better]] = off[better]
+        error[rows[better]] = said[better]
 
 
 def to_track(
@@ -189,7 +208,8 @@ def to_track(
 ) -> Track:
     """A curve as rows of a track: measured, bridged over a short time, or missing.
 
-    ahead: the curve also goes on for a short time after the last measurement; told: only these rows.
+    ahead: the curve also goes on for a short time after the last measurement; told: only these
+    rows.
     """
     tuning = tuning or Tuning.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
@@ -202,10 +222,13 @@ def to_track(
 
 def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None:
     """A curve into the rows (n) of a track, whether anything was measured there or not."""
-    pose, motion = curve.pose, tuning.motion
+    pose = curve.pose
+    motion = tuning.motion
     track.joints_mm[:] = curve.joints
-    track.root_rotation[:], track.root_mm[:] = pose.root.rotation, pose.root.translation
-    track.angles_rad[:], track.scale[:] = pose.angles, pose.scale
+    track.root_rotation[:] = pose.root.rotation
+    track.root_mm[:] = pose.root.translation
+    track.angles_rad[:] = pose.angles
+    track.scale[:] = pose.scale
     stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
     away = stretch_of(stretch, curve.joints)
     track.sd_mm[:] = np.hypot(
@@ -227,7 +250,9 @@ def _settle(
     measured: NDArray[np.bool_],
     bridged: NDArray[np.bool_],
 ) -> None:
-    """Keep of the curve in the rows (n) of a track what was measured or is bridged, and add what was seen."""
+    """Keep of the curve in the rows (n) of a track what was measured or is bridged, and add what
+    was seen.
+    """
     there = measured | bridged
     for column in (
         track.joints_mm,
@@ -254,14 +279,16 @@ def _settle(
 
 
 def covariance_of_root(curve: Curve) -> Array:
-    """Covariance (n, 6, 6) of the root's turn, rad, and shift, mm, about and along its own axes: what the joints'
-    middle may be off, and what a turn about the middle moves the root.
+    """Covariance (n, 6, 6) of the root's turn, rad, and shift, mm, about and along its own axes:
+    what the joints' middle may be off, and what a turn about the middle moves the root.
     """
-    root, out = curve.pose.root, np.zeros((len(curve.joints), 6, 6))
+    root = curve.pose.root
+    out = np.zeros((len(curve.joints), 6, 6))
     lever = np.einsum("nij,ni->nj", root.rotation, curve.joints[:, 0] - curve.joints.mean(axis=1))
     moved = -so3.hat(lever)  # of a small turn: the shift is its cross product with the lever
     turn = curve.sd_turn[:, :, None] ** 2 * np.eye(3)
-    out[:, :3, :3], out[:, 3:, :3] = turn, moved @ turn
+    out[:, :3, :3] = turn
+    out[:, 3:, :3] = moved @ turn
     out[:, :3, 3:] = np.swapaxes(out[:, 3:, :3], 1, 2)
     middle = np.swapaxes(root.rotation, 1, 2) @ curve.cov_middle_mm2 @ root.rotation
     out[:, 3:, 3:] = middle + moved @ turn @ np.swapaxes(moved, 1, 2)
@@ -269,13 +296,14 @@ def covariance_of_root(curve: Curve) -> Array:
 
 
 def stretch_of(stretch_sd: float, joints: Array) -> Array:
-    """Standard deviations (n, J) mm along one axis of joints (n, J, 3) mm whose distances from the base are all off by
-    about this share.
+    """Standard deviations (n, J) mm along one axis of joints (n, J, 3) mm whose distances from the
+    base are all off by about this share.
     """
     return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
 
 
-# a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails are heavier
+# a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails
+# are heavier
 ERROR_PER_SD = 1.4
 
 
@@ -283,19 +311,19 @@ def _add_sight(
     track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
 ) -> None:
     """What was seen of the animal where it was measured."""
-    rows, taken = np.flatnonzero(measured), path[measured]
+    rows = np.flatnonzero(measured)
+    taken = path[measured]
     track.n_foreground_px[rows] = seen.n_px[rows, taken]
-    track.centroid_mm[rows], track.centroid_px[rows] = (
-        seen.centroid_mm[rows, taken],
-        seen.centroid_px[rows, taken],
-    )
+    track.centroid_mm[rows] = seen.centroid_mm[rows, taken]
+    track.centroid_px[rows] = seen.centroid_px[rows, taken]
     track.residual_mm[rows] = seen.residual_mm[rows, taken]
 
 
 def single_frames(subject: Subject, seen: Observations) -> Track:
     """What each frame says by itself, without its neighbours."""
     path = np.where(seen.known[:, 0], 0, NONE)
-    pose, error = seen.pose(path), seen.along(seen.error_mm, path)
+    pose = seen.pose(path)
+    error = seen.along(seen.error_mm, path)
     moves = Tuning.of(subject.skeleton.name).motion.packed
     turn, bend = (
         group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend)
@@ -308,8 +336,9 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
 def short_gaps(
     seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
 ) -> NDArray[np.bool_]:
-    """(n,) True in frames between two measured ones of which the nearer is no farther than half of bridge_s, so that a
-    gap no longer than bridge_s is bridged whole; ahead: and so long after the last one.
+    """(n,) True in frames between two measured ones of which the nearer is no farther than half of
+    bridge_s, so that a gap no longer than bridge_s is bridged whole; ahead: and so long after the
+    last one.
     """
     rows = np.flatnonzero(measured)
     if not len(rows):
@@ -317,7 +346,8 @@ def short_gaps(
     t = np.arange(len(measured))
     after = np.searchsorted(rows, t)
     inside = (after > 0) & (after < len(rows))
-    before, after = rows[np.maximum(after - 1, 0)], rows[np.minimum(after, len(rows) - 1)]
+    before = rows[np.maximum(after - 1, 0)]
+    after = rows[np.minimum(after, len(rows) - 1)]
     away = np.minimum(seconds - seconds[before], seconds[after] - seconds)
     short = inside & (away <= 0.5 * bridge_s)
     if ahead:
@@ -326,8 +356,11 @@ def short_gaps(
 
 
 def _flips(seen: Observations, track: Track) -> list[Flip]:
-    """The stretches in which the single frames had head and tail exchanged, and those in which the track may have."""
-    tip, exchanged = track.skeleton.tip, np.zeros(len(seen), np.bool_)
+    """The stretches in which the single frames had head and tail exchanged, and those in which the
+    track may have.
+    """
+    tip = track.skeleton.tip
+    exchanged = np.zeros(len(seen), np.bool_)
     for rows in blocks(len(seen), _BLOCK):
         ends = seen[rows].joints([0, tip])[:, 0]
         along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]

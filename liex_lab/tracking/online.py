@@ -1,4 +1,6 @@
-"""Tracking while the recording goes on: the same chain and the same smoother over the last seconds, at a fixed lag."""
+"""Tracking while the recording goes on: the same chain and the same smoother over the last seconds,
+at a fixed lag.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +14,24 @@ from liex_lab.tracking.offline import Subject, to_track
 from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.track import Track
 
-# frames that have a say in which hypothesis is the animal, and before the one that is told in where exactly it is
-_WINDOW, _BEFORE = 48, 20
+# frames that have a say in which hypothesis is the animal, and before the one that is told in where
+# exactly it is
+_WINDOW = 48
+_BEFORE = 20
 
 
 class OnlineTracker:
     """Takes what frames say as they come; gives a row for every one, `lag` frames later.
 
-    Which hypothesis a frame of the past was stays as it was told; what is told can only get better with a longer lag.
-    With lag 0 a row is told at once, from the past alone.
+    Which hypothesis a frame of the past was stays as it was told; what is told can only get better
+    with a longer lag. With lag 0 a row is told at once, from the past alone.
     """
 
     def __init__(self, subject: Subject, lag: int = 0, tuning: Tuning | None = None) -> None:
         tuning = tuning or Tuning.of(subject.skeleton.name)
-        self._subject, self._lag, self._motion = subject, lag, tuning.motion
+        self._subject = subject
+        self._lag = lag
+        self._motion = tuning.motion
         self._chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
@@ -35,7 +41,9 @@ class OnlineTracker:
         )
 
     def add(self, seen: Observations) -> Track | None:
-        """The rows that can be told once the next frames are known, None where there are none yet."""
+        """The rows that can be told once the next frames are known, None where there are
+        none yet.
+        """
         rows = []
         for k in range(len(seen)):
             self._take(seen[k : k + 1])
@@ -54,21 +62,28 @@ class OnlineTracker:
         joints = self._chain.joints(frame)
         joints = joints if self._joints is None else np.concatenate([self._joints, joints])
         gone = max(0, len(joined) - _WINDOW)
-        self._seen, self._joints, self._told = joined[gone:], joints[gone:], self._told - gone
+        self._seen = joined[gone:]
+        self._joints = joints[gone:]
+        self._told = self._told - gone
         self._path = np.append(self._path[gone:], NONE)
 
     def _tell(self, n: int) -> Track:
         """The rows of the n frames after those that were told."""
         assert self._seen is not None
-        seen, told = self._seen, self._told
+        seen = self._seen
+        told = self._told
         path = self._chain.path(seen, self._path[:told], self._joints)
         self._path[told : told + n] = path[told : told + n]
         doubt = self._chain.doubt(seen, path, self._joints)
         first = max(0, told - _BEFORE)
         if (path[first:] == NONE).all():  # what is known of the animal lies further back
             first = 0
-        seen, path, doubt, told = seen[first:], path[first:], doubt[first:], told - first
-        pose, error = seen.pose(path), seen.along(seen.error_mm, path)
+        seen = seen[first:]
+        path = path[first:]
+        doubt = doubt[first:]
+        told = told - first
+        pose = seen.pose(path)
+        error = seen.along(seen.error_mm, path)
         curve = smooth(
             self._subject.skeleton, seen.seconds, pose, error, self._subject.length_mm, self._motion
         )

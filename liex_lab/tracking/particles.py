@@ -1,7 +1,8 @@
-"""Algorithm 3 of Lie-X to the letter: a particle filter whose base joints wander and whose other joints are regressed.
+"""Algorithm 3 of Lie-X to the letter: a particle filter whose base joints wander and whose other
+joints are regressed.
 
-What the paper leaves open is stated in `Wander` and in `ParticleFilter`. It keeps its row in the tables; the default
-tracker is `curve`.
+What the paper leaves open is stated in `Wander` and in `ParticleFilter`. It keeps its row in the
+tables; the default tracker is `curve`.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ _AVERAGING_PASSES = 10
 
 @dataclass(frozen=True)
 class Wander:
-    """What the paper leaves open: how far base joints wander, and how the metric weighs; lengths of an animal of the
-    reference length.
+    """What the paper leaves open: how far base joints wander, and how the metric weighs; lengths of
+    an animal of the reference length.
 
-    turn_rad and shift_mm: standard deviations of a Brownian step of delta_s, Eq. 6; sigma_mm of Eq. 12.
+    turn_rad and shift_mm: standard deviations of a Brownian step of delta_s, Eq. 6; sigma_mm of Eq.
+    12.
     """
 
     n_particles: int = 200
@@ -40,7 +42,9 @@ class Wander:
 
     @staticmethod
     def of(name: str) -> Wander:
-        """That of an animal: a fish goes and turns three times as far, by its length, between two frames of a mouse."""
+        """That of an animal: a fish goes and turns three times as far, by its length, between two
+        frames of a mouse.
+        """
         return Wander(turn_rad=0.45, shift_mm=12.0) if name == "fish" else Wander()
 
 
@@ -54,11 +58,12 @@ class _Particles:
 
 
 class ParticleFilter:
-    """One animal, frame by frame. The first frame in which it is found gives all particles their place.
+    """One animal, frame by frame. The first frame in which it is found gives all particles their
+    place.
 
-    Selection, propagation of the base by Eq. 7 and of the other joints by Eq. 10, measurement by the learned metric
-    with Eq. 12 and 13, and Eq. 14, where the average of tangent vectors is taken about itself, that is on the group. In
-    a frame without a foreground particles wander on.
+    Selection, propagation of the base by Eq. 7 and of the other joints by Eq. 10, measurement by
+    the learned metric with Eq. 12 and 13, and Eq. 14, where the average of tangent vectors is taken
+    about itself, that is on the group. In a frame without a foreground particles wander on.
     """
 
     def __init__(
@@ -69,14 +74,17 @@ class ParticleFilter:
         rng: np.random.Generator,
         how: Wander | None = None,
     ) -> None:
-        self._estimator, self._scene, self._size, self._rng = estimator, scene, size, rng
+        self._estimator = estimator
+        self._scene = scene
+        self._size = size
+        self._rng = rng
         self._how = how or Wander.of(estimator.skeleton.name)
         self._particles: _Particles | None = None
         self._last_ns = 0
 
     def step(self, frame: DepthFrame) -> tuple[Pose, float] | None:
-        """The pose () of the next frame in the camera frame and its expected error, mm; None before the animal is
-        found, and where no particle can be measured.
+        """The pose () of the next frame in the camera frame and its expected error, mm; None before
+        the animal is found, and where no particle can be measured.
         """
         method = self._estimator.model.method
         depths = frame.depth[None]
@@ -99,7 +107,8 @@ class ParticleFilter:
         self._particles.weight = w / w.sum()
         pose = self._average(rotations, positions).moved(T_view_camera.inverse())
         self._particles.base = T_view_camera.inverse() @ SE3(rotations[:, 0], positions[:, 0])
-        calibration, mean = self._estimator.model.calibration, float(self._particles.weight @ score)
+        calibration = self._estimator.model.calibration
+        mean = float(self._particles.weight @ score)
         return pose, (calibration.offset + calibration.slope * mean) * self._size
 
     @property
@@ -120,7 +129,8 @@ class ParticleFilter:
     def _select(self) -> None:
         """Draw particles from the cumulative weights; all weigh the same afterwards."""
         assert self._particles is not None
-        p, k = self._particles, self._how.n_particles
+        p = self._particles
+        k = self._how.n_particles
         total = np.cumsum(p.weight)
         drawn = np.searchsorted(total, self._rng.random(k) * total[-1])
         self._particles = _Particles(
@@ -132,7 +142,8 @@ class ParticleFilter:
     def _propagate(self, dt: float) -> None:
         """Move every base joint along a Brownian path of dt seconds."""
         assert self._particles is not None
-        how, p = self._how, self._particles
+        how = self._how
+        p = self._particles
         spread = np.array([how.turn_rad] * 3 + [how.shift_mm * self._size * self._unit] * 3)
         n_steps = max(1, int(np.ceil(dt / how.delta_s - 1e-9)))
         # the deviations are those of a whole step, so steps are drawn for a unit of time of delta_s
@@ -140,12 +151,16 @@ class ParticleFilter:
         for i in range(len(p.scale)):
             start = SE3(p.base.rotation[i], p.base.translation[i])
             end = brownian_path(start, steps[i], 1.0, min(dt / how.delta_s, float(n_steps)))
-            p.base.rotation[i], p.base.translation[i] = end.rotation[0], end.translation[0]
+            p.base.rotation[i] = end.rotation[0]
+            p.base.translation[i] = end.translation[0]
 
     def _measure(self, images: ImageSet, base: SE3) -> tuple[Array, Array, Array]:
-        """All joints of the particles, regressed from their bases, in the view frame, and the metric's scores (K,)."""
+        """All joints of the particles, regressed from their bases, in the view frame, and the
+        metric's scores (K,).
+        """
         assert self._particles is not None
-        cascade, model = self._estimator.model.cascade, self._estimator.model
+        cascade = self._estimator.model.cascade
+        model = self._estimator.model
         k = len(self._particles.scale)
         candidates = Candidates.start(
             cascade.skeleton,
@@ -170,9 +185,12 @@ class ParticleFilter:
         )
 
     def _average(self, rotations: Array, positions: Array) -> Pose:
-        """Eq. 14 about the average itself, for the base on SE(3) and for each other joint on its axes."""
+        """Eq. 14 about the average itself, for the base on SE(3) and for each other joint on its
+        axes.
+        """
         assert self._particles is not None
-        weight, skeleton = self._particles.weight, self._estimator.skeleton
+        weight = self._particles.weight
+        skeleton = self._estimator.skeleton
         base = SE3(rotations[:, 0], positions[:, 0])
         best = int(np.argmax(weight))
         root = SE3(base.rotation[best], base.translation[best])

@@ -29,8 +29,11 @@ class WindowTracker:
     estimator: PoseEstimator
 
     def find_size(self, windows: Windows) -> float:
-        """The animal's length over the home length, measured in some windows as over a recording's sample."""
-        model, size = self.estimator.model, 1.0
+        """The animal's length over the home length, measured in some windows as over a recording's
+        sample.
+        """
+        model = self.estimator.model
+        size = 1.0
         uncorrected = replace(
             self, estimator=replace(self.estimator, model=replace(model, corrector=None))
         )
@@ -47,25 +50,27 @@ class WindowTracker:
         self, parts: Iterable[Windows], times_ns: NDArray[np.int64], size: float
     ) -> Observations:
         """What the frames at these times (n,) say, each by itself, in the arena frame."""
-        seen, start = Observations.empty(self.estimator.skeleton, times_ns), 0
+        seen = Observations.empty(self.estimator.skeleton, times_ns)
+        start = 0
         for windows in parts:
             place = windows.floor(0).T_arena_camera
             rows = slice(start, start + len(windows.depth))
-            start, some = rows.stop, seen[rows]  # a view: what is put there is put in all of it
+            # a view: what is put there is put in all of it
+            start = rows.stop
+            some = seen[rows]
             for h, estimates in enumerate(
                 self.estimator.both_ways(*self._cut(windows, size), size)
             ):
                 some.put_pose(h, estimates.chosen.pose.moved(place))
-                some.error_mm[:, h], some.score[:, h] = (
-                    estimates.chosen.error_mm,
-                    estimates.chosen.score,
-                )
+                some.error_mm[:, h] = estimates.chosen.error_mm
+                some.score[:, h] = estimates.chosen.score
                 some.n_px[:, h] = np.where(estimates.found, estimates.crops.n_px, 0)
         return seen
 
     def subject(self, camera: Camera, T_arena_camera: SE3, size: float) -> Subject:
         """Whom a track out of such windows is of, before which camera."""
-        skeleton, calibration = self.estimator.skeleton, self.estimator.model.calibration
+        skeleton = self.estimator.skeleton
+        calibration = self.estimator.model.calibration
         share = calibration.joint_share or (1.0,) * skeleton.n_joints
         doubtful_mm = calibration.doubtful_mm * size
         return Subject(
@@ -74,7 +79,8 @@ class WindowTracker:
 
     def _cut(self, windows: Windows, size: float) -> tuple[Crops, Array]:
         """The height map of every window and how it was cut."""
-        model, n = self.estimator.model, len(windows.depth)
+        model = self.estimator.model
+        n = len(windows.depth)
         used = size if model.method.session_size else 1.0
         area = np.full(n, model.calibration.area_mm2 * size**2)
         lowest = self.estimator.skeleton.view.min_height_mm

@@ -31,9 +31,11 @@ class BodyResidual:
     camera_view: bool = False
 
     def of(self, pose_arena: Pose, crops: Crops, scene: Foreground) -> Array:
-        """Median absolute difference (n,) mm between body and reading over the pixels that both cover; NaN without.
+        """Median absolute difference (n,) mm between body and reading over the pixels that both
+        cover; NaN without.
 
-        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken back to depth.
+        pose_arena (n): poses in the arena frame. The readings are the crops' height maps, taken
+        back to depth.
         """
         n = len(pose_arena.scale)
         if n == 0:
@@ -80,9 +82,12 @@ def render_crops(
 
 @njit(cache=True, parallel=True)
 def _compare(rendered, heights, origin, step, planes, distance, out):
-    """Median |rendered - observed| depth of each frame over pixels where both are, into out (n,)."""
+    """Median |rendered - observed| depth of each frame over pixels where both are, into out
+    (n,).
+    """
     for i in prange(rendered.shape[0]):
-        size, plane = rendered.shape[1], planes[i]
+        size = rendered.shape[1]
+        plane = planes[i]
         off = np.empty(size * size)
         n = 0
         for r in range(size):

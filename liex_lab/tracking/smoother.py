@@ -1,4 +1,6 @@
-"""The curve itself: poses between and beside the measured ones, by a smoother on the manifold, with their spread."""
+"""The curve itself: poses between and beside the measured ones, by a smoother on the manifold, with
+their spread.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ Array = NDArray[np.float64]
 class Wandering:
     """How one coordinate moves and how frames err in it.
 
-    error: standard deviation times the animal's length over the predicted mean joint error; drive: density of the noise
-    that drives the velocity, rad^2/s^3; fade: seconds within which a velocity dies away by itself.
+    error: standard deviation times the animal's length over the predicted mean joint error; drive:
+    density of the noise that drives the velocity, rad^2/s^3; fade: seconds within which a velocity
+    dies away by itself.
     """
 
     error: float
@@ -31,19 +34,22 @@ class Wandering:
 
 @dataclass(frozen=True)
 class Motion:
-    """How an animal moves and how single frames err; errors are over the predicted mean joint error.
+    """How an animal moves and how single frames err; errors are over the predicted mean joint
+    error.
 
-    place_error: of the joints' middle, along the animal, to its side, and up; place_drive (lengths^2/s^3): in the level
-    and up; place_fade s. turn: of the base's rotation, about its own x, y and z axis; bend: of the other joints' angles
-    about theirs; size: of the logarithm of the bones' scale. freedom of the t distribution of errors; reject: off by
-    more than this many predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
-    have in common and no smoother takes away; honest: what is left of an error over what the filter says is left, at
-    some of the latter over the animal's length (pairs, in rising order; between them by the logarithm), beside what a
-    wrong size does: stretch is what the share by which distances from the base may be off (see `Subject`) grows with,
-    how far the body lies from the depth seen, over its length, and the standard deviation of the logarithm of the size
-    that frames tell; usual_stretch: that share of a session of which neither is known. honest_root,
-    honest_bend: the same of the base's rotation and place about and along its own axes, and of the other joints' angles
-    about theirs, over what that leaves.
+    place_error: of the joints' middle, along the animal, to its side, and up; place_drive
+    (lengths^2/s^3): in the level and up; place_fade s. turn: of the base's rotation, about its own
+    x, y and z axis; bend: of the other joints' angles about theirs; size: of the logarithm of the
+    bones' scale. freedom of the t distribution of errors; reject: off by more than this many
+    predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
+    have in common and no smoother takes away; honest: what is left of an error over what the filter
+    says is left, at some of the latter over the animal's length (pairs, in rising order; between
+    them by the logarithm), beside what a wrong size does: stretch is what the share by which
+    distances from the base may be off (see `Subject`) grows with, how far the body lies from the
+    depth seen, over its length, and the standard deviation of the logarithm of the size that frames
+    tell; usual_stretch: that share of a session of which neither is known. honest_root,
+    honest_bend: the same of the base's rotation and place about and along its own axes, and of the
+    other joints' angles about theirs, over what that leaves.
     """
 
     place_error: tuple[float, float, float]
@@ -86,9 +92,10 @@ class Motion:
 class Curve:
     """A smoothed curve of n frames.
 
-    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error; cov_middle_mm2 (n, 3, 3): of
-    the joints' middle along the arena's axes; sd_turn (n, 3) of the base's rotation about its own axes and sd_bend
-    (n, 3) of the other joints' about theirs, rad; used (n,): frames whose measurement it goes by.
+    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error;
+    cov_middle_mm2 (n, 3, 3): of the joints' middle along the arena's axes; sd_turn (n, 3) of the
+    base's rotation about its own axes and sd_bend (n, 3) of the other joints' about theirs, rad;
+    used (n,): frames whose measurement it goes by.
     """
 
     pose: Pose
@@ -107,7 +114,8 @@ class Curve:
     def unknown(n: int, n_joints: int) -> Curve:
         """A curve of frames in which nothing was measured."""
         nan = np.full((n, n_joints, 3, 3), np.nan)
-        axes, none = nan[:, 0, 0], nan[:, 0, 0, 0]
+        axes = nan[:, 0, 0]
+        none = nan[:, 0, 0, 0]
         pose = Pose(SE3(nan[:, 0], axes), nan[..., 0], none)
         return Curve(pose, nan[..., 0], none, nan[:, 0], axes, axes, np.zeros(n, np.bool_))
 
@@ -123,10 +131,12 @@ def smooth(
     length_mm: float,
     motion: Motion,
 ) -> Curve:
-    """The curve through measured poses (n), NaN where none is, with predicted errors error_mm (n,) at times (n,) s.
+    """The curve through measured poses (n), NaN where none is, with predicted errors error_mm (n,)
+    at times (n,) s.
 
-    Errors have heavy tails: measurements far off the curve weigh less (iterated weights of a t distribution) and those
-    very far off nothing. Before the first measurement the curve stands still.
+    Errors have heavy tails: measurements far off the curve weigh less (iterated weights of a t
+    distribution) and those very far off nothing. Before the first measurement the curve stands
+    still.
     """
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     n = len(seconds)
@@ -170,10 +180,13 @@ def _curve(
     spread: kernels.Spread,
     used: NDArray[np.bool_],
 ) -> Curve:
-    """What the kernels made, and how far off it may be: what the filter leaves, and what lasts over many frames."""
+    """What the kernels made, and how far off it may be: what the filter leaves, and what lasts over
+    many frames.
+    """
     lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
     middle = np.trace(spread.middle, axis1=1, axis2=2)
-    place, moves = np.array(motion.place_error), motion.packed
+    place = np.array(motion.place_error)
+    moves = motion.packed
     # of a frame's predicted error, what the middle's errors and what the bends' are of it
     relative = 0.5 * middle / (place**2).sum()
     relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2

@@ -19,7 +19,9 @@ CORRECTED = "corrected"  # the flag of a pose of which a person placed joints
 FLAGS = {
     "": "a pose was measured and is trusted",
     "doubtful": "a pose was measured, but its predicted error is large for this animal",
-    "not_found": "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged",
+    "not_found": (
+        "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged"
+    ),
     "corrected": "a person placed joints of this pose; the others follow as the bones allow",
     "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
 }
@@ -29,14 +31,16 @@ FLAGS = {
 class Track:
     """Poses over time: one row for EVERY frame of the recording, NaN where there is none.
 
-    times_ns (n,) int64; joints_mm (n, J, 3) arena frame; uv_px (n, J, 2) pixels of the depth image; sd_mm (n, J);
-    root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; cov_root (n, 6, 6): covariance of the root's turn, rad,
-    and shift, mm, about and along its own axes; angles_rad (n, J, 3) rotation vectors relative to the parent joint;
-    sd_angles_rad (n, J, 3); scale (n,) of the skeleton's bones; predicted_error_mm (n,) mean joint error expected by
-    the learned metric; residual_mm (n,) median distance between the rendered body and the observed depth;
-    n_foreground_px (n,); centroid_mm (n, 3) centre of the animal as seen from above and its mean height, arena frame;
-    centroid_px (n, 2); p_flip (n,): probability that head and tail are exchanged; bridged (n,): nothing was measured,
-    but shortly before and after, and the pose is what lies between; flag (n,) a word of `FLAGS`.
+    times_ns (n,) int64; joints_mm (n, J, 3) arena frame; uv_px (n, J, 2) pixels of the depth image;
+    sd_mm (n, J); root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; cov_root (n, 6, 6):
+    covariance of the root's turn, rad, and shift, mm, about and along its own axes; angles_rad (n,
+    J, 3) rotation vectors relative to the parent joint; sd_angles_rad (n, J, 3); scale (n,) of the
+    skeleton's bones; predicted_error_mm (n,) mean joint error expected by the learned metric;
+    residual_mm (n,) median distance between the rendered body and the observed depth;
+    n_foreground_px (n,); centroid_mm (n, 3) centre of the animal as seen from above and its mean
+    height, arena frame; centroid_px (n, 2); p_flip (n,): probability that head and tail are
+    exchanged; bridged (n,): nothing was measured, but shortly before and after, and the pose is
+    what lies between; flag (n,) a word of `FLAGS`.
     """
 
     skeleton: Skeleton
@@ -66,8 +70,11 @@ class Track:
         flag: str = "not_found",
         room: Room = np.empty,
     ) -> Track:
-        """A track of these times in which nothing has been measured yet; room: where its columns are to lie."""
-        n, j = len(times_ns), skeleton.n_joints
+        """A track of these times in which nothing has been measured yet; room: where its columns
+        are to lie.
+        """
+        n = len(times_ns)
+        j = skeleton.n_joints
 
         def column(value: object, dtype: object, *shape: int) -> NDArray[Any]:
             made = room((n, *shape), dtype)
@@ -157,8 +164,9 @@ def _columns() -> list[str]:
 class Flip:
     """Frames start to stop (exclusive) in which head and tail may have been exchanged.
 
-    p_flip: probability that they were, in the single frames' answers where `applied` says that this was undone, else in
-    the track; source: model or human; undone_at: when a human took the correction back, ISO 8601.
+    p_flip: probability that they were, in the single frames' answers where `applied` says that this
+    was undone, else in the track; source: model or human; undone_at: when a human took the
+    correction back, ISO 8601.
     """
 
     start: int

@@ -1,4 +1,6 @@
-"""Before the curve: the animal's size and girth, and what every frame of a recording says of the pose by itself."""
+"""Before the curve: the animal's size and girth, and what every frame of a recording says of the
+pose by itself.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +32,12 @@ BRIDGE_S = 0.5
 class FrameTracker:
     """Measures each frame on its own; `track` then makes the curve of them all.
 
-    size: the animal's spine over the skeleton's home length, a fact of the session. size_origin says where the size
-    comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger predicted error are flagged; bridge_s: so long
-    a stretch without a measurement is bridged. blur: how far the body lies from the depth seen, over its length, and
-    size_spread: standard deviation of the logarithm of the size that frames tell; both of the sampled frames.
-    free_ends: puts an animal that swims where the end of it that is seen says.
+    size: the animal's spine over the skeleton's home length, a fact of the session. size_origin
+    says where the size comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger
+    predicted error are flagged; bridge_s: so long a stretch without a measurement is bridged. blur:
+    how far the body lies from the depth seen, over its length, and size_spread: standard deviation
+    of the logarithm of the size that frames tell; both of the sampled frames. free_ends: puts an
+    animal that swims where the end of it that is seen says.
     """
 
     estimator: PoseEstimator
@@ -57,9 +60,11 @@ class FrameTracker:
         doubtful_mm: float | None = None,
         bridge_s: float = BRIDGE_S,
     ) -> FrameTracker:
-        """A tracker for a recording, from a sample (n, H, W) mm of its frames: the animal's size and girth are found.
+        """A tracker for a recording, from a sample (n, H, W) mm of its frames: the animal's size
+        and girth are found.
 
-        spine_mm: the size where the user knows it. Raises EstimationError where no sampled frame shows an animal.
+        spine_mm: the size where the user knows it. Raises EstimationError where no sampled frame
+        shows an animal.
         """
         home = estimator.skeleton.length
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
@@ -69,7 +74,8 @@ class FrameTracker:
                 "no animal was found in the sampled frames; check the depth unit and the plan"
             )
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
-        crops, used = estimates.crops, estimates.found
+        crops = estimates.crops
+        used = estimates.found
         camera_view = estimator.model.method.camera_view
         body = BodyResidual.fit(
             Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
@@ -150,7 +156,8 @@ class FrameTracker:
     ) -> None:
         """What the estimator says as hypothesis h, and what is seen of the thing that it is of."""
         found = np.flatnonzero(estimates.found)
-        chosen, crops = estimates.chosen, estimates.crops
+        chosen = estimates.chosen
+        crops = estimates.crops
         in_camera = (
             chosen.pose
             if self.free_ends is None
@@ -158,7 +165,8 @@ class FrameTracker:
         )
         pose = in_camera.moved(self.scene.floor.T_arena_camera)
         seen.put_pose(h, pose)
-        seen.error_mm[:, h], seen.score[:, h] = chosen.error_mm, chosen.score
+        seen.error_mm[:, h] = chosen.error_mm
+        seen.score[:, h] = chosen.score
         seen.n_px[found, h] = crops.n_px[found]
         if not len(found):
             return

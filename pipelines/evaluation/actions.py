@@ -1,4 +1,6 @@
-"""The job `liex evaluate actions`: the paper's recogniser and ours, on cut-out actions and on uncut recordings."""
+"""The job `liex evaluate actions`: the paper's recogniser and ours, on cut-out actions and on uncut
+recordings.
+"""
 
 from __future__ import annotations
 
@@ -41,18 +43,21 @@ _LEARNERS = 3  # every so many-th recording of fish teaches the tree that knows 
 _MAIN = ("macro_f1", "segment_f1_50")
 
 PROTOCOL = (
-    "Virtual animals act by kinematic definitions, are rendered in depth, measured frame by frame and tracked as `liex "
-    "run` tracks; every feature comes from these tracks, whose mean joint error is track_error_mm. Cut-out sequences: "
-    "{n_train} to learn from and {n_test} to test on, of different individuals; tangent_accuracy and joint_accuracy: "
-    "forests of 50 trees, depth 20, mean of {seeds} seeds, with Wilson's 95 % interval. default_accuracy: the "
-    "timeline's recogniser on the same sequences. timeline: {minutes:.0f} minutes of uncut recordings of {animals} "
-    "individuals whose traits lie outside those it learned from; macro_f1: mean over the actions of the frame-wise F1; "
-    "segment_f1_50: bouts that share at least half of what either covers. by_fps: a slower camera has of the same "
-    "recordings the frames nearest to its times, and the tracker nothing else; at {fast:g} frames per second the first "
-    "{fast_minutes:.0f} minutes of the same ones are rendered again, frame by frame. lost_by_fps: what that is less "
-    "than at the usual rate over the same time. speed_only_macro_f1: a decision tree on speed alone, to show that the "
-    "task is not told by speed. one_hour: the time that features and recognition of an hour's track take; "
-    "core_seconds: of the machine's cores, whatever else they did."
+    "Virtual animals act by kinematic definitions, are rendered in depth, measured frame by frame "
+    "and tracked as `liex run` tracks; every feature comes from these tracks, whose mean joint "
+    "error is track_error_mm. Cut-out sequences: {n_train} to learn from and {n_test} to test on, "
+    "of different individuals; tangent_accuracy and joint_accuracy: forests of 50 trees, depth "
+    "20, mean of {seeds} seeds, with Wilson's 95 % interval. default_accuracy: the timeline's "
+    "recogniser on the same sequences. timeline: {minutes:.0f} minutes of uncut recordings of "
+    "{animals} individuals whose traits lie outside those it learned from; macro_f1: mean over "
+    "the actions of the frame-wise F1; segment_f1_50: bouts that share at least half of what "
+    "either covers. by_fps: a slower camera has of the same recordings the frames nearest to its "
+    "times, and the tracker nothing else; at {fast:g} frames per second the first "
+    "{fast_minutes:.0f} minutes of the same ones are rendered again, frame by frame. lost_by_fps: "
+    "what that is less than at the usual rate over the same time. speed_only_macro_f1: a decision "
+    "tree on speed alone, to show that the task is not told by speed. one_hour: the time that "
+    "features and recognition of an hour's track take; core_seconds: of the machine's cores, "
+    "whatever else they did."
 )
 
 
@@ -65,13 +70,14 @@ def evaluate_actions(
     draw: Callable[[dict[str, Any]], object] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The figures of `liex evaluate actions`. model: an action model other than the bundled one or, where there is
-    none, one trained now; pose_model: that measures the frames, other than the animal's own; minutes: of uncut
-    test recordings; draw: is given the result, for a picture.
+    """The figures of `liex evaluate actions`. model: an action model other than the bundled one or,
+    where there is none, one trained now; pose_model: that measures the frames, other than the
+    animal's own; minutes: of uncut test recordings; draw: is given the result, for a picture.
     """
     if animal not in RATE_HZ:
         raise LiexError(
-            f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of these"
+            f"actions are generated for {' and '.join(RATE_HZ)}, not for {animal}; name one of "
+            "these"
         )
     estimator = estimator_of(animal, "default", progress, pose_model)
     recogniser = _recogniser(animal, model, pose_model, progress)
@@ -88,7 +94,8 @@ def evaluate_actions(
             acted_tracks(cut_sequences(animal, side), estimator, progress) for side in (False, True)
         )
     else:
-        train, test = cut_out(learned), cut_out(tracks)
+        train = cut_out(learned)
+        test = cut_out(tracks)
     timeline, by_fps, lost = _timelines(recogniser, recordings, tracks, fast, RATE_HZ[animal])
     result = {
         "animal": animal,
@@ -121,10 +128,13 @@ def evaluate_actions(
 def sequence_scores(
     train: Sequence[LabelledTrack], test: Sequence[LabelledTrack], recogniser: TimelineModel
 ) -> dict[str, Any]:
-    """How many cut-out actions are named rightly: by the paper's recogniser with either descriptor, and by ours."""
+    """How many cut-out actions are named rightly: by the paper's recogniser with either descriptor,
+    and by ours.
+    """
     from liex_lab.actions.scores import confusion, interval95
 
-    true, n = [str(one.words[0]) for one in test], len(test)
+    true = [str(one.words[0]) for one in test]
+    n = len(test)
     words = sorted(set(true))
     found = paper_names(train, test)
     shares = {
@@ -182,7 +192,8 @@ def paper_names(
     """Per descriptor, the words that the forests of every seed give the test sequences."""
     from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
 
-    words, found = [str(one.words[0]) for one in train], {}
+    words = [str(one.words[0]) for one in train]
+    found = {}
     for kind in DESCRIPTORS:
         rows, asked = (describe(kind, [one.track for one in some]) for some in (train, test))
         found[kind] = [
@@ -198,7 +209,9 @@ def _timelines(
     fast: Sequence[Acted],
     rate_hz: float,
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Scores on uncut recordings, the two main ones at other frame rates, and what is lost at each."""
+    """Scores on uncut recordings, the two main ones at other frame rates, and what is lost
+    at each.
+    """
     usual = _scores(recogniser, tracks)
     alike = _scores(
         recogniser,
@@ -245,7 +258,8 @@ def one_hour(
     hour = replace(again, times_ns=np.round(np.arange(n) * usual * 1e9).astype(np.int64))
     wall = None if one.wall_mm is None else one.wall_mm[np.arange(n) % len(one)]
     recogniser.recognise(one.track, one.wall_mm)  # compiles
-    began, worked = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
+    worked = time.process_time()
     recogniser.recognise(hour, wall)
     return {
         "frames": n,
@@ -291,9 +305,11 @@ def speed_only(
 def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, NDArray[np.str_]]:
     from liex_lab.actions.channels import channel_names, stretches_of
 
-    speeds, words = [], []
+    speeds = []
+    words = []
     for one in tracks:
-        time_s, column = one.track.times_ns * 1e-9, channel_names(one.track.skeleton).index("speed")
+        time_s = one.track.times_ns * 1e-9
+        column = channel_names(one.track.skeleton).index("speed")
         for stretch in stretches_of(one.track, clock_hz):
             row = np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz).clip(0, len(time_s) - 1)
             speeds.append(stretch.values[:, [column]])

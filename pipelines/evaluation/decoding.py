@@ -1,4 +1,6 @@
-"""The job behind `liex evaluate speed --recordings`: how fast each format decodes, and in how much memory."""
+"""The job behind `liex evaluate speed --recordings`: how fast each format decodes, and in how much
+memory.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,12 @@ _ONE_CORE = (
 )
 _READ = "from liex_lab.pipelines.evaluate_recordings import read_aloud; read_aloud()"
 _PROTOCOL = (
-    "rendered pictures of a mouse with a PrimeSense camera's noise ({width} x {height}, {n} frames), written by "
-    "liex_lab and read in a process of its own on one thread; frames a second: every frame decoded to float32 "
-    "millimetres in order, best of {repeats}; opening: finding every frame and its time, once; peak memory: of the "
-    "whole process. An hour's peak is that of the full-sized pictures plus what {hour} frames of 64 x 48 pixels take "
-    "more than {n} of them, for what grows with length is what is kept of every frame, whatever its size"
+    "rendered pictures of a mouse with a PrimeSense camera's noise ({width} x {height}, {n} "
+    "frames), written by liex_lab and read in a process of its own on one thread; frames a "
+    "second: every frame decoded to float32 millimetres in order, best of {repeats}; opening: "
+    "finding every frame and its time, once; peak memory: of the whole process. An hour's peak is "
+    "that of the full-sized pictures plus what {hour} frames of 64 x 48 pixels take more than {n} "
+    "of them, for what grows with length is what is kept of every frame, whatever its size"
 )
 
 
@@ -69,7 +72,8 @@ class _MoseqWriter(RecordingWriter):
         self._stamps.close()
 
 
-# what is measured: the name of a format, what writes it, and how many frames of it may be an hour. Ten minutes of
+# what is measured: the name of a format, what writes it, and how many frames of it may be an hour.
+# Ten minutes of
 # pictures in a folder are 18,000 files, and the other fifty would be like them.
 _FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] = {
     "mcap_zstd_raw": ("r.mcap", McapDepthWriter, 1),
@@ -91,7 +95,9 @@ def evaluate_recordings(
     n_repeats: int = _N_REPEATS,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Frames per second on one core and peak memory of every format that is written; see the protocol in it."""
+    """Frames per second on one core and peak memory of every format that is written; see the
+    protocol in it.
+    """
     camera, pictures = _rendered(progress)
     small = (
         np.random.default_rng(7)
@@ -107,11 +113,9 @@ def evaluate_recordings(
         full = _measure(file, writer, camera, pictures, n_frames, n_repeats)
         short = _measure(file, writer, _SMALL, small, n_frames, 1)
         long = _measure(file, writer, _SMALL, small, n_hour // share, 1)
-        rate[name], opening[name], peak[name] = (
-            full["frames_per_s"],
-            full["open_ms_per_frame"],
-            full["peak_mb"],
-        )
+        rate[name] = full["frames_per_s"]
+        opening[name] = full["open_ms_per_frame"]
+        peak[name] = full["peak_mb"]
         hour[name] = full["peak_mb"] + max(0.0, long["peak_mb"] - short["peak_mb"]) * share
     return {
         "frames_per_s_1core": rate,
@@ -156,7 +160,8 @@ def _measure(
         ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if ran.returncode:
             raise LiexError(
-                f"reading {file} in a process of its own failed ({ran.stderr.strip()[-300:]}); report this"
+                f"reading {file} in a process of its own failed ({ran.stderr.strip()[-300:]}); "
+                "report this"
             )
         numbers: dict[str, float] = json.loads(ran.stdout)
         return numbers
@@ -169,11 +174,14 @@ def _repeated(pictures: NDArray[np.float32], n_frames: int) -> Iterator[DepthFra
 
 
 def read_aloud() -> None:
-    """What the process of its own does: read the recording named on its command line, and print the numbers."""
+    """What the process of its own does: read the recording named on its command line, and print the
+    numbers.
+    """
     from liex_lab.recordings import open_recording
     from liex_lab.runtime.memory import peak_memory_mb
 
-    path, n_repeats = sys.argv[1], int(sys.argv[2])
+    path = sys.argv[1]
+    n_repeats = int(sys.argv[2])
     began = time.perf_counter()
     with open_recording(path, strict=True) as recording:
         opened_s = time.perf_counter() - began

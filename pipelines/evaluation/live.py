@@ -1,4 +1,6 @@
-"""What `liex evaluate live` measures: how late skeletons are while a virtual animal is filmed at its camera's pace."""
+"""What `liex evaluate live` measures: how late skeletons are while a virtual animal is filmed at
+its camera's pace.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,17 @@ from ..build import plan_of
 from ..live import follow_live
 
 LIVE_PROTOCOL = (
-    "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at the camera's pace, "
-    "forwards and backwards in turn. latency: from when a whole frame had come to when its skeleton was told, without "
-    "a viewer; counted from the first frame on that came when all before it had been told, so that learning the "
-    "background is not in it, and from then on every frame. Some frames are followed beforehand, so that all is "
-    "compiled."
+    "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at "
+    "the camera's pace, forwards and backwards in turn. latency: from when a whole frame had come "
+    "to when its skeleton was told, without a viewer; counted from the first frame on that came "
+    "when all before it had been told, so that learning the background is not in it, and from "
+    "then on every frame. Some frames are followed beforehand, so that all is compiled."
 )
 _SEED = 78_001
 _KEPT = 150  # frames rendered
-_WARM, _WARM_SPEED = 60, 1000.0  # frames followed beforehand, and how many times as fast
+# frames followed beforehand, and how many times as fast
+_WARM = 60
+_WARM_SPEED = 1000.0
 
 
 def evaluate_live(
@@ -57,6 +61,8 @@ def evaluate_live(
 
 
 def _to_and_fro(index: int, n: int) -> int:
-    """The frame that is shown at a count, when n frames are shown forwards and backwards in turn."""
+    """The frame that is shown at a count, when n frames are shown forwards and backwards in
+    turn.
+    """
     at = index % (2 * n)
     return at if at < n else 2 * n - 1 - at

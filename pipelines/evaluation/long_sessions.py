@@ -35,7 +35,9 @@ Stage = Callable[[str], None]
 
 
 def looped(short: Recording, n_frames: int) -> Recording:
-    """A recording of any length: the frames of a short one, held in memory, to and fro, at times that run on."""
+    """A recording of any length: the frames of a short one, held in memory, to and fro, at times
+    that run on.
+    """
     from liex_lab.recordings.recording import Recording
 
     depth = [short.frame(row).depth for row in range(len(short))]
@@ -57,15 +59,18 @@ def write_long(
     report: ReportMaker | None = None,
     told: Stage = lambda what: None,
 ) -> dict[str, Any]:
-    """A session of so many minutes from the frames of a short recording, over and over; returns its cost.
+    """A session of so many minutes from the frames of a short recording, over and over; returns its
+    cost.
 
-    Every frame is written, tracked and measured as in `liex run`; what is seen in it is what was seen in the short
-    recording's frame, for looking at it again would say the same. report: see `SessionWriter`; told: where the job is.
+    Every frame is written, tracked and measured as in `liex run`; what is seen in it is what was
+    seen in the short recording's frame, for looking at it again would say the same. report: see
+    `SessionWriter`; told: where the job is.
     """
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.offline import track_whole
 
-    plan, n = Plan.load("mouse"), int(minutes * 60 * FPS)
+    plan = Plan.load("mouse")
+    n = int(minutes * 60 * FPS)
     short = _look_at_short(plan)
     give_back()
     told("began")
@@ -115,9 +120,11 @@ def _parts(short: _Short, n: int) -> Iterator[tuple[list[DepthFrame], Observatio
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.tracking.observations import COLUMNS, Observations
 
-    there, times_ns = _to_and_fro(len(short.depth), n), _times(n)
+    there = _to_and_fro(len(short.depth), n)
+    times_ns = _times(n)
     for start in range(0, n, _CHUNK):
-        rows, times = there[start : start + _CHUNK], times_ns[start : start + _CHUNK]
+        rows = there[start : start + _CHUNK]
+        times = times_ns[start : start + _CHUNK]
         columns = {name: getattr(short.seen, name)[rows] for name in COLUMNS} | {"times_ns": times}
         frames = [
             DepthFrame(start + k, int(times[k]), short.depth[row]) for k, row in enumerate(rows)

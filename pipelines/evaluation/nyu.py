@@ -1,4 +1,6 @@
-"""The job `liex evaluate nyu`: published answers on the NYU hand data, and what our hand does on its frames."""
+"""The job `liex evaluate nyu`: published answers on the NYU hand data, and what our hand does on
+its frames.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +25,12 @@ _PUBLISHED = {
 def evaluate_nyu(
     reference: str | Path, *, model: str | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Errors by the NYU protocol, with both root protocols, of the published answers in a folder and of our own on the
-    frames that lie there.
+    """Errors by the NYU protocol, with both root protocols, of the published answers in a folder
+    and of our own on the frames that lie there.
 
-    reference: a folder with nyu_test_14joints.npz (labels and answers) or joint_data.mat (labels), and any of the
-    frames depth_1_NNNNNNN.png. model: of the hand, the bundled one where none is named.
+    reference: a folder with nyu_test_14joints.npz (labels and answers) or joint_data.mat (labels),
+    and any of the frames depth_1_NNNNNNN.png. model: of the hand, the bundled one where none is
+    named.
     """
     from liex_lab.evaluation.nyu import NYU_PROTOCOL, nyu_errors
     from liex_lab.recordings.formats.images.nyu_labels import NyuReference
@@ -55,9 +58,9 @@ def in_short(result: dict[str, Any]) -> dict[str, str]:
             lines[name] = row.get("note", f"lost in all of {row['n_frames']} frames")
             continue
         lines[name] = (
-            f"{row['n_frames']} frames; 14 points: {row['root_estimated_mm_14']:.3f} mm, root given "
-            f"{row['root_given_mm_14']:.3f}; 13 points: {row['root_estimated_mm_13']:.3f} mm, root given "
-            f"{row['root_given_mm_13']:.3f}"
+            f"{row['n_frames']} frames; 14 points: {row['root_estimated_mm_14']:.3f} mm, root "
+            f"given {row['root_given_mm_14']:.3f}; 13 points: {row['root_estimated_mm_13']:.3f} "
+            f"mm, root given {row['root_given_mm_13']:.3f}"
         )
     return {**lines, "protocol": result["protocol"]}
 
@@ -80,8 +83,8 @@ def _ours(folder: Path, truth: np.ndarray, model: str | None, progress: Progress
         return {"n_frames": 0, "note": f"no frames depth_1_NNNNNNN.png in {folder}"}
     if numbers.max() > len(truth):
         raise LiexError(
-            f"{folder} holds the frame {numbers.max()}, but labels of {len(truth)} frames; give the frames that belong "
-            "to the labels"
+            f"{folder} holds the frame {numbers.max()}, but labels of {len(truth)} frames; give "
+            "the frames that belong to the labels"
         )
     try:
         estimator = build_estimator(plan)

@@ -1,4 +1,6 @@
-"""The jobs behind `liex evaluate`: accuracy on fixed splits, speed, sizes, and agreement with another program."""
+"""The jobs behind `liex evaluate`: accuracy on fixed splits, speed, sizes, and agreement with
+another program.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ _SIZES = (0.75, 1.0, 1.25, 1.5)  # of other animals, over their home length
 def estimator_of(
     animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
 ) -> PoseEstimator:
-    """The estimator of a model file, or of a variant: the bundled model, or one trained now and kept in the cache."""
+    """The estimator of a model file, or of a variant: the bundled model, or one trained now and
+    kept in the cache.
+    """
     from liex_lab.catalog import bundled_models, find_model
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
@@ -46,7 +50,8 @@ def estimator_of(
 def subject_of(
     animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
 ) -> PoseEstimator | Baseline:
-    """What `liex evaluate pose --variant` measures: a variant of the method, one of its ablations, or a baseline.
+    """What `liex evaluate pose --variant` measures: a variant of the method, one of its ablations,
+    or a baseline.
 
     model: of another file than the animal's own.
     """
@@ -71,8 +76,9 @@ def subject_of(
 def measure(
     subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Foreground
 ) -> tuple[Array, Array, Array]:
-    """Joints (n, J, 3) mm in the camera frame, their predicted error (n,) mm, NaN where the subject predicts none, and
-    the quantiles (2,) of its 90 % interval; the animal's size is found over the frames (n, H, W) mm.
+    """Joints (n, J, 3) mm in the camera frame, their predicted error (n,) mm, NaN where the subject
+    predicts none, and the quantiles (2,) of its 90 % interval; the animal's size is found over the
+    frames (n, H, W) mm.
     """
     from liex_lab.baselines.baseline import Guesses
 
@@ -93,7 +99,9 @@ def errors_of(
     plan: Plan,
     progress: Progress,
 ) -> dict[str, PoseErrors]:
-    """Errors over rendered recordings, each handled as `liex run` would: scene learned, size estimated, all frames."""
+    """Errors over rendered recordings, each handled as `liex run` would: scene learned, size
+    estimated, all frames.
+    """
     from ..build import build_scene
 
     parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
@@ -131,7 +139,9 @@ def evaluate_pose(
     spine_mm: float | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The figures of one split and variant; `liex evaluate pose`. model: of another file than the animal's own."""
+    """The figures of one split and variant; `liex evaluate pose`. model: of another file than the
+    animal's own.
+    """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
 
@@ -169,7 +179,9 @@ def evaluate_sizes(
     n_frames: int | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Mean joint error in per cent of the spine for animals of several sizes, the size estimated and not given."""
+    """Mean joint error in per cent of the spine for animals of several sizes, the size estimated
+    and not given.
+    """
     rows = {}
     for spine in spines_mm or sizes_of(animal):
         result = evaluate_pose(
@@ -188,11 +200,12 @@ def evaluate_sizes(
 
 
 def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:
-    """A session against another program's centroid and long axis in the same recording, a table with one row a frame.
+    """A session against another program's centroid and long axis in the same recording, a table
+    with one row a frame.
 
-    Columns used: frame, centroid_x_px, centroid_y_px, angle_rad (direction (cos a, -sin a) in (right, down), known
-    modulo pi) and, where present, reliable (rows other than 1 are left out). Distances are pixels times the true size
-    of a pixel on the floor.
+    Columns used: frame, centroid_x_px, centroid_y_px, angle_rad (direction (cos a, -sin a) in
+    (right, down), known modulo pi) and, where present, reliable (rows other than 1 are left out).
+    Distances are pixels times the true size of a pixel on the floor.
     """
     import pandas as pd
 
@@ -208,9 +221,11 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
     needed = {"frame", "centroid_x_px", "centroid_y_px", "angle_rad"}
     if not needed <= set(table.columns):
         raise LiexError(
-            f"{reference} should have the columns {', '.join(sorted(needed))}; it lacks some of them"
+            f"{reference} should have the columns {', '.join(sorted(needed))}; it lacks some of "
+            "them"
         )
-    poses, frames = opened.poses, opened.frames
+    poses = opened.poses
+    frames = opened.frames
     names = opened.metadata["animal"]["joints"]
     u, v = (
         poses.pivot(index="frame_index", columns="joint", values=name)[names].to_numpy()
@@ -220,10 +235,12 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
     used = (rows >= 0) & (rows < len(u))
     if "reliable" in table:
         used &= table["reliable"].to_numpy() == 1
-    table, rows = table[used], rows[used]
+    table = table[used]
+    rows = rows[used]
     if not len(rows):
         raise LiexError(
-            f"{reference} has no reliable row for any frame of {session}; its column frame counts from 0"
+            f"{reference} has no reliable row for any frame of {session}; its column frame counts "
+            "from 0"
         )
     camera = opened.metadata["camera"]
     mm_per_px = camera["floor_distance_mm"] / np.sqrt(camera["fx"] * camera["fy"])
@@ -249,8 +266,12 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
         "heading_median_deg": float(np.nanmedian(turn)),
         "n_reversals": count_reversals(heading),
         "surface_median_mm": float(np.nanmedian(frames["residual_mm"])),
-        "protocol": "centroid: of the animal's outline (frames.parquet) against the reference's; joint_mean: the plain "
-        "mean of the joints, which lies ahead of the outline's centre; both in pixels times the floor's mm a pixel. "
-        "heading: base to tip in the image, modulo pi. reversals: heading turns of more than 90 degrees between "
-        "consecutive measured frames. surface: median over frames of the median |rendered body - depth| in the animal",
+        "protocol": (
+            "centroid: of the animal's outline (frames.parquet) against the reference's; "
+            "joint_mean: the plain mean of the joints, which lies ahead of the outline's centre; "
+            "both in pixels times the floor's mm a pixel. heading: base to tip in the image, "
+            "modulo pi. reversals: heading turns of more than 90 degrees between consecutive "
+            "measured frames. surface: median over frames of the median |rendered body - depth| "
+            "in the animal"
+        ),
     }

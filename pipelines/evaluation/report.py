@@ -1,4 +1,6 @@
-"""The job `liex evaluate report`: how long the report of a long session takes, and how much memory."""
+"""The job `liex evaluate report`: how long the report of a long session takes, and how much
+memory.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,15 @@ if TYPE_CHECKING:
     from liex_lab.tracking.track import Track
 
 _COPIED = ("plan.toml", "session.rrd", "session.mcap")
-# the peak is asked for by a process of its own, which has had no other child: the system counts them together
+# the peak is asked for by a process of its own, which has had no other child: the system counts
+# them together
 _MEASURE = """
 import json, resource, subprocess, sys, time
 began = time.perf_counter()
-code = subprocess.run([sys.executable, "-m", "liex_lab", "report", sys.argv[1]], stdout=subprocess.DEVNULL).returncode
-peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024.0 if sys.platform == "linux" else 1048576.0)
+command = [sys.executable, "-m", "liex_lab", "report", sys.argv[1]]
+code = subprocess.run(command, stdout=subprocess.DEVNULL).returncode
+unit = 1024.0 if sys.platform == "linux" else 1048576.0
+peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit
 print(json.dumps({"code": code, "seconds": time.perf_counter() - began, "peak_memory_mb": peak}))
 """
 
@@ -36,10 +41,12 @@ print(json.dumps({"code": code, "seconds": time.perf_counter() - began, "peak_me
 def evaluate_report(
     session: str | Path, minutes: float = 60.0, *, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Time and peak memory of `liex report` on a session that repeats this one until it is `minutes` long.
+    """Time and peak memory of `liex report` on a session that repeats this one until it is
+    `minutes` long.
 
-    Every table is made from the repeated track, as a run of that length would; the report is written by a process of
-    its own, so that its start counts, too. Returns frames, minutes, seconds, peak_memory_mb and the report's size.
+    Every table is made from the repeated track, as a run of that length would; the report is
+    written by a process of its own, so that its start counts, too. Returns frames, minutes,
+    seconds, peak_memory_mb and the report's size.
     """
     from liex_lab.sessions import Session
 
@@ -70,8 +77,8 @@ def evaluate_report(
 
 
 def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int, float]:
-    """Write a session that repeats another one, end to end, to at least so many seconds; its depth is that of one
-    round only. Returns its frames and seconds.
+    """Write a session that repeats another one, end to end, to at least so many seconds; its depth
+    is that of one round only. Returns its frames and seconds.
     """
     from liex_lab.behaviour.summary import measure_rows, stated_by
     from liex_lab.sessions.evidence import provenance_of

@@ -1,4 +1,6 @@
-"""The job `liex evaluate scale`: sessions per hour by workers, memory by length, where the time goes."""
+"""The job `liex evaluate scale`: sessions per hour by workers, memory by length, where the time
+goes.
+"""
 
 from __future__ import annotations
 
@@ -37,21 +39,32 @@ _CREWS = {
 _N_SIMULATED = 2000  # sessions
 _FPS = 30
 ASSUMPTIONS = (
-    "simulated: every worker has the cores, the memory and the reading and writing speed that one has here; sessions "
-    "take the measured times, drawn with replacement and stretched to an hour of recording; they are handed out one by "
-    "one, and the scheduler spends its measured time on each, one after the other; starting workers is not counted"
+    "simulated: every worker has the cores, the memory and the reading and writing speed that one "
+    "has here; sessions take the measured times, drawn with replacement and stretched to an hour "
+    "of recording; they are handed out one by one, and the scheduler spends its measured time on "
+    "each, one after the other; starting workers is not counted"
 )
 
 DEFINITIONS = {
-    "times_decode_and_write": "all of `liex run` but Python's start and the loading of what it needs, over opening the "
-    "recording, decoding every frame and writing depth into both logs",
+    "times_decode_and_write": (
+        "all of `liex run` but Python's start and the loading of what it needs, over opening the "
+        "recording, decoding every frame and writing depth into both logs"
+    ),
     "times_decode_and_write_without_opening": "the same over decoding and writing alone",
-    "times_decode_and_write_once_begun": "from the first frame that is looked at to the finished session, over "
-    "decoding and writing alone",
-    "looking": "frames that processes with one thread for kernels read, look at and write, once each has done its "
-    "first stretch; two on two cores, one on one; free: one that may use both, as its logs are packed beside it",
-    "two_workers_over_one": "sessions an hour of a study, the workers' start included; two workers on two cores over "
-    "one on one; free: over one that may use both, which reads ahead and packs its logs beside its work",
+    "times_decode_and_write_once_begun": (
+        "from the first frame that is looked at to the finished session, over decoding and "
+        "writing alone"
+    ),
+    "looking": (
+        "frames that processes with one thread for kernels read, look at and write, once each "
+        "has done its first stretch; two on two cores, one on one; free: one that may use both, "
+        "as its logs are packed beside it"
+    ),
+    "two_workers_over_one": (
+        "sessions an hour of a study, the workers' start included; two workers on two cores over "
+        "one on one; free: over one that may use both, which reads ahead and packs its logs "
+        "beside its work"
+    ),
 }
 
 
@@ -61,12 +74,13 @@ def evaluate_scale(
     minutes: tuple[float, ...] = (1.0, 10.0),
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure one session's stages, two workers against one, memory by length, and simulate many workers.
+    """Measure one session's stages, two workers against one, memory by length, and simulate many
+    workers.
 
     Workers of one recording share its stretches, those of a study its sessions.
 
-    n_frames: of each virtual recording, 640 x 480, some stretches long; minutes: lengths of recording whose memory is
-    measured.
+    n_frames: of each virtual recording, 640 x 480, some stretches long; minutes: lengths of
+    recording whose memory is measured.
     """
     with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
         folder = Path(scratch)
@@ -108,7 +122,9 @@ def _recording(folder: Path, seed: int, n_frames: int) -> Path:
 
 
 def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
-    """One session after a first one has compiled everything: where its time goes, and the bound it is held against."""
+    """One session after a first one has compiled everything: where its time goes, and the bound it
+    is held against.
+    """
     from liex_lab.sessions import Session
 
     plan = Plan.load("mouse")
@@ -152,10 +168,11 @@ class _Timed:
 
 
 def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
-    """Frames a second that are read, looked at and written by one process and by two, once each process has done its
-    first stretch: they take some seconds to begin.
+    """Frames a second that are read, looked at and written by one process and by two, once each
+    process has done its first stretch: they take some seconds to begin.
     """
-    plan, found = Plan.load("mouse"), {}
+    plan = Plan.load("mouse")
+    found = {}
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
         whole = Stretch(
@@ -182,7 +199,9 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _on_cores(n: int) -> Iterator[None]:
-    """Processes that are started in the block are kept on so many cores, where the system can do that."""
+    """Processes that are started in the block are kept on so many cores, where the system can do
+    that.
+    """
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -195,8 +214,8 @@ def _on_cores(n: int) -> Iterator[None]:
 
 
 def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) -> dict[str, float]:
-    """Seconds that opening the recording takes, opening it and reading all frames, and, once it is open, reading them
-    and writing both logs: nothing that does this can be quicker.
+    """Seconds that opening the recording takes, opening it and reading all frames, and, once it is
+    open, reading them and writing both logs: nothing that does this can be quicker.
     """
     from liex_lab.sessions.mcap import McapWriter
     from liex_lab.sessions.provenance import Provenance
@@ -221,16 +240,12 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
             "0",
             n_frames=len(opened),
         )
-        replay, messages = (
-            ReplayWriter(place / "session.rrd", origin),
-            McapWriter(place / "session.mcap", origin),
-        )
+        replay = ReplayWriter(place / "session.rrd", origin)
+        messages = McapWriter(place / "session.mcap", origin)
         began = time.perf_counter()
         for frames in opened.chunks(CHUNK):
-            depth, times = (
-                [to_millimetres(frame.depth) for frame in frames],
-                [frame.time_ns for frame in frames],
-            )
+            depth = [to_millimetres(frame.depth) for frame in frames]
+            times = [frame.time_ns for frame in frames]
             replay.add([frame.index for frame in frames], times, depth)
             messages.add(times, depth)
         replay.flushed()
@@ -278,14 +293,17 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
 def simulate(
     session_s: list[float], scheduler_s: float, workers: tuple[int, ...] = _WORKERS, seed: int = 0
 ) -> dict[str, float]:
-    """Sessions per hour for each number of workers, by going through the handing out of `_N_SIMULATED` sessions.
+    """Sessions per hour for each number of workers, by going through the handing out of
+    `_N_SIMULATED` sessions.
 
-    session_s: measured times of sessions; scheduler_s: what handing out one of them costs, one after the other.
+    session_s: measured times of sessions; scheduler_s: what handing out one of them costs, one
+    after the other.
     """
     lengths = np.random.default_rng(seed).choice(session_s, _N_SIMULATED)
     found = {}
     for count in workers:
-        free, scheduler = [0.0] * count, 0.0
+        free = [0.0] * count
+        scheduler = 0.0
         for length in lengths:
             begins = max(heapq.heappop(free), scheduler)
             scheduler = begins + scheduler_s
@@ -303,7 +321,9 @@ print(json.dumps(write_long(float(sys.argv[1]), sys.argv[2])))
 
 
 def _memory(minutes: float, folder: Path) -> float:
-    """Peak memory, MB, of a process that tracks and writes so many minutes of 30 frames a second."""
+    """Peak memory, MB, of a process that tracks and writes so many minutes of 30 frames a
+    second.
+    """
     done = subprocess.run(
         [sys.executable, "-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")],
         capture_output=True,

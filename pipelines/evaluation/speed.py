@@ -1,4 +1,6 @@
-"""The job `liex evaluate speed`: frames per second, where the time goes, and what makes a frame dearer."""
+"""The job `liex evaluate speed`: frames per second, where the time goes, and what makes a frame
+dearer.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ _SHRINK = (2, 1)  # every second pixel, every pixel
 
 @dataclass(frozen=True)
 class _Footage:
-    """Frames (n, H, W) mm in memory, of a recording of that name, its scene and the animal's size."""
+    """Frames (n, H, W) mm in memory, of a recording of that name, its scene and the
+    animal's size.
+    """
 
     name: str
     frames: NDArray[np.float32]
@@ -41,7 +45,9 @@ class _Footage:
 
 
 def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
-    """Shortest of several runs after one that compiles: the least disturbed by what else the machine does."""
+    """Shortest of several runs after one that compiles: the least disturbed by what else the
+    machine does.
+    """
     job()
     times = []
     for _ in range(n_repeats or N_REPEATS):
@@ -52,7 +58,8 @@ def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
 
 
 def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
-    """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate speed`.
+    """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate
+    speed`.
 
     The paper's variant is trained where it has not been; baselines are timed where they have been.
     """
@@ -90,12 +97,18 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         "ratio_to": ratios,
         "stages_ms": stages,
         "cost_ms": costs,
-        "machine": f"{platform.processor() or platform.machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
-        "protocol": f"{N_FRAMES} rendered {footage.pixels} frames in memory, foreground to final pose, best of "
-        f"{N_REPEATS}; ratios on {cores} cores in the same run, `paper` on our engine, `paper_one_by_one` compiled but "
-        "as published: every candidate walks down every tree by itself, and leaves are averaged; stages and costs in "
-        "ms a frame on one core: `joints` is the whole with that many joints' regressors, `candidates` unpruned, "
-        "`pixels` the foreground alone",
+        "machine": (
+            f"{platform.processor() or platform.machine()}, {cores} of "
+            f"{numba.config.NUMBA_NUM_THREADS} cores"
+        ),
+        "protocol": (
+            f"{N_FRAMES} rendered {footage.pixels} frames in memory, foreground to final pose, "
+            f"best of {N_REPEATS}; ratios on {cores} cores in the same run, `paper` on our "
+            "engine, `paper_one_by_one` compiled but as published: every candidate walks down "
+            "every tree by itself, and leaves are averaged; stages and costs in ms a frame on "
+            "one core: `joints` is the whole with that many joints' regressors, `candidates` "
+            "unpruned, `pixels` the foreground alone"
+        ),
     }
 
 
@@ -140,16 +153,21 @@ def _frames_per_s(subject: PoseEstimator | Baseline, footage: _Footage, parallel
 
 
 def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
-    """Algorithm 1 as it is written, from frames to the scores of all candidates: no two of them share a step."""
+    """Algorithm 1 as it is written, from frames to the scores of all candidates: no two of them
+    share a step.
+    """
     from liex_lab.estimation.cascade import Candidates, ImageSet
     from liex_lab.estimation.initial import draw_starts, start_poses
     from liex_lab.estimation.training import base_at_front
     from liex_lab.forests.forest import predict
 
-    method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
+    method = paper.model.method
+    skeleton = paper.skeleton
+    cascade = paper.model.cascade
     crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
     images = ImageSet(crops.heights, footage.scene.looks(crops, method.camera_view), crops.moments)
-    n, k = len(crops.heights), method.n_candidates
+    n = len(crops.heights)
+    k = method.n_candidates
     rotation, position, scale = start_poses(
         crops.moments,
         draw_starts(np.random.default_rng(0), 1, k),
@@ -183,7 +201,9 @@ def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
     """Milliseconds a frame on one core of what a frame goes through."""
     from liex_lab.estimation.cascade import ImageSet
 
-    frames, scene, size = footage.frames, footage.scene, footage.size
+    frames = footage.frames
+    scene = footage.scene
+    size = footage.size
     crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
     looks = scene.looks(crops, default.model.method.camera_view)
     rotations, positions, _, scores = default.candidates(crops, looks, size)
@@ -198,8 +218,12 @@ def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
 
 
 def _costs(default: PoseEstimator, footage: _Footage) -> dict[str, dict[str, float]]:
-    """Milliseconds a frame on one core against the number of joints, of candidates, and of pixels."""
-    frames, scene, size = footage.frames, footage.scene, footage.size
+    """Milliseconds a frame on one core against the number of joints, of candidates, and of
+    pixels.
+    """
+    frames = footage.frames
+    scene = footage.scene
+    size = footage.size
     n_joints = len(default.skeleton.solved)
     crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
     looks = scene.looks(crops, default.model.method.camera_view)

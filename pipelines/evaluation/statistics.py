@@ -1,4 +1,6 @@
-"""The job `liex evaluate statistics`: how often the group test is wrong where there is no effect, and its power."""
+"""The job `liex evaluate statistics`: how often the group test is wrong where there is no effect,
+and its power.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,12 @@ _AT_ONCE = 50  # studies that are compared in one go, as measures of the same an
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A simulated study: so many cages per group, animals per cage and sessions per animal, and how much each varies.
+    """A simulated study: so many cages per group, animals per cage and sessions per animal, and how
+    much each varies.
 
-    Standard deviations are of a cage's mean, of an animal in its cage and of a session of its animal. within: every
-    cage holds both groups. effect: what the second group has more, in standard deviations between animals.
+    Standard deviations are of a cage's mean, of an animal in its cage and of a session of its
+    animal. within: every cage holds both groups. effect: what the second group has more, in
+    standard deviations between animals.
     """
 
     name: str
@@ -34,7 +38,9 @@ class StudyPlan:
     effect: float = 0.0
 
     def draw(self, rng: np.random.Generator, n_studies: int) -> pd.DataFrame:
-        """As many independent studies of the same design: a row per session, and the columns study_0, study_1, ..."""
+        """As many independent studies of the same design: a row per session, and the columns
+        study_0, study_1, ...
+        """
         n_cages = self.n_cages if self.within else 2 * self.n_cages
         n_animals = n_cages * self.n_animals
         cage = np.repeat(np.arange(n_cages), self.n_animals)
@@ -70,10 +76,12 @@ PLANS = (
 def evaluate_statistics(
     n_studies: int = 2000, effect: float = 1.0, seed: int = 0, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Share of p <= 5 % in `n_studies` simulated studies of each kind: without an effect, and with one.
+    """Share of p <= 5 % in `n_studies` simulated studies of each kind: without an effect, and with
+    one.
 
-    effect: in standard deviations between animals. Beside it what a t test would do that takes every session for a
-    unit; the interval's coverage of the true difference; and how often the mixed model was used.
+    effect: in standard deviations between animals. Beside it what a t test would do that takes
+    every session for a unit; the interval's coverage of the true difference; and how often the
+    mixed model was used.
     """
     found: dict[str, Any] = {
         "alpha": ALPHA,
@@ -92,17 +100,18 @@ def evaluate_statistics(
 
 
 def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> dict[str, float]:
-    """Of studies without an effect: shares with p <= 5 %, with an interval around 0, tested by the model."""
+    """Of studies without an effect: shares with p <= 5 %, with an interval around 0, tested by the
+    model.
+    """
     from scipy.stats import ttest_ind
 
-    tests, naive = [], []
+    tests = []
+    naive = []
     for n in _portions(n_studies):
         studies = plan.draw(rng, n)
         tests.append(_compared(studies, rng))
-        values, treated = (
-            studies.filter(like="study_").to_numpy(),
-            (studies["group"] == "treated").to_numpy(),
-        )
+        values = studies.filter(like="study_").to_numpy()
+        treated = (studies["group"] == "treated").to_numpy()
         naive.append(ttest_ind(values[treated], values[~treated]).pvalue <= ALPHA)
     table = pd.concat(tests)
     return {

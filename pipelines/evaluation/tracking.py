@@ -1,4 +1,6 @@
-"""What `liex evaluate tracking` measures: single frames, Algorithm 3 and the default tracker, against the truth."""
+"""What `liex evaluate tracking` measures: single frames, Algorithm 3 and the default tracker,
+against the truth.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,16 @@ Array = NDArray[np.float64]
 ROWS = ("single", "algorithm3", "online", "smoothed")
 ONLINE_LAG = 5  # frames
 _CHUNK = 32
-_TIMED, _AGAIN = 3, 3  # chunks that the tracker is timed on, and how often
+# chunks that the tracker is timed on, and how often
+_TIMED = 3
+_AGAIN = 3
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A sequence and what each row made of it: joints (n, J, 3) mm in the true arena frame; speed: see `_speed`."""
+    """A sequence and what each row made of it: joints (n, J, 3) mm in the true arena frame; speed:
+    see `_speed`.
+    """
 
     sequence: TestSequence
     rows: dict[str, Followed]
@@ -55,14 +61,15 @@ def evaluate_tracking(
 ) -> dict[str, Any]:
     """The figures of a fixed sequence; `liex evaluate tracking`.
 
-    rows: only some of `ROWS`; seeds: other sequences of the same kind, whose frames are taken together; draw: is given
-    the first sequence and what the rows made of it, for a picture.
+    rows: only some of `ROWS`; seeds: other sequences of the same kind, whose frames are taken
+    together; draw: is given the first sequence and what the rows made of it, for a picture.
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
     from liex_lab.simulation.tracking_sequences import tracking_sequence
 
-    world, plan = world_of(Skeleton.load(animal)), plan_of(animal)
+    world = world_of(Skeleton.load(animal))
+    plan = plan_of(animal)
     estimator = estimator_of(animal, "default", progress, *(() if model is None else (model,)))
     measured = []
     for seed in seeds or (None,):
@@ -98,7 +105,9 @@ def follow_sequence(
     rows: Sequence[str],
     progress: Progress = silent,
 ) -> Measured:
-    """Every row's way through a sequence; scene, size and animal are found by the product, nothing is handed over."""
+    """Every row's way through a sequence; scene, size and animal are found by the product, nothing
+    is handed over.
+    """
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -159,8 +168,8 @@ def follow_sequence(
 
 
 def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
-    """Frames/s of the default tracker, from pictures in memory to the smoothed track, on one core and on all of them:
-    the best of some tries in turn over the sequence's first frames.
+    """Frames/s of the default tracker, from pictures in memory to the smoothed track, on one core
+    and on all of them: the best of some tries in turn over the sequence's first frames.
     """
     import numba
 
@@ -188,8 +197,8 @@ def _online(tracker: FrameTracker, seen: Observations) -> Track:
 
 
 def _algorithm3(tracker: FrameTracker, recording: TestSequence, seed: int) -> tuple[Array, Array]:
-    """Joints (n, J, 3) mm in the camera frame and their standard deviations (n, J) by Algorithm 3; NaN where it has no
-    estimate.
+    """Joints (n, J, 3) mm in the camera frame and their standard deviations (n, J) by Algorithm 3;
+    NaN where it has no estimate.
     """
     from liex_lab.tracking.particles import ParticleFilter
 
@@ -204,5 +213,6 @@ def _algorithm3(tracker: FrameTracker, recording: TestSequence, seed: int) -> tu
         for frame in frames:
             step = filter.step(frame)
             if step is not None:
-                joints[frame.index], sd[frame.index] = step[0].joints(skeleton), step[1] * share
+                joints[frame.index] = step[0].joints(skeleton)
+                sd[frame.index] = step[1] * share
     return joints, sd

@@ -1,8 +1,10 @@
-"""The job `liex cohort`: every session of a study on the workers of a Dask cluster. Dask is imported here alone.
+"""The job `liex cohort`: every session of a study on the workers of a Dask cluster. Dask is
+imported here alone.
 
-A session is one task. It may run twice (a worker dies, and another takes over): it leaves its results on disk, goes on
-where it was, and done twice it does the same. Sessions are done side by side, each by one worker; where fewer are left
-than there are workers, these share the stretches of each.
+A session is one task. It may run twice (a worker dies, and another takes over): it leaves its
+results on disk, goes on where it was, and done twice it does the same. Sessions are done side by
+side, each by one worker; where fewer are left than there are workers, these share the stretches of
+each.
 """
 
 from __future__ import annotations
@@ -49,10 +51,11 @@ def measure_cohort(
     told: Told = lambda *_: None,
     finished: Finished = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Measure the sessions; returns how each went. workers: processes on this machine, 0 one for every two cores.
+    """Measure the sessions; returns how each went. workers: processes on this machine, 0 one for
+    every two cores.
 
-    threads: cores for each, 0 an equal share; scheduler: the address of a running Dask scheduler; slurm: how to ask a
-    Slurm cluster for workers.
+    threads: cores for each, 0 an equal share; scheduler: the address of a running Dask scheduler;
+    slurm: how to ask a Slurm cluster for workers.
     """
     planned = {one.session.id: one.session for one in todo}
     if not planned:
@@ -64,8 +67,9 @@ def measure_cohort(
 
 
 def n_shared(n: int, n_workers: int) -> int:
-    """How many of n sessions, the last ones, are cut into stretches for all workers to look at: as many as would leave
-    workers idle if each were measured by one. Cutting costs: what each worker wrote is copied into one.
+    """How many of n sessions, the last ones, are cut into stretches for all workers to look at: as
+    many as would leave workers idle if each were measured by one. Cutting costs: what each worker
+    wrote is copied into one.
     """
     return n % max(n_workers, 1)
 
@@ -98,7 +102,8 @@ def _results(
     completed = as_completed(submitted, loop=client.loop)
     del submitted
     for future in completed:
-        session, error = sessions[future.key], future.exception()
+        session = sessions[future.key]
+        error = future.exception()
         result = _died(session, error) if error is not None else future.result()
         future.release()  # what a worker holds would be made again if it died
         finished(result)
@@ -111,7 +116,10 @@ def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
     if type(error).__name__ == "KilledWorker":
         failure |= {
             "reason": f"the worker process died {_DEATHS + 1} times while it measured this session",
-            "remedy": "give workers more memory or run fewer at a time, see the system's log, and try it again",
+            "remedy": (
+                "give workers more memory or run fewer at a time, see the system's log, and try "
+                "it again"
+            ),
         }
         failure.pop("traceback", None)
     quarantine(session, failure)
@@ -121,10 +129,13 @@ def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
 def _on_worker(
     session: PlannedSession, run: RunSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
-    """The task: one session, its progress sent to whoever started the study. shared: by all workers."""
+    """The task: one session, its progress sent to whoever started the study. shared: by all
+    workers.
+    """
     from distributed import get_worker
 
-    worker, last = get_worker(), 0.0
+    worker = get_worker()
+    last = 0.0
 
     def tell(done: int, total: int | None, what: str) -> None:
         nonlocal last
@@ -137,10 +148,14 @@ def _on_worker(
 
 
 class Workers:
-    """All workers of the cluster that this task runs on, as a crew for the stretches of its session."""
+    """All workers of the cluster that this task runs on, as a crew for the stretches of its
+    session.
+    """
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """See `crew.Crew`. The task steps aside meanwhile, and its worker looks at stretches like the others."""
+        """See `crew.Crew`. The task steps aside meanwhile, and its worker looks at stretches like
+        the others.
+        """
         from distributed import as_completed, worker_client
 
         with worker_client() as client:
@@ -175,8 +190,8 @@ def _client(
                 yield stack.enter_context(Client(scheduler, timeout="20s", set_as_default=False))
             except (OSError, ValueError, TypeError) as error:
                 raise StudyError(
-                    f"no Dask scheduler answers at {scheduler} ({error}); start one with `dask scheduler`, or leave "
-                    "--scheduler out"
+                    f"no Dask scheduler answers at {scheduler} ({error}); start one with `dask "
+                    "scheduler`, or leave --scheduler out"
                 ) from None
             return
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="liex-"))
@@ -192,7 +207,9 @@ def _client(
 
 
 def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
-    """Worker processes on this machine, reached through this machine alone and with keys made for this run."""
+    """Worker processes on this machine, reached through this machine alone and with keys made for
+    this run.
+    """
     from distributed import LocalCluster, Security
 
     cores = n_cores()
@@ -220,7 +237,8 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise MissingPackageError(
-            "workers on Slurm need the package dask-jobqueue; install it with `pip install 'liex_lab[slurm]'`"
+            "workers on Slurm need the package dask-jobqueue; install it with `pip install "
+            "'liex_lab[slurm]'`"
         ) from None
     from distributed import Security
 
@@ -236,7 +254,9 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
 
 
 def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
-    """The options of one job: one worker that measures one session at a time on all of the job's cores."""
+    """The options of one job: one worker that measures one session at a time on all of the job's
+    cores.
+    """
     exports = [
         f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()
     ]

@@ -1,4 +1,6 @@
-"""`liex cohort init`: a study file to begin from, made of the recordings that are found in a folder."""
+"""`liex cohort init`: a study file to begin from, made of the recordings that are found in a
+folder.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,15 @@ _HEADER = """\
 #     liex cohort {file}                does it, goes on after any interruption, and leaves out what is done
 # Paths count from this file's folder and stay in it. Nothing is ever written into {raw}.
 # [set], and `set` of an animal or a session, change values of the plan: set = {{ animal.spine_mm = 65 }}
-"""
+"""  # noqa: E501
 
 
 def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
-    """Write FOLDER/study.toml with every recording below FOLDER/rawdata, or below FOLDER where there is no rawdata.
+    """Write FOLDER/study.toml with every recording below FOLDER/rawdata, or below FOLDER where
+    there is no rawdata.
 
-    The animal and the session are taken from folder names such as sub-m01 and ses-01_date-20260821 where there are
-    such, otherwise from the recording's own name. Returns the file.
+    The animal and the session are taken from folder names such as sub-m01 and ses-01_date-20260821
+    where there are such, otherwise from the recording's own name. Returns the file.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -83,7 +86,8 @@ def find_recordings(folder: Path) -> list[Path]:
 
 def name_sessions(recordings: list[Path], raw: Path) -> list[tuple[str, str, Path]]:
     """(animal, session, recording) for each, no pair of names twice."""
-    named, taken = [], set()
+    named = []
+    taken = set()
     spelled: dict[str, str] = {}  # some file systems take M1 and m1 for one, so here they are one
     for path in recordings:
         parts = path.relative_to(raw).parts
@@ -94,7 +98,8 @@ def name_sessions(recordings: list[Path], raw: Path) -> list[tuple[str, str, Pat
             animal = parts[0] if len(parts) > 1 and not parts[0].startswith("ses-") else stem
         animal = spelled.setdefault(_letters(animal).lower(), _letters(animal))
         session = _pairs(session or (stem if _letters(stem) != animal else "01"))
-        base, k = session, 1
+        base = session
+        k = 1
         while (animal.lower(), session.lower()) in taken:
             k += 1
             session = f"{base}_rec-{k}"
@@ -108,7 +113,9 @@ def _letters(text: str) -> str:
 
 
 def _pairs(text: str) -> str:
-    """A session's name: as it is where it is made of key-value pairs, otherwise its letters and digits."""
+    """A session's name: as it is where it is made of key-value pairs, otherwise its letters and
+    digits.
+    """
     first, *pairs = text.split("_")
     whole = re.fullmatch(r"[A-Za-z0-9]{1,32}", first) and len(pairs) <= 5
     kept = all(re.fullmatch(r"[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}", pair) for pair in pairs)
@@ -122,7 +129,8 @@ def _text(root: Path, named: list[tuple[str, str, Path]]) -> str:
         f"name = {_quoted(root.resolve().name or 'study')}",
     ]
     lines += [
-        'plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in this folder',
+        'plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in '
+        "this folder",
         f'results = "{DERIVED}"',
         "",
         "[set]",

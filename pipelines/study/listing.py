@@ -16,7 +16,9 @@ from .status import Standing, standings
 
 
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]]:
-    """The name of a study, and what lists its sessions: of a study file, or of a folder with sessions in it."""
+    """The name of a study, and what lists its sessions: of a study file, or of a folder with
+    sessions in it.
+    """
     path = Path(place)
     if path.is_file() or (path / STUDY_FILE).is_file():
         study = Study.load(path)
@@ -30,7 +32,8 @@ def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]
 
 
 def _of_study(one: Standing) -> Entry:
-    animal, failure = one.session.animal, one.failure or {}
+    animal = one.session.animal
+    failure = one.failure or {}
     who = {"subject_id": animal.id, **{name: getattr(animal, name) for name in WHO[1:]}}
     there = (one.session.folder / "session.json").is_file()
     folder = one.session.folder if there else None
@@ -38,7 +41,9 @@ def _of_study(one: Standing) -> Entry:
 
 
 def _of_folder(path: Path) -> list[Entry]:
-    """Every session in a folder, and every one that failed; each by its name, or its place where names recur."""
+    """Every session in a folder, and every one that failed; each by its name, or its place where
+    names recur.
+    """
     entries = [_measured(folder) for folder in find_sessions([path])]
     for file in sorted(path.rglob(FAILED_FILE)):
         failure = read_failure(file.parent) or {}

@@ -1,4 +1,6 @@
-"""One session of a study: measured, or quarantined with a failed.json; whatever happens, the others go on."""
+"""One session of a study: measured, or quarantined with a failed.json; whatever happens, the others
+go on.
+"""
 
 from __future__ import annotations
 
@@ -42,18 +44,23 @@ def measure_one(
     run_id: str = "",
     crew: Crew | None = None,
 ) -> dict[str, Any]:
-    """Measure a session; returns how it went: id, state 'done' or 'failed', seconds, and the failure.
+    """Measure a session; returns how it went: id, state 'done' or 'failed', seconds, and the
+    failure.
 
-    Done twice it does the same: what was interrupted goes on, what is there is replaced when the new one is whole.
-    run_id: of the study's run; what that has ended already is not done again. crew: looks at stretches of it.
+    Done twice it does the same: what was interrupted goes on, what is there is replaced when the
+    new one is whole. run_id: of the study's run; what that has ended already is not done again.
+    crew: looks at stretches of it.
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
-    began, stage, frame = time.perf_counter(), "opening the recording", None
+    began = time.perf_counter()
+    stage = "opening the recording"
+    frame = None
 
     def watch(done: int, total: int | None, what: str) -> None:
         nonlocal stage, frame
-        stage, frame = what, done if what == MEASURING else frame
+        stage = what
+        frame = done if what == MEASURING else frame
         progress(done, total, what)
 
     failure = None
@@ -98,7 +105,9 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
 
 
 def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
-    """Leave failed.json in the session's place, with what was to be done, so that a change of it is noticed."""
+    """Leave failed.json in the session's place, with what was to be done, so that a change of it is
+    noticed.
+    """
     known = {
         "session_id": session.id,
         **failure,

@@ -1,4 +1,6 @@
-"""The job `liex cohort`: look where every session stands, measure what is to be done, write the study's table."""
+"""The job `liex cohort`: look where every session stands, measure what is to be done, write the
+study's table.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def run_study(
     dry_run: bool,
     board: Callable[[int], AbstractContextManager[Board]],
 ) -> list[Standing]:
-    """Measure what is to be done; returns where every session stands then. See `liex_lab.api.run_study`."""
+    """Measure what is to be done; returns where every session stands then. See
+    `liex_lab.api.run_study`.
+    """
     if scheduler and slurm:
         raise StudyError(
             "the workers are found either with --scheduler or with --slurm; leave one of them out"

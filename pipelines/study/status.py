@@ -1,4 +1,6 @@
-"""Which sessions of a study are done, which are to be done (again), and why: looked up on disk, never remembered."""
+"""Which sessions of a study are done, which are to be done (again), and why: looked up on disk,
+never remembered.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a session stands. reason: why it is to be done, or was not; failure: of the last attempt, if it failed."""
+    """Where a session stands. reason: why it is to be done, or was not; failure: of the last
+    attempt, if it failed.
+    """
 
     session: PlannedSession
     state: State
@@ -45,12 +49,15 @@ class Standing:
 def standings(
     study: Study, *, retry: bool = False, only: Sequence[str] = (), again: bool = False
 ) -> list[Standing]:
-    """Where every session stands. retry: failed ones are to be done; only: ids, the others are left out; again: all."""
+    """Where every session stands. retry: failed ones are to be done; only: ids, the others are left
+    out; again: all.
+    """
     known = [session.id for session in study.sessions]
     for id in only:
         if id not in known:
             raise LiexError(
-                f"the study {study.name} has no session {id}; it has {', '.join(known[:8]) or 'none'}"
+                f"the study {study.name} has no session {id}; it has "
+                f"{', '.join(known[:8]) or 'none'}"
             )
     found = [standing(session) for session in study.sessions if not only or session.id in only]
     return [_asked_again(one, retry, again) for one in found]
@@ -94,7 +101,9 @@ def standing(session: PlannedSession) -> Standing:
 
 
 def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Callable[[], str]]:
-    """Each says why the session in `document` is not the planned one any more, or nothing; the cheapest first."""
+    """Each says why the session in `document` is not the planned one any more, or nothing; the
+    cheapest first.
+    """
     return (
         lambda: _version_changed(document),
         lambda: _plan_changed(session.plan, document.get("plan", {})),
@@ -104,7 +113,8 @@ def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Calla
 
 
 def _version_changed(document: dict[str, Any]) -> str:
-    then, now = document.get("versions", {}).get("liex_lab", ""), package_version("liex_lab")
+    then = document.get("versions", {}).get("liex_lab", "")
+    now = package_version("liex_lab")
     if then != now:
         return f"version changed: {then or 'unknown'}, now {now}"
     schema = document.get("schema_version", SCHEMA_VERSION)
@@ -116,7 +126,8 @@ def _version_changed(document: dict[str, Any]) -> str:
 
 
 def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
-    then, now = Plan.from_table(stored).model_dump(), plan.model_dump()
+    then = Plan.from_table(stored).model_dump()
+    now = plan.model_dump()
     differing = [
         f"{section}.{key} = {now[section][key]}"
         if isinstance(now[section], dict)
@@ -156,7 +167,8 @@ def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
 
 
 def input_stamp(recording: str) -> str:
-    """A short hash of names, sizes and times of the recording's files and of those beside them; cheap to look up.
+    """A short hash of names, sizes and times of the recording's files and of those beside them;
+    cheap to look up.
 
     Empty where there is no recording.
     """
@@ -182,7 +194,9 @@ def input_stamp(recording: str) -> str:
 
 
 def set_aside(folder: Path) -> None:
-    """Make room for failed.json: an older session's results stay under another name, an older failed.json goes."""
+    """Make room for failed.json: an older session's results stay under another name, an older
+    failed.json goes.
+    """
     if (folder / "session.json").is_file():
         older = folder.with_name(f"{folder.name}.outdated")
         if older.is_dir():

@@ -25,7 +25,8 @@ STUDY_SESSIONS = columns(
         "state",
         "string",
         "",
-        "done; failed: see reason and remedy; excluded: by the study file; new, begun or changed: to be done",
+        "done; failed: see reason and remedy; excluded: by the study file; new, begun or "
+        "changed: to be done",
     ),
     ("reason", "string", "", "why it failed, is excluded or is to be done"),
     ("remedy", "string", "", "what to do about it"),
@@ -78,7 +79,8 @@ def study_rows(study: Study, standings: Sequence[Standing]) -> list[dict[str, An
 
 
 def _row(study: Study, one: Standing) -> dict[str, Any]:
-    session, failure = one.session, one.failure or {}
+    session = one.session
+    failure = one.failure or {}
     document = _document(session.folder) if one.state == "done" else {}
     frames = document.get("frames", {})
     return {

@@ -33,13 +33,16 @@ _SLOWER_HZ = (
 def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
-    """Generated recordings of an animal to learn from, at several frame rates, and cut-out sequences."""
+    """Generated recordings of an animal to learn from, at several frame rates, and cut-out
+    sequences.
+    """
     from .agent_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
     from .agent_tracks import acted, acted_tracks
 
     if animal not in WORDS:
         raise LiexError(
-            f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled sessions"
+            f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled "
+            "sessions"
         )
     recordings = acted(training_recordings(animal), estimator, progress)
     usual = by_usual_camera(recordings)
@@ -61,10 +64,12 @@ def train_actions(
     pose_model: str | Path | None = None,
     progress: Progress = silent,
 ) -> tuple[Path, dict[str, Any]]:
-    """A recogniser learned from labelled sessions, or, without any, from generated recordings of an animal.
+    """A recogniser learned from labelled sessions, or, without any, from generated recordings of an
+    animal.
 
-    labels: tables of bouts or BORIS's projects or exports; without any, the sessions' own bouts whose source is human.
-    Returns the model's path and, for sessions, its scores on each animal when it learned from the others only.
+    labels: tables of bouts or BORIS's projects or exports; without any, the sessions' own bouts
+    whose source is human. Returns the model's path and, for sessions, its scores on each animal
+    when it learned from the others only.
     """
     from liex_lab.actions.learning import learn, leave_one_animal_out, with_card
     from liex_lab.actions.storage import save_action_model
@@ -115,14 +120,14 @@ def labelled_sessions(
         named = session.name if table is not None and session.name in _sessions_named(table) else ""
         if table is not None and not named and len(sessions) > 1:
             raise LiexError(
-                f"the labels name no recording {session.name}; give each session's name as session_id (in BORIS: the "
-                "observation's name)"
+                f"the labels name no recording {session.name}; give each session's name as "
+                "session_id (in BORIS: the observation's name)"
             )
         words = words_of(own, (track.times_ns - track.times_ns[0]) * 1e-9, named)
         if (words == UNLABELLED).all():
             raise LiexError(
-                f"the session {session.path} has no bout that a person labelled; give them with --labels, or correct "
-                "them in BORIS (`liex export --to boris`)"
+                f"the session {session.path} has no bout that a person labelled; give them with "
+                "--labels, or correct them in BORIS (`liex export --to boris`)"
             )
         about = session.table("sessions").iloc[0]
         tracks.append(
@@ -153,8 +158,8 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
 def suggest(
     session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5
 ) -> pd.DataFrame:
-    """The stretches of a session most worth labelling next: where the recogniser is least sure, one per kind of doubt
-    first. Columns start_s, stop_s, guess, or_else, uncertainty (0 to 1).
+    """The stretches of a session most worth labelling next: where the recogniser is least sure, one
+    per kind of doubt first. Columns start_s, stop_s, guess, or_else, uncertainty (0 to 1).
     """
     import pandas as pd
 
@@ -178,6 +183,7 @@ def _session_and_model(
     recogniser = load_action_model(model or skeleton)
     if recogniser.skeleton != skeleton:
         raise LiexError(
-            f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use another"
+            f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use "
+            "another"
         )
     return opened, recogniser

@@ -1,4 +1,6 @@
-"""Which recordings action recognisers are trained on and judged by. Individuals are never on both sides."""
+"""Which recordings action recognisers are trained on and judged by. Individuals are never on both
+sides.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,16 @@ Recorded = TypeVar("Recorded")
 WORDS = {"fish": fish_acts.ACTIONS, "mouse": mouse_acts.ACTIONS}
 RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
 FAST_HZ = 100.0
-N_TRAIN, N_TEST = 426, 173  # cut-out sequences, as in the paper, of 5 and 2 fish
-_TRAIN_FISH, _TEST_FISH = (101, 102, 103, 104, 105), (106, 107)
-_TRAIN_SET, _TEST_SET = tuple(range(201, 225)), tuple(range(301, 307))
+# cut-out sequences, as in the paper, of 5 and 2 fish
+N_TRAIN = 426
+N_TEST = 173
+_TRAIN_FISH = (101, 102, 103, 104, 105)
+_TEST_FISH = (106, 107)
+_TRAIN_SET = tuple(range(201, 225))
+_TEST_SET = tuple(range(301, 307))
 _FAST_SET = {"fish": tuple(range(225, 233))}
-_SECONDS, _FAST_SECONDS = 40.0, 20.0
+_SECONDS = 40.0
+_FAST_SECONDS = 20.0
 _TEST_SECONDS = 300.0  # of a test recording, about: fewer minutes are fewer of the same recordings
 _FAST_SHARE = 1.0 / 6.0  # of every test recording is filmed by a faster camera as well
 
@@ -57,8 +64,8 @@ def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
 
 
 def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
-    """Uncut recordings, so many minutes in all, of individuals whose traits no other has; fast: the beginnings of the
-    same ones, by a faster camera.
+    """Uncut recordings, so many minutes in all, of individuals whose traits no other has; fast: the
+    beginnings of the same ones, by a faster camera.
     """
     n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
     seconds = 60.0 * minutes / n

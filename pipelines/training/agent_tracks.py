@@ -1,7 +1,9 @@
-"""Tracks with known actions: acted by virtual animals, rendered, measured and tracked as recordings are.
+"""Tracks with known actions: acted by virtual animals, rendered, measured and tracked as recordings
+are.
 
-Everything is drawn from seeds. What single frames say is kept in the cache folder, recording by recording, by seed,
-model and generator, so that a job that was stopped goes on where it was; what the tracker makes of it is made anew.
+Everything is drawn from seeds. What single frames say is kept in the cache folder, recording by
+recording, by seed, model and generator, so that a job that was stopped goes on where it was; what
+the tracker makes of it is made anew.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ Array = NDArray[np.float64]
 
 _SOURCES = ("agent.py", "render.py")  # and the animal's own agent
 _WALL_ERROR_MM = 4.0  # of the arena as it was found
-_FISH_STRIDE, _FISH_WINDOW, _MOUSE_WINDOW = 4, 128, 112
+_FISH_STRIDE = 4
+_FISH_WINDOW = 128
+_MOUSE_WINDOW = 112
 _SIZE_FRAMES = 128  # frames in which an animal's size is measured
 _WAYS = 2  # hypotheses a frame: nothing but the animal is in view
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
@@ -48,9 +52,9 @@ _CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
 
 @dataclass(frozen=True)
 class Scenario:
-    """One recording to be acted. seed: of everything in it; individual: the animal's own seed; novel: an animal whose
-    traits no other has; seconds long, or (word) one cut-out action; filmed_s: only so much of its beginning is
-    filmed, 0 all of it.
+    """One recording to be acted. seed: of everything in it; individual: the animal's own seed;
+    novel: an animal whose traits no other has; seconds long, or (word) one cut-out action;
+    filmed_s: only so much of its beginning is filmed, 0 all of it.
     """
 
     animal: str
@@ -65,9 +69,10 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Acted:
-    """An acted recording as its single frames saw it. words (n,): what the animal really did; animal: who it is;
-    wall_mm (n,): from its middle to the nearest wall, NaN where nobody knows; truth (n, J, 3) mm: its true joints; cut:
-    the word of a cut-out action, of which a little before and after is seen as well.
+    """An acted recording as its single frames saw it. words (n,): what the animal really did;
+    animal: who it is; wall_mm (n,): from its middle to the nearest wall, NaN where nobody knows;
+    truth (n, J, 3) mm: its true joints; cut: the word of a cut-out action, of which a little before
+    and after is seen as well.
     """
 
     seen: Observations
@@ -79,8 +84,8 @@ class Acted:
     cut: str = ""
 
     def tracked(self, rate_hz: float = 0.0) -> LabelledTrack:
-        """Its track; rate_hz: as a camera of so many frames a second would have seen it, which has only the frames
-        nearest to its times to go by; 0 all.
+        """Its track; rate_hz: as a camera of so many frames a second would have seen it, which has
+        only the frames nearest to its times to go by; 0 all.
         """
         rows = np.arange(len(self.words)) if not rate_hz else thinned(self.seen.times_ns, rate_hz)
         seen = Observations(
@@ -94,7 +99,9 @@ class Acted:
 
 
 def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """The rows of frames at these times that lie nearest to those of a camera of another rate; none twice."""
+    """The rows of frames at these times that lie nearest to those of a camera of another rate; none
+    twice.
+    """
     times = (times_ns - times_ns[:1]) * 1e-9
     wanted = np.arange(0.0, times[-1] + 1e-9, 1.0 / rate_hz)
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
@@ -111,7 +118,9 @@ def acted_tracks(
 def acted(
     scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[Acted]:
-    """All scenarios, kept from earlier or measured now. Cut-outs of one individual share its size and one file."""
+    """All scenarios, kept from earlier or measured now. Cut-outs of one individual share its size
+    and one file.
+    """
     found: dict[int, Acted] = {}
     made_by = estimator.model.digest()
     whole = bool(scenarios[0].seconds)
@@ -137,7 +146,9 @@ def acted(
 def act(
     scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | None = None
 ) -> Acted:
-    """One scenario acted, rendered and measured; sizes: of individuals that have been measured already."""
+    """One scenario acted, rendered and measured; sizes: of individuals that have been measured
+    already.
+    """
     stage = {"fish": _fish, "mouse": _mouse}[scenario.animal]
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     motion, rows, pose, girth, walls, habits, camera, shape, room = stage(scenario, rng)
@@ -197,7 +208,8 @@ _Staged = tuple[
 
 def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     """A fish on its stage."""
-    habits, own = FishHabits(), np.random.default_rng([scenario.individual, 0])
+    habits = FishHabits()
+    own = np.random.default_rng([scenario.individual, 0])
     fish = Individual.draw(own, (25.0 / 30.0, 34.0 / 30.0), scenario.novel)
     shape = habits.shapes(own, "train", 1)
     assert isinstance(shape, BodyShape)
@@ -213,7 +225,8 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
 
 def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     """A mouse in its box."""
-    habits, own = MouseHabits(), np.random.default_rng([scenario.individual, 0])
+    habits = MouseHabits()
+    own = np.random.default_rng([scenario.individual, 0])
     mouse = Individual.draw(own, (0.95, 1.3), scenario.novel)
     shape = habits.shapes(own, "train", 1)
     half = rng.uniform([290.0, 250.0], [400.0, 330.0])
@@ -247,8 +260,10 @@ def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
     axis = np.argmin(half - np.abs(middle), axis=1)
     rows = np.arange(len(middle))
     walls[rows, axis] = np.where(middle[rows, axis] < 0, -1.0, 1.0)
-    walls[:, 2], walls[:, 3] = half[axis], rng.uniform(100.0, 300.0)
-    walls[:, 4], walls[:, 5] = rng.uniform(0.0, 8.0), rng.uniform(6.0, 20.0)
+    walls[:, 2] = half[axis]
+    walls[:, 3] = rng.uniform(100.0, 300.0)
+    walls[:, 4] = rng.uniform(0.0, 8.0)
+    walls[:, 5] = rng.uniform(6.0, 20.0)
     return walls
 
 
@@ -292,7 +307,9 @@ def _of_animal(seen: Observations, name: str) -> NDArray[Any]:
 def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> list[Acted]:
     with np.load(path) as kept:
         data = {name: kept[name] for name in kept.files}
-    tracker, stops, found = WindowTracker(estimator), np.cumsum(data["lengths"]), []
+    tracker = WindowTracker(estimator)
+    stops = np.cumsum(data["lengths"])
+    found = []
     for k, (stop, length) in enumerate(zip(stops, data["lengths"], strict=True)):
         part = slice(stop - length, stop)
         seen = Observations(estimator.skeleton, *(data[name][part] for name in COLUMNS))

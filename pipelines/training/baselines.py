@@ -42,15 +42,19 @@ class Training:
 
 
 BASELINES: dict[str, ForestPlan | CnnPlan] = {"rf": ForestPlan(), "cnn": CnnPlan()}
-# about as many images as our own model of the animal learns from; the CNN sees as many in all, whatever their number
+# about as many images as our own model of the animal learns from; the CNN sees as many in all,
+# whatever their number
 _N_IMAGES = {"mouse": 40_960, "hand": 20_480}
-_N_OTHERS, _SEEN, _DEGRADED = 16_384, 122_880, 0.5
+_N_OTHERS = 16_384
+_SEEN = 122_880
+_DEGRADED = 0.5
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
-    """Rendered images as our own model learns from, half of them degraded; all animals near home size, for like the
-    paper's variant the baselines are told nothing of an animal's size. Their number is no one else's, so that a
-    baseline stays what it is when our own model learns from more or fewer.
+    """Rendered images as our own model learns from, half of them degraded; all animals near home
+    size, for like the paper's variant the baselines are told nothing of an animal's size. Their
+    number is no one else's, so that a baseline stays what it is when our own model learns from more
+    or fewer.
     """
     from .pose_model import recipe_of
 

@@ -1,8 +1,10 @@
-"""The job `liex train tracking`: what the tracker believes of an animal, found on rendered sequences with the truth.
+"""The job `liex train tracking`: what the tracker believes of an animal, found on rendered
+sequences with the truth.
 
-Sequences of the kinds that tracking is measured on, with other seeds, are measured frame by frame once; what the filter
-says of its own errors is held against them. Before that, if it is asked for, numbers of the chain and of the motion are
-changed at random, some at a time, and kept where the tracks come nearer to the truth.
+Sequences of the kinds that tracking is measured on, with other seeds, are measured frame by frame
+once; what the filter says of its own errors is held against them. Before that, if it is asked for,
+numbers of the chain and of the motion are changed at random, some at a time, and kept where the
+tracks come nearer to the truth.
 """
 
 from __future__ import annotations
@@ -40,9 +42,13 @@ Knots = tuple[tuple[float, float], ...]
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 _EASY_WEIGHT = 2.0  # never worse than single frames where these are good
 _STEP = 0.5  # sd of the logarithm of a number that is changed
-_BINS, _Z90, _FACTORS, _LEAST = 3, 1.645, (0.3, 3.0), 0.01
+_BINS = 3
+_Z90 = 1.645
+_FACTORS = (0.3, 3.0)
+_LEAST = 0.01
 # how fast a session's stretch may grow with what it is told by, see `Motion.stretch`
-_PER_BLUR, _PER_SPREAD = np.arange(0.0, 6.5, 0.5), np.arange(0.0, 3.5, 0.5)
+_PER_BLUR = np.arange(0.0, 6.5, 0.5)
+_PER_SPREAD = np.arange(0.0, 3.5, 0.5)
 _FOUND_OTHERWISE = (
     "ceiling",
     "lasting",
@@ -57,8 +63,8 @@ _CHUNK = 32
 
 @dataclass(frozen=True)
 class Seen:
-    """A sequence as it was measured: what frames say, of whom, and the true poses (n) and joints (n, J, 3) mm in the
-    same arena. blur, size_spread: see `FrameTracker`.
+    """A sequence as it was measured: what frames say, of whom, and the true poses (n) and joints
+    (n, J, 3) mm in the same arena. blur, size_spread: see `FrameTracker`.
     """
 
     kind: str
@@ -88,10 +94,12 @@ def train_tracking(
     workers: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Write `tunings.toml` with an animal's table found again, byte for byte the same whenever and however it is run.
+    """Write `tunings.toml` with an animal's table found again, byte for byte the same whenever and
+    however it is run.
 
-    Chain and motion are those of the file, or the best of n_tries changes of them; how far off the track may be is
-    measured. n_frames, seeds: of other sequences than `SEEDS`; workers: threads, 0 for all.
+    Chain and motion are those of the file, or the best of n_tries changes of them; how far off the
+    track may be is measured. n_frames, seeds: of other sequences than `SEEDS`; workers: threads, 0
+    for all.
     """
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
@@ -110,7 +118,8 @@ def measure(
     animal: str, kind: str, seed: int, n_frames: int | None, progress: Progress = silent
 ) -> Seen:
     """One sequence, frame by frame; scene and size are found by the product."""
-    plan, estimator = plan_of(animal), estimator_of(animal, "default", progress)
+    plan = plan_of(animal)
+    estimator = estimator_of(animal, "default", progress)
     recording = tracking_sequence(
         world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
@@ -153,7 +162,8 @@ def search(
             other = changed(other, rng)
         cost = _cost(measured, alone, other)
         if cost < best:
-            best, tuning = cost, other
+            best = cost
+            tuning = other
     return tuning
 
 
@@ -198,10 +208,13 @@ def _track(each: Seen, tuning: Tuning | None) -> Track:
 
 
 def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: Tuning) -> float:
-    """Mean, median, third quartile and 95th percentile of the errors over those of single frames."""
+    """Mean, median, third quartile and 95th percentile of the errors over those of single
+    frames.
+    """
     total = 0.0
     for kind, weight in (("easy", _EASY_WEIGHT), ("hard", 1.0)):
-        error, others = _of_kind(measured, kind, tuning), alone[kind]
+        error = _of_kind(measured, kind, tuning)
+        others = alone[kind]
         of = [error.mean() / others.mean()]
         of += [float(np.quantile(error, q) / np.quantile(others, q)) for q in (0.5, 0.75, 0.95)]
         total += weight * float(np.sum(of))
@@ -215,8 +228,9 @@ def with_motion(tuning: Tuning, **changes: Any) -> Tuning:
 
 @dataclass(frozen=True)
 class _Claim:
-    """What the filter says of a sequence's frames that have a pose, over the animal's length: said (n,); sd (n, J) and
-    away (n, J), see `stretch_of`, of a stretch of 1; off (n, J, 3): how far off the joints are.
+    """What the filter says of a sequence's frames that have a pose, over the animal's length: said
+    (n,); sd (n, J) and away (n, J), see `stretch_of`, of a stretch of 1; off (n, J, 3): how far off
+    the joints are.
     """
 
     blur: float
@@ -240,19 +254,21 @@ class _Claim:
 
 
 def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
-    """The same with the `stretch` and `honest` by which nine errors in ten lie within their intervals in all sequences
-    together, and as nearly as possible in each of them.
+    """The same with the `stretch` and `honest` by which nine errors in ten lie within their
+    intervals in all sequences together, and as nearly as possible in each of them.
     """
     plain = with_motion(tuning, honest=((1.0, 1.0),), stretch=(0.0, 0.0), usual_stretch=0.0)
     claims = [_claim(each, plain) for each in measured]
-    best, least = (0.0, 0.0), np.inf
+    best = (0.0, 0.0)
+    least = np.inf
     for stretch in product(_PER_BLUR.tolist(), _PER_SPREAD.tolist()):
         knots = honesty(claims, stretch)
         apart = float(
             np.mean([np.log(_nine_in_ten(claim.over(knots, stretch))) ** 2 for claim in claims])
         )
         if apart < least:
-            best, least = stretch, apart
+            best = stretch
+            least = apart
     usual = float(np.median([claim.stretch_sd(*best) for claim in claims]))
     return with_motion(
         tuning, honest=honesty(claims, best), stretch=best, usual_stretch=round(usual, 4)
@@ -261,10 +277,8 @@ def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
 
 def _claim(each: Seen, plain: Tuning) -> _Claim:
     """What the filter says of a sequence by itself."""
-    length, track = (
-        each.subject.length_mm,
-        _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain),
-    )
+    length = each.subject.length_mm
+    track = _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain)
     there = track.posed
     joints = track.joints_mm[there]
     return _Claim(
@@ -278,7 +292,9 @@ def _claim(each: Seen, plain: Tuning) -> _Claim:
 
 
 def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
-    """How many times larger errors are than the filter says, by what it says, beside a stretch: see `Motion.honest`."""
+    """How many times larger errors are than the filter says, by what it says, beside a stretch: see
+    `Motion.honest`.
+    """
     said, sd, off = (
         np.concatenate([getattr(claim, name) for claim in claims]) for name in ("said", "sd", "off")
     )
@@ -301,12 +317,16 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
 
 
 def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
-    """The same with the `honest_root` and `honest_bend` by which nine errors in ten lie within their intervals."""
+    """The same with the `honest_root` and `honest_bend` by which nine errors in ten lie within
+    their intervals.
+    """
     plain = with_motion(tuning, honest_root=(1.0,) * 6, honest_bend=(1.0,) * 3)
-    roots, bends = [], []
+    roots = []
+    bends = []
     for each in measured:
         track = _track(each, plain)
-        there, true = track.posed, each.pose
+        there = track.posed
+        true = each.pose
         off = SE3(track.root_rotation[there], track.root_mm[there]).inverse() @ SE3(
             true.root.rotation[there], true.root.translation[there]
         )

@@ -1,4 +1,6 @@
-"""The job `liex train`: rendered images in, a model with its card out, the same bytes whenever it is run."""
+"""The job `liex train`: rendered images in, a model with its card out, the same bytes whenever it
+is run.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Recipe:
-    """How much a model is trained on. degraded_share of the images have up to 2.5 times the noise (METHOD lesson 5).
+    """How much a model is trained on. degraded_share of the images have up to 2.5 times the noise
+    (METHOD lesson 5).
 
-    sizes: the animals' mean spine in mm and the window in pixels that holds them, for one block of images after the
-    other; 0 is the skeleton's own length. Features do not depend on size, but pixels and noise do.
+    sizes: the animals' mean spine in mm and the window in pixels that holds them, for one block of
+    images after the other; 0 is the skeleton's own length. Features do not depend on size, but
+    pixels and noise do.
     """
 
     seed: int = 20
@@ -50,11 +54,11 @@ class Recipe:
     )
 
 
-_CALIBRATION, _CORRECTION = (
-    1,
-    2,
-)  # numbers of their own random numbers, so that each can be made again by itself
-# of the images that an animal's predicted error is calibrated on show bodies that vary as individuals do; intervals for
+# numbers of their own random numbers, so that each can be made again by itself
+_CALIBRATION = 1
+_CORRECTION = 2
+# of the images that an animal's predicted error is calibrated on show bodies that vary as
+# individuals do; intervals for
 # bodies that vary far more, as the others do, are wider than most animals need
 _ORDINARY_SHARE = {"mouse": 0.5}
 _AREAS_MM2 = {
@@ -91,7 +95,9 @@ _OWN: dict[tuple[str, str], Recipe] = {
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
-    """How much the variant is trained on for an animal; for one of the user's own, sizes around its home length."""
+    """How much the variant is trained on for an animal; for one of the user's own, sizes around its
+    home length.
+    """
     from liex_lab.simulation.simulator import GenericWorld, world_of
 
     world = world_of(skeleton)
@@ -116,8 +122,8 @@ def train_model(
 ) -> Path:
     """Train an animal's model and write it, and its card, to `out` (.npz); returns the path.
 
-    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of that to correct and
-    to calibrate on, instead of what the recipe says.
+    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of
+    that to correct and to calibrate on, instead of what the recipe says.
     """
     import numba
 
@@ -148,7 +154,9 @@ def train_model(
 
 @serial_products()
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
-    """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and the calibration."""
+    """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and
+    the calibration.
+    """
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
@@ -206,13 +214,16 @@ def rendered_set(
     progress: Progress,
     family: str = "augmented",
 ) -> TrainingSet:
-    """N training images from number `first` on, of bodies of a family, cut out by the product's own foreground."""
+    """N training images from number `first` on, of bodies of a family, cut out by the product's own
+    foreground.
+    """
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.simulation.simulator import world_of
     from liex_lab.simulation.training_patches import BLOCK
 
     world = world_of(skeleton)
-    blocks, begin = -(-n // BLOCK), -(-first // BLOCK)
+    blocks = -(-n // BLOCK)
+    begin = -(-first // BLOCK)
     parts: list[TrainingSet] = []
     for number in range(begin, begin + blocks):
         progress(number - begin, blocks, "rendering training images")
@@ -231,8 +242,8 @@ def rendered_set(
 
 
 def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
-    """Training images from number `first` on as a model is calibrated on them: some of ordinary bodies, see
-    `_ORDINARY_SHARE`, the rest as varied as those that it was trained on.
+    """Training images from number `first` on as a model is calibrated on them: some of ordinary
+    bodies, see `_ORDINARY_SHARE`, the rest as varied as those that it was trained on.
     """
     from liex_lab.estimation.training import TrainingSet
 
@@ -247,13 +258,16 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
 
 
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
-    """Training images of what the foreground found in the windows, with the truth in their view frames."""
+    """Training images of what the foreground found in the windows, with the truth in their view
+    frames.
+    """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.foreground.background_segmenter import SPREADS, Windows
     from liex_lab.foreground.hand_segmenter import NearestWindows
 
-    size, origin = windows.spine_mm / skeleton.length, windows.origin.astype(float)
+    size = windows.spine_mm / skeleton.length
+    origin = windows.origin.astype(float)
     shown = size if method.session_size else np.ones(len(size))
     if skeleton.view.foreground == FOREGROUNDS[1]:
         held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
@@ -280,7 +294,9 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> Tra
 def with_truth(
     skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array
 ) -> TrainingSet:
-    """Training images of blobs that were cut from the windows, with the truth in their view frames."""
+    """Training images of blobs that were cut from the windows, with the truth in their view
+    frames.
+    """
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
@@ -302,7 +318,8 @@ def with_truth(
         off = np.maximum(
             off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2])
         )
-    animal, other = off < 0.4 * windows.spine_mm, off > 0.8 * windows.spine_mm
+    animal = off < 0.4 * windows.spine_mm
+    other = off > 0.8 * windows.spine_mm
     good = crops.found & (
         animal | other
     )  # in between the two have run together, which teaches nothing
@@ -322,13 +339,16 @@ def home_area_mm2(skeleton: Skeleton) -> float:
 
 
 def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
-    """A model that does not come with the package, trained once and kept in the user's cache folder."""
+    """A model that does not come with the package, trained once and kept in the user's cache
+    folder.
+    """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.method import method_of
     from liex_lab.sessions.provenance import package_version
 
     skeleton = Skeleton.load(animal)
-    method, recipe = method_of(variant, skeleton), recipe_of(variant, skeleton)
+    method = method_of(variant, skeleton)
+    recipe = recipe_of(variant, skeleton)
     made_from: dict[str, Any] = {
         "method": method.to_dict(),
         "recipe": vars(recipe),

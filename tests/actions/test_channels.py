@@ -78,9 +78,7 @@ def test_window_features_are_finite_and_as_many_for_short_stretches() -> None:
     assert a.shape[1] == b.shape[1]
 
 
-def test_the_papers_descriptors_have_252_and_888_numbers_and_tangents_do_not_depend_on_the_place() -> (
-    None
-):
+def test_the_papers_descriptors_have_252_and_888_numbers_and_do_not_depend_on_the_place() -> None:
     clock = np.arange(0.0, 1.0, 0.02)
     track = straight_track("fish", clock, 60.0 * clock**2, np.sin(3 * clock))
     tangent, joints = tangent_descriptor(track), position_descriptor(track)

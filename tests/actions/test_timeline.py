@@ -1,4 +1,6 @@
-"""The default recogniser learns from labelled tracks, works at other frame rates, and is kept without pickle."""
+"""The default recogniser learns from labelled tracks, works at other frame rates, and is kept
+without pickle.
+"""
 
 from __future__ import annotations
 

@@ -39,7 +39,9 @@ def straight_track(
 def going_and_staying(
     seed: int, rate_hz: float = 30.0, seconds: float = 40.0, animal: str = "mouse"
 ) -> LabelledTrack:
-    """It goes at 3 lengths a second for a second or so, then stays as long; labelled, with a little noise."""
+    """It goes at 3 lengths a second for a second or so, then stays as long; labelled, with a little
+    noise.
+    """
     rng = np.random.default_rng(seed)
     clock = np.arange(0.0, seconds, 1.0 / rate_hz)
     edges = np.cumsum(rng.uniform(0.8, 2.0, int(seconds)))

@@ -1,4 +1,6 @@
-"""Arenas whose shape is known: found round or rectangular, as large as they are, or said to be out of view."""
+"""Arenas whose shape is known: found round or rectangular, as large as they are, or said to be out
+of view.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def seen(stage: Stage, rng: np.random.Generator) -> np.ndarray:
 
 
 def test_drawn_arenas_are_found_as_they_are() -> None:
-    """Half of them are cut by the picture's edge, a third have things on the floor; the seed is not chosen."""
+    """Half of them are cut by the picture's edge, a third have things on the floor; the seed is not
+    chosen.
+    """
     rng = np.random.default_rng(0)
     kinds = {"round": 0, "rectangular": 0, "open": 0}
     for k in range(24):

@@ -1,4 +1,6 @@
-"""The paper's regression forest: its coordinates are a pose, its votes are counted, and it learns."""
+"""The paper's regression forest: its coordinates are a pose, its votes are counted, and it
+learns.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Patches for the CNN: what is said of them can be undone, and they look as a reader would cut them."""
+"""Patches for the CNN: what is said of them can be undone, and they look as a reader would cut
+them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A fish whose every number is known: its place, its heading and its tail's beat are given as functions of time."""
+"""A fish whose every number is known: its place, its heading and its tail's beat are given as
+functions of time.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,11 @@ LENGTH_MM = 30.0
 
 @dataclass(frozen=True)
 class SwimmingFish:
-    """times_s of the frames. The body's centre goes round a circle at turn_rad_s, its height as climb_mm_s.
+    """times_s of the frames. The body's centre goes round a circle at turn_rad_s, its height as
+    climb_mm_s.
 
-    beat_hz, beat_rad: frequency and largest turn at one joint of the wave that runs down the tail, from the head to
-    the tip in wave_s; lost: rows without a pose.
+    beat_hz, beat_rad: frequency and largest turn at one joint of the wave that runs down the tail,
+    from the head to the tip in wave_s; lost: rows without a pose.
     """
 
     times_s: np.ndarray
@@ -63,7 +66,9 @@ class SwimmingFish:
         return frames, poses
 
     def joints(self) -> np.ndarray:
-        """(n, 21, 3) mm: bones of equal length behind the head; the mean of the front half lies on the circle."""
+        """(n, 21, 3) mm: bones of equal length behind the head; the mean of the front half lies on
+        the circle.
+        """
         time = self.times_s
         turned = self.turn_rad_s * time
         heading = turned + np.pi / 2

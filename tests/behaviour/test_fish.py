@@ -63,7 +63,9 @@ def test_a_fish_on_a_circle_of_10_mm_at_2_rad_a_second_before_an_uneven_clock():
 
 
 def lasting(rng: np.random.Generator, n: int, k: int, step_s: float) -> np.ndarray:
-    """Errors (n, k) of standard deviation 1 that agree by exp(-time / ERROR_LASTS_S) from frame to frame."""
+    """Errors (n, k) of standard deviation 1 that agree by exp(-time / ERROR_LASTS_S) from frame to
+    frame.
+    """
     shared = np.exp(-step_s / ERROR_LASTS_S)
     out = rng.normal(size=(n, k))
     for row in range(1, n):
@@ -176,7 +178,9 @@ def test_speed_of_a_swimming_animal_has_its_vertical_part():
 
 
 def test_depth_preference_is_of_the_water_s_thirds():
-    """From 10 mm up at 2 mm/s in 90 mm of water: 10 s in the bottom third, 15 s in the middle, the rest at the top."""
+    """From 10 mm up at 2 mm/s in 90 mm of water: 10 s in the bottom third, 15 s in the middle, the
+    rest at the top.
+    """
     fish = SwimmingFish(np.arange(35 * 20) / 20.0, height_mm=10.0, climb_mm_s=2.0)
     frames, poses = fish.tables()
     row = measure(frames, poses, around=Surroundings(surface_z_mm=90.0)).summary.iloc[0]

@@ -198,7 +198,9 @@ def test_the_interval_without_blocks_is_welch_s():
 
 
 def test_the_mixed_model_of_balanced_cages_is_the_t_test_of_their_means():
-    """Which it has to be in theory: same numbers in every cage, and a variance between cages above zero."""
+    """Which it has to be in theory: same numbers in every cage, and a variance between cages above
+    zero.
+    """
     from scipy.stats import ttest_ind
 
     rng = np.random.default_rng(8)
@@ -260,7 +262,9 @@ def test_sessions_are_collected_with_who_they_are_of(tmp_path):
 
 @pytest.mark.parametrize("plan", [PLANS[k] for k in (0, 2, 3, 5)], ids=lambda plan: plan.name)
 def test_studies_without_an_effect_are_rarely_called_significant(plan):
-    """Forty of each kind; `liex evaluate statistics` makes two thousand. Seven or more are 0.3 % likely at 5 %."""
+    """Forty of each kind; `liex evaluate statistics` makes two thousand. Seven or more are 0.3 %
+    likely at 5 %.
+    """
     rates = error_rates(plan, 40, np.random.default_rng(1))
     assert rates["type_1"] <= 0.15
     assert rates["coverage"] >= 0.85

@@ -53,7 +53,9 @@ def rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def chain(n: int, seed: int, weights: dict[str, float]) -> list[str]:
-    """Actions that follow each other by chance: the next is drawn by weight from all but the last."""
+    """Actions that follow each other by chance: the next is drawn by weight from all but
+    the last.
+    """
     rng = np.random.default_rng(seed)
     words, out = list(weights), [next(iter(weights))]
     while len(out) < n:
@@ -171,7 +173,9 @@ def test_false_discovery_agrees_with_the_rule_as_it_is_printed():
 
 
 def test_a_mouse_on_a_circle_visits_a_zone_once_a_round():
-    """On a circle of 150 mm at 200 mm/s it is right of x = 75 mm for a third of each round of 4.71 s."""
+    """On a circle of 150 mm at 200 mm/s it is right of x = 75 mm for a third of each round of 4.71
+    s.
+    """
     mouse = WalkingMouse(steady(20.0))
     frames, poses = tables_of(mouse)
     right = Zone(

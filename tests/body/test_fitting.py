@@ -1,4 +1,6 @@
-"""Inverse kinematics: poses are found again from the points they put down, within the joints' limits."""
+"""Inverse kinematics: poses are found again from the points they put down, within the joints'
+limits.
+"""
 
 from __future__ import annotations
 

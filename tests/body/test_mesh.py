@@ -1,4 +1,6 @@
-"""A body from a user's own mesh file: read, thinned out, carried in the table, and moving with the bones."""
+"""A body from a user's own mesh file: read, thinned out, carried in the table, and moving with the
+bones.
+"""
 
 from __future__ import annotations
 

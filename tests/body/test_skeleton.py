@@ -1,4 +1,6 @@
-"""Skeletons: the paper's counts, kinematics against the product of exponentials, and errors that name the mistake."""
+"""Skeletons: the paper's counts, kinematics against the product of exponentials, and errors that
+name the mistake.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The surface around a skeleton: closed, the right size, moving with the body; and the families of shapes."""
+"""The surface around a skeleton: closed, the right size, moving with the body; and the families of
+shapes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Bodies of any animal: individuals vary, and the other family holds builds that training never reaches."""
+"""Bodies of any animal: individuals vary, and the other family holds builds that training never
+reaches.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""The fault campaign, run by hand: python -m tests.campaign kills|workers|faults|broken|fuzz (figures in the README).
+"""The fault campaign, run by hand: python -m tests.campaign kills|workers|faults|broken|fuzz
+(figures in the README).
 
-What it does at random moments it does from a seed, but for the moments themselves, which the machine's load decides.
+What it does at random moments it does from a seed, but for the moments themselves, which the
+machine's load decides.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""A disk that is full, a drive that cannot be read, a clock that jumps, two runs on one folder at once."""
+"""A disk that is full, a drive that cannot be read, a clock that jumps, two runs on one folder at
+once.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ _DISK_MB = 64
 
 
 def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
-    """Each fault n times; what was refused, and with which sentences, and whether the tables were equal in the end."""
+    """Each fault n times; what was refused, and with which sentences, and whether the tables were
+    equal in the end.
+    """
     rng, scratch = random.Random(seed), Path(tempfile.mkdtemp(prefix="liex-faults-"))
     _, expected = undisturbed(scratch, n_frames)
     whole_mb = (

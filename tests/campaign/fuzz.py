@@ -1,4 +1,6 @@
-"""The laws of all readers of small files on ever new examples; what breaks one is told, and the hunt goes on."""
+"""The laws of all readers of small files on ever new examples; what breaks one is told, and the
+hunt goes on.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,8 @@ Law = Callable[[int], int]  # a seed -> examples tried; raises what breaks it
 
 
 def fuzz(minutes: float, rng_seed: int) -> dict[str, Any]:
-    """Examples tried of each law in so many minutes of one core's work, and every way in which one was broken, with its
-    example.
+    """Examples tried of each law in so many minutes of one core's work, and every way in which one
+    was broken, with its example.
     """
     rng, tried, broken = random.Random(rng_seed), dict[str, int](), dict[str, str]()
     began, until = (

@@ -18,11 +18,14 @@ from liex_lab.errors import LiexError
 from liex_lab.sessions import Session
 from tests.campaign.runs import begin, refusal, tables_of, undisturbed
 
-_IN_THE_WORK = 0.6  # of the moments are counted from when poses are measured; the others from the very beginning
+# of the moments are counted from when poses are measured; the others from the very beginning
+_IN_THE_WORK = 0.6
 
 
 def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
-    """Kill runs at n random moments; a run that was killed is begun again until it is whole, and compared."""
+    """Kill runs at n random moments; a run that was killed is begun again until it is whole, and
+    compared.
+    """
     rng, scratch = random.Random(seed), Path(tempfile.mkdtemp(prefix="liex-kills-"))
     usual_s, expected = undisturbed(scratch, n_frames)
     out, lost, where = scratch / "killed", [0.0], dict[str, int]()
@@ -81,7 +84,9 @@ def _wait_for_the_work(process: BaseProcess, out: Path) -> None:
 
 
 def _lost(out: Path) -> tuple[str, float]:
-    """What was being done, and seconds of measuring since the last checkpoint, or since this process began to."""
+    """What was being done, and seconds of measuring since the last checkpoint, or since this
+    process began to.
+    """
     try:
         stage, since = json.loads((out / "stage.json").read_text())
     except (OSError, ValueError):

@@ -53,7 +53,9 @@ def long_sample(n_frames: int, broken_at: int = -1) -> Recording:
 
 
 def run_here(out: str, told: str, n_frames: int, broken_at: int, jumping: bool) -> None:
-    """What `liex run` does, in a process forked off one with everything imported; stages and refusals are told."""
+    """What `liex run` does, in a process forked off one with everything imported; stages and
+    refusals are told.
+    """
     from liex_lab.api import run_session
 
     if jumping:

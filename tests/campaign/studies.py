@@ -23,7 +23,9 @@ _N_SESSIONS = 4  # of a study whose workers are killed
 
 
 def workers(n: int, seed: int) -> dict[str, Any]:
-    """SIGKILL of a worker at n random moments of studies of four sessions; each study ends by itself."""
+    """SIGKILL of a worker at n random moments of studies of four sessions; each study ends by
+    itself.
+    """
     import psutil
 
     rng, killed, done, same, again = random.Random(seed), 0, 0, 0, 0
@@ -92,7 +94,8 @@ BROKEN = {
 
 
 def broken(n: int, n_frames: int, n_workers: int, kept: Path | None = None) -> dict[str, Any]:
-    """A study of n sessions, ten of them broken in different ways; who fails and why; mended, one command does them.
+    """A study of n sessions, ten of them broken in different ways; who fails and why; mended, one
+    command does them.
 
     kept: a folder for the study, where the campaign goes on if it was interrupted.
     """

@@ -1,4 +1,6 @@
-"""The command line: quick to ask, one sentence and exit code 1 for what the user can put right, JSON that is JSON."""
+"""The command line: quick to ask, one sentence and exit code 1 for what the user can put right,
+JSON that is JSON.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def job(monkeypatch: pytest.MonkeyPatch, module: str, **functions: Any) -> None:
 
 
 def test_help_is_quick() -> None:
-    """Half a second is promised; the limit here leaves room for a machine that is busy with other tests."""
+    """Half a second is promised; the limit here leaves room for a machine that is busy with other
+    tests.
+    """
     liex("--help")  # the first call writes the byte code
     walls = []
     for _ in range(3):
@@ -94,7 +98,10 @@ def test_a_call_that_is_wrong_is_exit_code_2() -> None:
     assert liex("fly").returncode == 2
 
 
-BREAK = "import liex_lab.plan, liex_lab.cli as c\ndef broken(*a): {}\nliex_lab.plan.Plan.load = broken\nc.main()"
+BREAK = (
+    "import liex_lab.plan, liex_lab.cli as c\ndef broken(*a): {}\nliex_lab.plan.Plan.load = "
+    "broken\nc.main()"
+)
 
 
 def test_a_fault_of_ours_says_so_and_shows_where() -> None:

@@ -1,4 +1,6 @@
-"""What a lab gets wrong, told at `liex run`: one sentence that says what to do, exit code 1, nothing left behind."""
+"""What a lab gets wrong, told at `liex run`: one sentence that says what to do, exit code 1,
+nothing left behind.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +94,9 @@ def whole(folder: Path) -> Path:
 def refused(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str
 ) -> str:
-    """The sentence with which the command line refuses, in this process: a new one takes seconds."""
+    """The sentence with which the command line refuses, in this process: a new one takes
+    seconds.
+    """
     monkeypatch.setattr(sys, "argv", ["liex", *words])
     with pytest.raises(SystemExit) as left:
         cli.main()

@@ -1,4 +1,6 @@
-"""A real browser that is watched: every complaint of a page and every request to another machine is kept."""
+"""A real browser that is watched: every complaint of a page and every request to another machine is
+kept.
+"""
 
 from __future__ import annotations
 

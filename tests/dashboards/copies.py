@@ -1,4 +1,6 @@
-"""A study whose sessions are copies of one, so that two hundred are made in seconds: other animals, other numbers."""
+"""A study whose sessions are copies of one, so that two hundred are made in seconds: other animals,
+other numbers.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ FAILED, WAITING = 1, 2  # the places of the sessions that are not done
 
 
 def session(folder: Path) -> Session:
-    """The session that the others are copies of: 6 s, a rear from 2 to 3 s, a gap, two frames without a pose."""
+    """The session that the others are copies of: 6 s, a rear from 2 to 3 s, a gap, two frames
+    without a pose.
+    """
     mouse = WalkingMouse(np.delete(steady(6.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(150, 151))
     return write(
         folder, mouse, name="first", report=write_report, arena=Arena("round", (0.0, 0.0), 220.0)
@@ -33,7 +37,9 @@ def session(folder: Path) -> Session:
 
 
 def study(folder: Path, n_sessions: int) -> Path:
-    """A study file with its sessions: two per animal, the animals in two groups, one session failed, one waiting."""
+    """A study file with its sessions: two per animal, the animals in two groups, one session
+    failed, one waiting.
+    """
     first = session(folder / "first.liex")
     summary, rng = first.summary, np.random.default_rng(3)
     lines = ['name = "copies"', 'plan = "mouse"', 'results = "derivatives"']

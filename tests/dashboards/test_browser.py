@@ -1,4 +1,6 @@
-"""The report in a real browser: on a phone, a screen and paper nothing runs out of the page, and nothing goes wrong."""
+"""The report in a real browser: on a phone, a screen and paper nothing runs out of the page, and
+nothing goes wrong.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,10 @@ from liex_lab.arena.zones import Zone
 from tests.dashboards.conftest import Watched
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
-_EMPTY = "[...document.querySelectorAll('svg')].filter(svg => svg.getBoundingClientRect().height < 5).length"
+_EMPTY = (
+    "[...document.querySelectorAll('svg')].filter(svg => svg.getBoundingClientRect().height < "
+    "5).length"
+)
 _BROKEN = "[...document.images].filter(image => !image.naturalWidth).length"
 # on paper: what runs over its right edge, and figures that two pages would share
 _A4_PX = 718  # the width of A4 between margins of 10 mm at 96 dpi
@@ -51,7 +56,8 @@ def test_the_report_can_be_printed(report: Path, watched: Watched) -> None:
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     assert page.locator("nav").is_hidden()
     clipped = """[...document.querySelectorAll('.scroll, .over, .cards')].filter(
-        box => box.scrollWidth > box.clientWidth + 1 && getComputedStyle(box).overflowX !== 'visible').length"""
+        box => box.scrollWidth > box.clientWidth + 1
+            && getComputedStyle(box).overflowX !== 'visible').length"""
     assert page.evaluate(clipped) == 0  # on paper nobody scrolls
     shown = page.pdf(format="A4", print_background=True)
     assert shown.startswith(b"%PDF")

@@ -1,4 +1,6 @@
-"""What the dashboard shows is what the folders hold; what it hands out runs nowhere; and not everybody may ask."""
+"""What the dashboard shows is what the folders hold; what it hands out runs nowhere; and not
+everybody may ask.
+"""
 
 from __future__ import annotations
 

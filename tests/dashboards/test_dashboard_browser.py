@@ -1,4 +1,6 @@
-"""The dashboard in a real browser, with a study of two hundred sessions: what is clicked happens, and nothing else."""
+"""The dashboard in a real browser, with a study of two hundred sessions: what is clicked happens,
+and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from tests.dashboards import copies
 from tests.dashboards.conftest import Watched
 
 N_SESSIONS = 200
-SOON_S = 20.0  # from the study file to the list on the screen; measured: 4.5 s on two cores that had other work
+# from the study file to the list on the screen; measured: 4.5 s on two cores that had other work
+SOON_S = 20.0
 KEY = "sub-m003_ses-01"
 
 
@@ -208,11 +211,13 @@ def test_everything_can_be_reached_with_the_keyboard_and_is_seen_when_it_is(
     named, seen = [], []
     for _ in range(60):
         page.keyboard.press("Tab")
-        about = page.evaluate("""() => { const one = document.activeElement, style = getComputedStyle(one);
+        about = page.evaluate("""() => {
+            const one = document.activeElement, style = getComputedStyle(one);
             const outer = one.closest('.dash-input-container');
             const ring = [style, ...(outer ? [getComputedStyle(outer)] : [])].some(
                 s => parseFloat(s.outlineWidth) >= 2 && s.outlineStyle !== 'none');
-            return [one.innerText || one.getAttribute('aria-label') || one.id || one.tagName, ring || one.type]; }""")
+            const name = one.innerText || one.getAttribute('aria-label') || one.id || one.tagName;
+            return [name, ring || one.type]; }""")
         named.append(str(about[0]))
         seen.append(about[1])
     assert named[:4] == ["Skip to the content", "Sessions", "Ethograms", "Groups"]

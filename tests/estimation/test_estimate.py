@@ -1,4 +1,6 @@
-"""Estimation: the fast kernels agree with the page of the paper, however the frames are dealt out; then the choice."""
+"""Estimation: the fast kernels agree with the page of the paper, however the frames are dealt out;
+then the choice.
+"""
 
 from __future__ import annotations
 
@@ -264,7 +266,9 @@ def test_of_two_things_of_the_animals_size_the_one_that_looks_like_it_is_taken()
 
 
 def drawn_candidates(n: int, k: int, seed: int) -> tuple[Skeleton, Pose, np.ndarray, np.ndarray]:
-    """Poses (n, k) whose joints do not turn about their bones, with rotations and positions of all their joints."""
+    """Poses (n, k) whose joints do not turn about their bones, with rotations and positions of all
+    their joints.
+    """
     rng = np.random.default_rng(seed)
     skeleton = Skeleton.load("mouse")
     angles = rng.normal(0, 0.3, (n, k, skeleton.n_joints, 3)) * skeleton.axes

@@ -1,4 +1,6 @@
-"""The last correction of the chosen pose: it helps where trees have not been, and keeps what it cannot know."""
+"""The last correction of the chosen pose: it helps where trees have not been, and keeps what it
+cannot know.
+"""
 
 from __future__ import annotations
 

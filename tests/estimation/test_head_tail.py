@@ -1,4 +1,6 @@
-"""Which way an animal faces: the picture that is laid along it, and what a network's word does to the scores."""
+"""Which way an animal faces: the picture that is laid along it, and what a network's word does to
+the scores.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ N = 240
 
 @pytest.fixture(scope="module")
 def mice():
-    """Toy mice's height maps, and their joints pointing the right way (n, J, 3) and the wrong way."""
+    """Toy mice's height maps, and their joints pointing the right way (n, J, 3) and the
+    wrong way.
+    """
     data = training_set(toy_mice(N, seed=5), METHODS["default"])
     joints = data.truth.positions
     return data.images, joints, np.ascontiguousarray(joints[:, ::-1]), data.size
@@ -85,7 +89,8 @@ def test_the_word_counts_where_scores_are_near_and_only_there(mice, network):
     skeleton = toy_mice(1, seed=0).skeleton
     one = int(np.argmin(np.abs(size - 1.0)))
     seen = type(images)(*(np.repeat(v[one : one + 1], 4, axis=0) for v in vars(images).values()))
-    # two candidates for each way; the wrong way is ahead by a little, by much, not at all, and alone
+    # two candidates for each way; the wrong way is ahead by a little, by much, not at all, and
+    # alone
     positions = np.repeat(
         np.stack([wrong[one], wrong[one], right[one], right[one]])[None], 4, axis=0
     )

@@ -1,4 +1,6 @@
-"""The model file: what goes in comes out, equal models are equal bytes, and anything else is refused in a sentence."""
+"""The model file: what goes in comes out, equal models are equal bytes, and anything else is
+refused in a sentence.
+"""
 
 from __future__ import annotations
 

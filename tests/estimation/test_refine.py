@@ -1,4 +1,6 @@
-"""A pose taken into the picture: its slopes are true, it goes where the readings are, and it stays a pose."""
+"""A pose taken into the picture: its slopes are true, it goes where the readings are, and it stays
+a pose.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A finished pose settles under its back: what is seen along it, and what a linear map makes of that."""
+"""A finished pose settles under its back: what is seen along it, and what a linear map makes of
+that.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ THICK_MM, HALF_WIDTH_MM = 2.0, 2.0
 
 
 def look() -> np.ndarray:
-    """How the toy's maps are cut: an upright camera DISTANCE above the view's origin, the origin in the middle."""
+    """How the toy's maps are cut: an upright camera DISTANCE above the view's origin, the origin in
+    the middle.
+    """
     middle = (SIDE - 1) / 2.0
     return np.array(
         [FOCAL, FOCAL, middle, middle, 1, 0, 0, 0, -1, 0, 0, 0, -1, DISTANCE, 0, 0, STEP]
@@ -31,7 +35,9 @@ def look() -> np.ndarray:
 
 
 def fish(n: int, seed: int) -> Pose:
-    """Fish of 0.8 to 1.2 of the home size that hang near 20 mm of height, rise a little and bend a little."""
+    """Fish of 0.8 to 1.2 of the home size that hang near 20 mm of height, rise a little and bend a
+    little.
+    """
     rng = np.random.default_rng(seed)
     angles = np.zeros((n, FISH.n_joints, 3))
     angles[:, 1:-1, 2] = np.radians(rng.uniform(-4, 4, (n, 1)))

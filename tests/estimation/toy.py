@@ -1,4 +1,5 @@
-"""A toy world: the default mouse, bare, on a tilted floor before a small camera; every pose is known exactly.
+"""A toy world: the default mouse, bare, on a tilted floor before a small camera; every pose is
+known exactly.
 
 The product's own foreground cuts the height maps, so a toy set is what training sees, only smaller.
 """
@@ -47,7 +48,9 @@ class Toy:
 def toy_mice(
     n: int, seed: int, noise_mm: float | np.ndarray = 1.0, size: tuple[float, float] = (0.9, 1.1)
 ) -> Toy:
-    """Mice that look anywhere, bend a little and lift their noses a little; noise_mm of all readings, or (n,)."""
+    """Mice that look anywhere, bend a little and lift their noses a little; noise_mm of all
+    readings, or (n,).
+    """
     rng = np.random.default_rng(seed)
     skeleton = Skeleton.load("mouse")
     zero, scale = np.zeros(n), rng.uniform(*size, n)
@@ -119,8 +122,9 @@ def training_set(toy: Toy, method: Method) -> TrainingSet:
 
 
 def tiny(variant: str) -> Method:
-    """A variant with few and shallow trees; all else is as it is. 'seen' is the default as a hand has it: it starts
-    from proposals, its metric knows what is left unexplained, and the chosen pose is taken into the picture.
+    """A variant with few and shallow trees; all else is as it is. 'seen' is the default as a hand
+    has it: it starts from proposals, its metric knows what is left unexplained, and the chosen pose
+    is taken into the picture.
     """
     if variant == "seen":
         proposals = GrowthPlan(4, 12, 4, 60, 0.3, 0.15, 0.3, 0.63)

@@ -1,4 +1,6 @@
-"""One session that every format is written from; readers of other programs join where they are installed."""
+"""One session that every format is written from; readers of other programs join where they are
+installed.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ import pytest
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
-# movement alone brings 90 packages and half a gigabyte: `pip install -e '.[test,peers]'` collects these as well
+# movement alone brings 90 packages and half a gigabyte: `pip install -e '.[test,peers]'` collects
+# these as well
 collect_ignore = [] if find_spec("movement") and find_spec("sleap_io") else ["test_peers.py"]
 
 

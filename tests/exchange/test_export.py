@@ -1,4 +1,6 @@
-"""Each format holds the session's own numbers, times and actions, and bad wishes are told in a sentence."""
+"""Each format holds the session's own numbers, times and actions, and bad wishes are told in a
+sentence.
+"""
 
 from __future__ import annotations
 

@@ -33,7 +33,9 @@ _CELLS = st.one_of(
 
 
 def read(content: bytes, name: str) -> None:
-    """Everything that is done with a file of labels: it is read, and its words are put on frames."""
+    """Everything that is done with a file of labels: it is read, and its words are put on
+    frames.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(content)

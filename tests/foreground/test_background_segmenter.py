@@ -1,4 +1,6 @@
-"""The scene and the animal in it: backgrounds under animals that sit, floors that tilt, blobs of the right size."""
+"""The scene and the animal in it: backgrounds under animals that sit, floors that tilt, blobs of
+the right size.
+"""
 
 from __future__ import annotations
 

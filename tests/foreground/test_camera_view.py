@@ -1,4 +1,6 @@
-"""Animals of the camera view: heights along the optical axis, bodies with holes, backs that rise."""
+"""Animals of the camera view: heights along the optical axis, bodies with holes, backs that
+rise.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def scene(frame: str) -> Scene:
 
 
 def bar(rise: float = 0.0, turned: float = 0.3) -> np.ndarray:
-    """A frame with a bar of 60 x 8 mm that hangs HIGH above the floor, along a heading, its front higher by `rise`."""
+    """A frame with a bar of 60 x 8 mm that hangs HIGH above the floor, along a heading, its front
+    higher by `rise`.
+    """
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     z = FLOOR.distance_mm - HIGH
     x, y = (u - CAMERA.cx) / CAMERA.fx * z, -(v - CAMERA.cy) / CAMERA.fy * z
@@ -66,7 +70,9 @@ def test_what_hangs_together_with_the_animal_but_lies_far_behind_it_is_left_out(
 
 
 def under_a_beam(thing: float, columns: slice) -> tuple[np.ndarray, np.ndarray]:
-    """The bar with a beam of depth `thing` mm over some columns, and the same with the beam's readings missing."""
+    """The bar with a beam of depth `thing` mm over some columns, and the same with the beam's
+    readings missing.
+    """
     frame, unread = bar(), bar()
     frame[:, columns], unread[:, columns] = thing, 0.0
     return frame, unread
@@ -112,7 +118,7 @@ def test_an_animal_between_a_thing_before_it_and_specks_far_behind_it_is_told_ap
     np.testing.assert_array_equal(crops.moments, same.moments)
 
 
-def test_a_thing_elsewhere_that_hangs_together_with_specks_behind_it_does_not_take_the_animal_away():
+def test_a_thing_elsewhere_that_hangs_with_specks_behind_it_does_not_take_the_animal_away():
     known = replace(scene("camera"), area_mm2=480.0)
     alone = bar()
     frame = alone.copy()

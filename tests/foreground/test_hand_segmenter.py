@@ -1,4 +1,6 @@
-"""The hand that is held out: found in front of people and walls, cut from its arm, seen along the line of sight."""
+"""The hand that is held out: found in front of people and walls, cut from its arm, seen along the
+line of sight.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,9 @@ def test_the_hand_is_what_is_cut_out() -> None:
 def drawn_arm(
     wrist: tuple[int, int], elbow: tuple[int, int], hand_mm: float, body: bool
 ) -> np.ndarray:
-    """A picture (480, 640) mm: four fingers and a palm beyond the wrist, a forearm that ends at the elbow, a chest."""
+    """A picture (480, 640) mm: four fingers and a palm beyond the wrist, a forearm that ends at the
+    elbow, a chest.
+    """
     depth = np.zeros((480, 640), np.float32)
     if body:
         cv2.ellipse(depth, (320, 330), (150, 200), 0.0, 0.0, 360.0, hand_mm + 120.0, -1)
@@ -106,7 +110,9 @@ def test_it_is_the_hand_and_no_elbow_and_no_chest(
 
 
 def test_the_hand_is_found_at_a_size_that_is_off() -> None:
-    """The size of a person's hand is found later: what is cut meanwhile must be the hand as well."""
+    """The size of a person's hand is found later: what is cut meanwhile must be the hand as
+    well.
+    """
     session, depths = people()
     scene = scene_of(session.camera)
     true = session.spine_mm / HAND.length

@@ -1,4 +1,6 @@
-"""Forests: nodes hold what was put in, fast descents agree with the slow twin, growth learns and is repeatable."""
+"""Forests: nodes hold what was put in, fast descents agree with the slow twin, growth learns and is
+repeatable.
+"""
 
 from __future__ import annotations
 

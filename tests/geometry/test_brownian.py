@@ -1,4 +1,6 @@
-"""Brownian motion on SE(3): Eq. 6 at the steps, Eq. 7 between them, the stated covariance everywhere."""
+"""Brownian motion on SE(3): Eq. 6 at the steps, Eq. 7 between them, the stated covariance
+everywhere.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ def test_the_path_is_continuous() -> None:
 
 
 def test_the_motion_spreads_with_time_whatever_the_step() -> None:
-    """After one second the covariance is C, in 2 steps or in 20: that is what sqrt(delta) is for."""
+    """After one second the covariance is C, in 2 steps or in 20: that is what sqrt(delta)
+    is for.
+    """
     small = np.diag([1e-4, 1e-4, 1e-4, 1.0, 2.0, 3.0])  # hardly turning, so that the steps add up
     for n_steps in (2, 20):
         steps = brownian_steps(np.random.default_rng(8), small, n_steps, 800)

@@ -139,7 +139,9 @@ def test_one_transform_moves_a_batch_and_a_batch_moves_one_point() -> None:
 
 
 def test_a_twist_about_the_vertical_is_a_circle() -> None:
-    """A quarter turn to the left while walking ahead ends ahead and to the left by the circle's radius."""
+    """A quarter turn to the left while walking ahead ends ahead and to the left by the circle's
+    radius.
+    """
     quarter = SE3.exp([0, 0, np.pi / 2, 100.0, 0, 0])
     np.testing.assert_allclose(quarter.translation, [200 / np.pi, 200 / np.pi, 0], atol=1e-12)
     np.testing.assert_allclose(so3.log(quarter.rotation), [0, 0, np.pi / 2], atol=1e-15)

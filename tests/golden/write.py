@@ -45,7 +45,9 @@ CAMERA = Camera(71.6, 71.6, 39.5, 29.5, 80, 60, source="typical PrimeSense, an e
 
 
 def contents(session: Session) -> dict[str, Any]:
-    """Every table of a session in short: its rows, and of each column its type and its values added up."""
+    """Every table of a session in short: its rows, and of each column its type and its values added
+    up.
+    """
     found: dict[str, Any] = {}
     for name in TABLES:
         table = getattr(session, name) if name != "sessions" else session.table("sessions")
@@ -57,7 +59,9 @@ def contents(session: Session) -> dict[str, Any]:
 
 
 def summed(column: pd.Series[Any]) -> list[Any]:
-    """A column's kind, how many of its values are known, and their sum, or the different words among them."""
+    """A column's kind, how many of its values are known, and their sum, or the different words
+    among them.
+    """
     if pd.api.types.is_numeric_dtype(column):
         known = column[np.isfinite(column.astype(float))]
         return [str(column.dtype), len(known), float(known.sum())]

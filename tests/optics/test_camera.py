@@ -1,4 +1,6 @@
-"""The camera: project undoes unproject, nothing is seen behind the lens, and a bent lens bends as OpenCV says."""
+"""The camera: project undoes unproject, nothing is seen behind the lens, and a bent lens bends as
+OpenCV says.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ def test_the_axes_point_as_agreed() -> None:
 
 
 def test_a_hundred_pixels_are_as_long_as_the_focal_length_says() -> None:
-    """100 px from the centre at 673.1 mm with f = 365 px are 184.4 mm (BEHAVIOUR f2: MoSeq says 162)."""
+    """100 px from the centre at 673.1 mm with f = 365 px are 184.4 mm (BEHAVIOUR f2: MoSeq says
+    162).
+    """
     x = KINECT_V2.unproject([KINECT_V2.cx + 100, KINECT_V2.cy], 673.1)[0]
     assert round(float(x), 1) == 184.4
 

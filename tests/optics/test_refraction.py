@@ -39,7 +39,9 @@ def test_a_point_under_water_is_put_back_where_it_is(
 
 
 def test_the_angles_obey_snell() -> None:
-    """The oracle itself: sines in air and in water are as n to 1, whatever was solved to get there."""
+    """The oracle itself: sines in air and in water are as n to 1, whatever was solved to
+    get there.
+    """
     water = Water(400.0, 1.333, 0.1, -0.05)
     points = points_under(water)
     ray, in_air, _ = ray_to(points, np.zeros(3), water.normal, 400.0, 1.333)
@@ -59,7 +61,9 @@ def test_straight_down_the_apparent_depth_is_the_true_one_over_n(ranging: str) -
 
 
 def test_light_takes_longer_under_water() -> None:
-    """A time-of-flight camera sees the bottom farther away than it is, where the others see it nearer."""
+    """A time-of-flight camera sees the bottom farther away than it is, where the others see it
+    nearer.
+    """
     water = Water(500.0, 1.333, ranging="time_of_flight")
     assert water.true_points([0.0, 0.0], 500.0 + 200.0 * 1.333) == pytest.approx(
         [0.0, 0.0, 700.0], abs=1e-9
@@ -67,7 +71,9 @@ def test_light_takes_longer_under_water() -> None:
 
 
 def test_two_eyes_that_are_not_infinitely_near_see_nearly_the_same() -> None:
-    """A PrimeSense camera's views are 75 mm apart: half a millimetre at most, over the whole field."""
+    """A PrimeSense camera's views are 75 mm apart: half a millimetre at most, over the
+    whole field.
+    """
     water = Water(400.0, ranging="structured_light")
     points = points_under(water)
     rays, apparent = seen(points, water.normal, 400.0, 1.333, "structured_light", baseline_mm=75.0)
@@ -95,7 +101,9 @@ def test_air_under_the_surface_changes_nothing(ranging: str) -> None:
 def test_the_camera_without_water_sees_everything_in_the_same_pixel(
     tilt: tuple[float, float],
 ) -> None:
-    """So neither is detail lost nor another side of the animal shown; off the perpendicular a point moves inwards."""
+    """So neither is detail lost nor another side of the animal shown; off the perpendicular a point
+    moves inwards.
+    """
     water = Water(500.0, 1.333, *tilt)
     ideal = water.without(PRIMESENSE)
     points = points_under(water)

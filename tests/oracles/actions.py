@@ -10,7 +10,9 @@ import numpy as np
 def every_path(
     scores: np.ndarray, first: np.ndarray, stay: np.ndarray, leave: np.ndarray, switch: np.ndarray
 ):
-    """All (log weight, words) of state sequences; arguments as in `liex_lab.actions._semi_markov_kernels`."""
+    """All (log weight, words) of state sequences; arguments as in
+    `liex_lab.actions._semi_markov_kernels`.
+    """
     total, word = first[-1], np.repeat(np.arange(len(first) - 1), np.diff(first))
     last = first[1:] - 1
     for path in itertools.product(range(total), repeat=len(scores)):

@@ -1,7 +1,9 @@
-"""Lie-X Algorithm 1 as the paper's page reads: one candidate, one joint, one round and one tree after the other.
+"""Lie-X Algorithm 1 as the paper's page reads: one candidate, one joint, one round and one tree
+after the other.
 
-Rigid motions are 4x4 matrices and their exponentials SciPy's; points are projected through the camera, and an offset's
-way over the map is a finite difference of that. Only the walk down a tree is shared with `oracles.forest`.
+Rigid motions are 4x4 matrices and their exponentials SciPy's; points are projected through the
+camera, and an offset's way over the map is a finite difference of that. Only the walk down a tree
+is shared with `oracles.forest`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Candidate:
-    """One pose under way: a matrix (4, 4) for each joint, in the view frame, and the scale of its bones."""
+    """One pose under way: a matrix (4, 4) for each joint, in the view frame, and the scale of its
+    bones.
+    """
 
     joints: list[Array]
     scale: float
@@ -32,7 +36,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Picture:
-    """One height map (S, S), how it was cut (17,), its moments (9,), and the animal's size over home."""
+    """One height map (S, S), how it was cut (17,), its moments (9,), and the animal's size over
+    home.
+    """
 
     heights: NDArray[np.int16]
     look: Array
@@ -134,7 +140,9 @@ def start(model: Model, moments: Array, number: int, drawn: Array, size: float) 
 
 
 def seen_start(model: Model, picture: Picture, number: int, size: float) -> Candidate:
-    """Candidate `number` where the method starts from proposals: what one tree says, the axis taken one way."""
+    """Candidate `number` where the method starts from proposals: what one tree says, the axis taken
+    one way.
+    """
     method, forest, (tree, way) = model.method, model.cascade.proposals, divmod(number, 2)
     assert forest is not None
     _, area, volume, x, y, axis, *_ = picture.moments

@@ -1,4 +1,6 @@
-"""The ends of a walked surface by the definition: where the walk cannot go on without first going back by so much."""
+"""The ends of a walked surface by the definition: where the walk cannot go on without first going
+back by so much.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from liex_lab.foreground._blob_kernels import BLOCK
 def ends_by_hand(
     order: np.ndarray, hops: np.ndarray, blocks: np.ndarray, focal: float, least_mm: float
 ) -> set[tuple[int, int]]:
-    """Blocks (row, column) from which every way to a block later in the order goes back by at least `least_mm`.
+    """Blocks (row, column) from which every way to a block later in the order goes back by at least
+    `least_mm`.
 
     order (n, 2): blocks in the order of their distance; hops (n,) their distances.
     """
@@ -27,8 +30,8 @@ def ends_by_hand(
 
 
 def _highest_pass(rank: dict[tuple[int, int], int], hops: np.ndarray, start: int) -> int | None:
-    """On the way from block `start` to any block later in the order: the distance of the lowest block that has to be
-    crossed, on the best way; None where there is no such block.
+    """On the way from block `start` to any block later in the order: the distance of the lowest
+    block that has to be crossed, on the best way; None where there is no such block.
     """
     blocks = list(rank)
     for lowest in range(

@@ -1,4 +1,6 @@
-"""How well a body of balls explains a height map, as one would write it down: ball by ball and pixel by pixel."""
+"""How well a body of balls explains a height map, as one would write it down: ball by ball and
+pixel by pixel.
+"""
 
 from __future__ import annotations
 

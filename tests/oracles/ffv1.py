@@ -1,4 +1,6 @@
-"""The check sum of FFV1 slices, one bit at a time: polynomial 0x04C11DB7, high bit first, from zero."""
+"""The check sum of FFV1 slices, one bit at a time: polynomial 0x04C11DB7, high bit first, from
+zero.
+"""
 
 from __future__ import annotations
 

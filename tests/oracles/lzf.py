@@ -4,7 +4,9 @@ from __future__ import annotations
 
 
 def unpack_lzf(packed: bytes) -> bytes:
-    """The bytes that were packed; IndexError where the data are cut, ValueError where they point before the start."""
+    """The bytes that were packed; IndexError where the data are cut, ValueError where they point
+    before the start.
+    """
     out, at = bytearray(), 0
     while at < len(packed):
         control = packed[at]

@@ -33,6 +33,8 @@ def chain(twists: ArrayLike) -> list[Array]:
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> float:
-    """The angle between two rotations (3, 3), rad, from the chord: exact where the trace's arc cosine is not."""
+    """The angle between two rotations (3, 3), rad, from the chord: exact where the trace's arc
+    cosine is not.
+    """
     chord = np.linalg.norm(np.asarray(first) - np.asarray(second)) / np.sqrt(8.0)
     return float(2.0 * np.arcsin(min(chord, 1.0)))

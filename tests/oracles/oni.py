@@ -1,4 +1,6 @@
-"""The 16z code of .oni files as OpenNI's own decoder reads it: slow, and what the fast code is tested against."""
+"""The 16z code of .oni files as OpenNI's own decoder reads it: slow, and what the fast code is
+tested against.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A square plate above a flat floor, as a real camera reports it: through its bent lens, and through water."""
+"""A square plate above a flat floor, as a real camera reports it: through its bent lens, and
+through water.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Plate:
-    """A floor at floor_mm straight before the camera, and above it by high_mm a thin square, seen from above only.
+    """A floor at floor_mm straight before the camera, and above it by high_mm a thin square, seen
+    from above only.
 
     side_mm of the square; centre (x, y) mm in the camera frame; turn rad.
     """
@@ -39,7 +42,9 @@ class Plate:
 
 @lru_cache(maxsize=8)
 def plane(camera: Camera, water: Water | None, z: float) -> tuple[Array, Array]:
-    """The plane at depth z mm: the place (x, y) mm (H, W, 2) under every pixel, and the depth (H, W) mm reported."""
+    """The plane at depth z mm: the place (x, y) mm (H, W, 2) under every pixel, and the depth (H,
+    W) mm reported.
+    """
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
     ray = camera.unproject(np.stack([u, v], axis=-1), 1.0)
     if water is None:

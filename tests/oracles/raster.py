@@ -1,4 +1,6 @@
-"""A slow twin of the renderer: for every pixel the ray through its centre, against every triangle."""
+"""A slow twin of the renderer: for every pixel the ray through its centre, against every
+triangle.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ def ray_cast_depth(
     camera: Camera,
     window: tuple[int, int, int, int],
 ) -> NDArray[np.float64]:
-    """Depth (H, W) mm of a mesh in the camera frame by Moeller and Trumbore's test; 0 where no triangle is hit."""
+    """Depth (H, W) mm of a mesh in the camera frame by Moeller and Trumbore's test; 0 where no
+    triangle is hit.
+    """
     u0, v0, width, height = window
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     edge_b, edge_c = b - a, c - a

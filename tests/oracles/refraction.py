@@ -1,4 +1,6 @@
-"""Seeing through water the slow way: from a known point back to the lens, by bisection on Snell's law alone."""
+"""Seeing through water the slow way: from a known point back to the lens, by bisection on Snell's
+law alone.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,8 @@ Array = NDArray[np.float64]
 def ray_to(
     point: Array, lens: Array, normal: Array, distance_mm: float, n: float
 ) -> tuple[Array, Array, Array]:
-    """Unit ray (..., 3) with which light from `point` (..., 3) under the plane normal . p = distance_mm reaches
-    `lens` (3,), and the lengths mm (...) of its way in air and in water.
+    """Unit ray (..., 3) with which light from `point` (..., 3) under the plane normal . p =
+    distance_mm reaches `lens` (3,), and the lengths mm (...) of its way in air and in water.
     """
     height = distance_mm - lens @ normal
     offset = point - lens
@@ -35,10 +37,12 @@ def ray_to(
 def seen(
     point: Array, normal: Array, height_mm: float, n: float, ranging: str, baseline_mm: float = 1e-3
 ) -> tuple[Array, Array]:
-    """What a camera at the origin reports of points (..., 3) under water: the ray's x and y (..., 2), and the depth.
+    """What a camera at the origin reports of points (..., 3) under water: the ray's x and y (...,
+    2), and the depth.
 
-    Two views `baseline_mm` apart give a disparity, and with it the depth; a light field is the mean of the disparities
-    along both picture axes. The displacement is centred on the lens, whose picture the depth belongs to.
+    Two views `baseline_mm` apart give a disparity, and with it the depth; a light field is the mean
+    of the disparities along both picture axes. The displacement is centred on the lens, whose
+    picture the depth belongs to.
     """
     ray, in_air, in_water = ray_to(point, np.zeros(3), normal, height_mm, n)
     xy = ray[..., :2] / ray[..., 2:]

@@ -1,4 +1,6 @@
-"""RVL as a reader of its description would write it: slow, and what the fast code is tested against."""
+"""RVL as a reader of its description would write it: slow, and what the fast code is tested
+against.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A run that takes no time: it writes what the study looks at, or breaks in the way the recording's name asks for."""
+"""A run that takes no time: it writes what the study looks at, or breaks in the way the recording's
+name asks for.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def pretended_run(
 
 
 def shared_task(n: int) -> list[tuple[int, int]]:
-    """A session's task that shares its stretches: each one's number, and the process that did it."""
+    """A session's task that shares its stretches: each one's number, and the process that
+    did it.
+    """
     from liex_lab.pipelines.study.dask_cluster import Workers
 
     return list(Workers().each(stretch, range(n)))

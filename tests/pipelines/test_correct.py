@@ -1,4 +1,6 @@
-"""What people correct in a session is kept beside it, every reader sees it, and it can be taken back."""
+"""What people correct in a session is kept beside it, every reader sees it, and it can be taken
+back.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ from liex_lab.sessions import Session
 from liex_lab.sessions import correcting as ask
 from liex_lab.sessions.corrections import Correction
 from liex_lab.sessions.tracks import track_of
-from tests.golden.test_golden import golden  # noqa: F401  (a fixture)
+from tests.golden.test_golden import golden  # noqa: F401
 from tests.sessions.walking_mouse import WalkingMouse, write
 
 MOUSE = WalkingMouse(np.arange(180) / 30.0, rear_s=(2.0, 3.5), lost=(20, 21))

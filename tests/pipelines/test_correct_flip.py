@@ -1,4 +1,6 @@
-"""A human says where head and tail are exchanged: everything in the session follows, and nothing is lost."""
+"""A human says where head and tail are exchanged: everything in the session follows, and nothing is
+lost.
+"""
 
 from __future__ import annotations
 

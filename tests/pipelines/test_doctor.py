@@ -275,7 +275,9 @@ def test_water_is_told_and_undone(tmp_path: Path) -> None:
 
 
 def test_a_camera_tilted_against_the_water_is_told_how_to_say_so(tmp_path: Path) -> None:
-    """A level tank under a tilted camera: the floor comes out tilted against the surface until the plan says it."""
+    """A level tank under a tilted camera: the floor comes out tilted against the surface until the
+    plan says it.
+    """
     water = Water(400.0, 1.333, 0.1, -0.06)
     n = water.normal
     v, u = np.mgrid[0:120, 0:160].astype(float)

@@ -1,4 +1,6 @@
-"""The bundled sample: what its card says, what a camera would have written, and the same whenever it is made."""
+"""The bundled sample: what its card says, what a camera would have written, and the same whenever
+it is made.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`run_session`: a folder of pictures in, a session out, whose every frame is accounted for and near the truth."""
+"""`run_session`: a folder of pictures in, a session out, whose every frame is accounted for and
+near the truth.
+"""
 
 from __future__ import annotations
 
@@ -226,7 +228,9 @@ def test_a_recording_without_an_animal_is_refused_and_leaves_nothing(mouse, tmp_
 
 
 def test_zones_are_drawn_in_a_file_that_the_plan_names(folder, session, tmp_path):
-    """Left and right of the arena's middle: every frame is in one of them, and together they take all the time."""
+    """Left and right of the arena's middle: every frame is in one of them, and together they take
+    all the time.
+    """
     drawn = tmp_path / "zones.toml"
     drawn.write_text("""
         [[zones]]

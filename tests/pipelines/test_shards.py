@@ -1,4 +1,6 @@
-"""A recording looked at in stretches, side by side: the tables are those of one process, also after an accident."""
+"""A recording looked at in stretches, side by side: the tables are those of one process, also after
+an accident.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ LENGTH = 8  # frames of a stretch here
 
 
 class InTurn:
-    """A crew of this process alone, which takes the last stretch first and may meet with an accident."""
+    """A crew of this process alone, which takes the last stretch first and may meet with an
+    accident.
+    """
 
     def __init__(self, accident_after: int = 1000) -> None:
         self.left, self.n_done = accident_after, 0
@@ -54,8 +58,11 @@ def run(folder: Path, out: Path, **how: Any) -> Path:  # noqa: F811
 
 @pytest.mark.parametrize("n", [2, 4])
 def test_tables_do_not_depend_on_the_number_of_workers(
-    n: int, session: Session, folder: Path, tmp_path: Path
-) -> None:  # noqa: F811
+    n: int,
+    session: Session,  # noqa: F811
+    folder: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
     shared = run(folder, tmp_path, crew=Processes(n))
     assert tables_of(shared) == tables_of(session.path)
     assert depth_messages(shared) == depth_messages(session.path)
@@ -69,9 +76,9 @@ def test_tables_do_not_depend_on_the_number_of_workers(
 @pytest.mark.parametrize("then", ["with a crew", "alone"])
 def test_after_an_accident_what_is_whole_is_not_done_again(
     then: str,
-    session: Session,
-    folder: Path,
-    tmp_path: Path,  # noqa: F811
+    session: Session,  # noqa: F811
+    folder: Path,  # noqa: F811
+    tmp_path: Path,
 ) -> None:
     with pytest.raises(SessionError, match="without a word"):
         run(folder, tmp_path, crew=InTurn(accident_after=3))
@@ -86,10 +93,10 @@ def test_after_an_accident_what_is_whole_is_not_done_again(
 
 
 def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
-    session: Session,
-    folder: Path,
+    session: Session,  # noqa: F811
+    folder: Path,  # noqa: F811
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frame = Recording.frame
 
@@ -112,10 +119,10 @@ def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
 
 
 def test_a_short_recording_and_one_that_is_open_are_looked_at_by_one(
-    session: Session,
-    folder: Path,
+    session: Session,  # noqa: F811
+    folder: Path,  # noqa: F811
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(job, "LENGTH", 1000)
     crew = InTurn()
@@ -130,8 +137,9 @@ def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:
 
 
 def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(
-    mouse: Any, tmp_path: Path
-) -> None:  # noqa: F811
+    mouse: Any,  # noqa: F811
+    tmp_path: Path,
+) -> None:
     plan = Plan.load("mouse")
     with build_recording(mouse, plan) as opened:
         tracker = build_tracker(opened, plan)

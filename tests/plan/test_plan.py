@@ -1,4 +1,6 @@
-"""A plan survives its own file, and a mistake in one is told in a sentence that names the nearest right thing."""
+"""A plan survives its own file, and a mistake in one is told in a sentence that names the nearest
+right thing.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def test_a_plan_survives_its_own_file(plan: Plan) -> None:
 
 @pytest.mark.parametrize("name", known_plans())
 def test_a_bundled_plan_is_the_file_that_the_program_would_write(name: str) -> None:
-    """So every setting stands in it, with its comment. After adding one: liex info --plan NAME > the file."""
+    """So every setting stands in it, with its comment. After adding one: liex info --plan NAME >
+    the file.
+    """
     assert (plans_folder() / f"{name}.toml").read_text(encoding="utf-8") == Plan.load(
         name
     ).to_toml()

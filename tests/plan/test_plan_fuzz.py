@@ -1,4 +1,6 @@
-"""Whatever a plan says, it is read or refused in one sentence; and what was found so is kept here."""
+"""Whatever a plan says, it is read or refused in one sentence; and what was found so is
+kept here.
+"""
 
 from __future__ import annotations
 

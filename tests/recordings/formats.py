@@ -1,7 +1,8 @@
-"""Every format that is read, as the common laws need it: one entry is all that a new reader adds to be held to them.
+"""Every format that is read, as the common laws need it: one entry is all that a new reader adds to
+be held to them.
 
-An entry writes given frames and says which of them must come out whole when a file is damaged. The laws are in
-test_laws.py, the damage in test_damage.py.
+An entry writes given frames and says which of them must come out whole when a file is damaged. The
+laws are in test_laws.py, the damage in test_damage.py.
 """
 
 from __future__ import annotations
@@ -56,11 +57,12 @@ Survivors = Callable[[Path, int], Sequence[int] | None]
 class Format:
     """A format.
 
-    write: put frames (n, H, W) uint16 mm of the camera `SMALL` and even times into an empty folder, and return what to
-    open. survivors: given a file and its first damaged byte, the frames that must still come out exactly; None where
-    the recording may be refused. atol_mm: how far depth may be from what was written. streams: its file is large, and
-    so must never be read at once. n_damaged: variants of it that are tried. promise: change the header to one that
-    promises 2^31 frames, where it counts them.
+    write: put frames (n, H, W) uint16 mm of the camera `SMALL` and even times into an empty folder,
+    and return what to open. survivors: given a file and its first damaged byte, the frames that
+    must still come out exactly; None where the recording may be refused. atol_mm: how far depth may
+    be from what was written. streams: its file is large, and so must never be read at once.
+    n_damaged: variants of it that are tried. promise: change the header to one that promises 2^31
+    frames, where it counts them.
     """
 
     name: str
@@ -73,7 +75,9 @@ class Format:
 
 
 def others(suffix: str) -> Survivors:
-    """Pictures in files of their own: damage to one costs none of the others, and may cost all if it is the camera."""
+    """Pictures in files of their own: damage to one costs none of the others, and may cost all if
+    it is the camera.
+    """
 
     def survivors(path: Path, at: int) -> Sequence[int] | None:
         if not path.name.endswith(suffix):
@@ -85,7 +89,9 @@ def others(suffix: str) -> Survivors:
 
 
 def before(ends: Callable[[Path], Sequence[int]], suffix: str) -> Survivors:
-    """Pictures one after the other in one file: those that end before the damage come out. ends: where each does."""
+    """Pictures one after the other in one file: those that end before the damage come out. ends:
+    where each does.
+    """
 
     def survivors(path: Path, at: int) -> Sequence[int] | None:
         if not path.name.endswith(suffix):

@@ -33,7 +33,9 @@ def cropping(x: int, y: int, width: int, height: int, on: int = 1) -> bytes:
 
 
 class OniBuilder:
-    """The bytes of a file, record after record. old: with 32-bit positions, as before version 1.0.1.0."""
+    """The bytes of a file, record after record. old: with 32-bit positions, as before version
+    1.0.1.0.
+    """
 
     def __init__(self, old: bool = False, version: tuple[int, int, int, int] | None = None) -> None:
         version = version or ((1, 0, 0, 5) if old else (1, 0, 1, 0))
@@ -63,7 +65,9 @@ class OniBuilder:
         record: int = 0x0D,
         table: int = 0,
     ) -> int:
-        """Add a node, in the form of version 1.0.0.4 (record 0x02), 1.0.0.5 (0x0C) or of today; where it begins."""
+        """Add a node, in the form of version 1.0.0.4 (record 0x02), 1.0.0.5 (0x0C) or of today;
+        where it begins.
+        """
         fields = text(name) + struct.pack("<i4s", kind, codec.encode())
         if record != 0x02:
             fields += struct.pack("<IQQ", n_frames, 0, 2**64 - 1)
@@ -153,7 +157,9 @@ def depth_builder(
     times_us: Sequence[int] | None = None,
     crop: bytes = bytes(12),
 ) -> OniBuilder:
-    """A file with one depth node, all but its last record. record: form of the node's own one; table: of seeking."""
+    """A file with one depth node, all but its last record. record: form of the node's own one;
+    table: of seeking.
+    """
     where = 0
     for _ in range(2 if table else 1):  # where the table is, is known only once it is there
         made = OniBuilder(old)
@@ -168,7 +174,9 @@ def depth_builder(
 
 
 def plain_16z(numbers: NDArray[np.uint16]) -> bytes:
-    """A stream without runs, in the plainest way the code allows: half-filled bytes and whole numbers."""
+    """A stream without runs, in the plainest way the code allows: half-filled bytes and whole
+    numbers.
+    """
     out = struct.pack("<H", numbers[0])
     for before, number in zip(numbers[:-1].tolist(), numbers[1:].tolist(), strict=True):
         step = before - number

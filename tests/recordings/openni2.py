@@ -1,7 +1,9 @@
-"""libOpenNI2 as a witness, in a process of its own: its Dummy device and its player crash when they are taken down.
+"""libOpenNI2 as a witness, in a process of its own: its Dummy device and its player crash when they
+are taken down.
 
-`play` gives what its player reads from an .oni file; `record` lets its recorder write one, of its Dummy device or of
-what its player plays. Run as a script, this module does either and leaves without taking anything down.
+`play` gives what its player reads from an .oni file; `record` lets its recorder write one, of its
+Dummy device or of what its player plays. Run as a script, this module does either and leaves
+without taking anything down.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ ONE_FRAME_A_READ = -1.0
 
 
 class Witnessed(NamedTuple):
-    """Frames (n, H, W) as libOpenNI2 handed them out, their times (n,) in µs, and its angles of view, rad."""
+    """Frames (n, H, W) as libOpenNI2 handed them out, their times (n,) in µs, and its angles of
+    view, rad.
+    """
 
     frames: NDArray[np.uint16]
     times_us: NDArray[np.uint64]

@@ -1,4 +1,6 @@
-"""Folders of depth pictures of the rarer kinds. Every writer returns the folder, with camera.toml and stamps in it."""
+"""Folders of depth pictures of the rarer kinds. Every writer returns the folder, with camera.toml
+and stamps in it.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def write_folder(
     write: Callable[[Path, NDArray[Any]], object],
     **camera: object,
 ) -> Path:
-    """frame_0, frame_1, ... with `suffix`, each by `write`; `camera` are further keys of camera.toml."""
+    """frame_0, frame_1, ... with `suffix`, each by `write`; `camera` are further keys of
+    camera.toml.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for k, frame in enumerate(frames):
         write(folder / f"frame_{k}{suffix}", frame)
@@ -54,7 +58,9 @@ def write_pclzf(path: Path, frame: NDArray[Any], kind: bytes = b"depth16") -> No
 
 
 def pack_lzf(data: bytes) -> bytes:
-    """LZF with literal runs, and short and long copies (overlapping ones too) where a run of bytes repeats."""
+    """LZF with literal runs, and short and long copies (overlapping ones too) where a run of bytes
+    repeats.
+    """
     out, literal, at = bytearray(), bytearray(), 0
     last: dict[bytes, int] = {}
 
@@ -89,7 +95,9 @@ def pack_lzf(data: bytes) -> bytes:
 
 
 def write_nyu(folder: Path, frames: Frames) -> Path:
-    """depth_1_0000001.png, ...: the high byte in green, the low one in blue; no times, as in the data set."""
+    """depth_1_0000001.png, ...: the high byte in green, the low one in blue; no times, as in the
+    data set.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for k, frame in enumerate(frames, start=1):
         colour = np.stack([frame & 255, frame >> 8, np.zeros_like(frame)], axis=-1).astype(np.uint8)
@@ -107,7 +115,9 @@ def write_raytrix(
     more: str = "",
     **camera: object,
 ) -> Path:
-    """A folder of exports with a raytrix.toml; `frames` are stored numbers, `more` further lines of raytrix.toml."""
+    """A folder of exports with a raytrix.toml; `frames` are stored numbers, `more` further lines of
+    raytrix.toml.
+    """
     write_folder(folder, frames, suffix, write, **camera)
     (folder / "raytrix.toml").write_text(f'profile = "{profile}"\n{more}', encoding="utf-8")
     return folder

@@ -1,4 +1,6 @@
-"""Depth in ROS's messages, as MCAP, .bag and .db3: laid out by `rosbags`, which knows nothing of our readers."""
+"""Depth in ROS's messages, as MCAP, .bag and .db3: laid out by `rosbags`, which knows nothing of
+our readers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Damaged files of every format: frames or one sentence, in little time and memory, and what lay before the damage."""
+"""Damaged files of every format: frames or one sentence, in little time and memory, and what lay
+before the damage.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,9 @@ def files_of(path: Path) -> list[Path]:
 
 
 def damage(rng: np.random.Generator, path: Path) -> Damage:
-    """Change one file of a recording: cut it, turn bits, blank a stretch, make a number absurd, add or drop bytes."""
+    """Change one file of a recording: cut it, turn bits, blank a stretch, make a number absurd, add
+    or drop bytes.
+    """
     files = files_of(path)
     sizes = np.array([file.stat().st_size for file in files], float)
     # mostly what holds the depth, sometimes what lies beside it
@@ -151,7 +155,8 @@ def test_damaged_variants_give_frames_or_a_sentence(form: Format, tmp_path: Path
                 n_opened += check(form, whole, opened, done)
         except BaseException as error:
             failed.append(
-                f"seed {seed}, {done.kind} at {done.at} of {done.file.name}: {type(error).__name__}: {error}"
+                f"seed {seed}, {done.kind} at {done.at} of {done.file.name}: "
+                f"{type(error).__name__}: {error}"
             )
             if isinstance(error, KeyboardInterrupt):
                 raise

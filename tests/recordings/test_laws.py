@@ -1,4 +1,6 @@
-"""What every recording promises, whatever file it comes from: the same laws over every format of formats.py."""
+"""What every recording promises, whatever file it comes from: the same laws over every format of
+formats.py.
+"""
 
 from __future__ import annotations
 
@@ -137,7 +139,9 @@ def test_a_recording_that_nobody_holds_lets_go_of_its_files(
 
 
 class Bounded(io.BufferedReader):
-    """A file that refuses to be read at once: a large one never in one piece, nor in pieces of many frames."""
+    """A file that refuses to be read at once: a large one never in one piece, nor in pieces of many
+    frames.
+    """
 
     def read(self, size: int | None = -1, /) -> bytes:
         self._check(size)
@@ -164,7 +168,9 @@ class Bounded(io.BufferedReader):
 
 @pytest.fixture(scope="module")
 def many(form: Format) -> np.ndarray:
-    """Enough frames for a file that must not be read at once; fewer where every picture has a file of its own."""
+    """Enough frames for a file that must not be read at once; fewer where every picture has a file
+    of its own.
+    """
     return depth_frames(600 if form.streams else 40)
 
 

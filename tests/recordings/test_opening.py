@@ -156,9 +156,10 @@ def test_the_package_hands_out_the_same_door() -> None:
 def test_a_format_brings_only_its_own_libraries(tmp_path: Path) -> None:
     folder = write_moseq_folder(tmp_path / "s", depth_frames(1, 512, 424))
     code = (
-        "import sys; from liex_lab.recordings import open_recording\n"
-        f"with open_recording({str(folder)!r}) as recording: recording.frame(0)\n"
-        "print({'av', 'cv2', 'tifffile', 'mcap', 'foxglove', 'numba', 'pandas', 'google', 'scipy'} & set(sys.modules))"
+        "import sys; from liex_lab.recordings import open_recording\nwith "
+        f"open_recording({str(folder)!r}) as recording: recording.frame(0)\nprint({{'av', 'cv2', "
+        "'tifffile', 'mcap', 'foxglove', 'numba', 'pandas', 'google', 'scipy'} & "
+        "set(sys.modules))"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "set()"

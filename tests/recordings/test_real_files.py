@@ -1,4 +1,6 @@
-"""Genuine files of other people's cameras, against values that independent readers found in them."""
+"""Genuine files of other people's cameras, against values that independent readers found in
+them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What a recording is by itself: frames, slices, times, digests. What every format promises is in test_laws.py."""
+"""What a recording is by itself: frames, slices, times, digests. What every format promises is in
+test_laws.py.
+"""
 
 from __future__ import annotations
 

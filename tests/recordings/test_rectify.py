@@ -1,4 +1,6 @@
-"""Rectified on reading: a bent lens and a water surface are gone, and everything else about the recording stays."""
+"""Rectified on reading: a bent lens and a water surface are gone, and everything else about the
+recording stays.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def recording(camera: Camera = CAMERA) -> Recording:
 
 
 def carried_by_hand(depth: np.ndarray, camera: Camera, water: Water) -> np.ndarray:
-    """The loop a reader would write, without the filling of holes: nearest point to a pixel, 0 for none."""
+    """The loop a reader would write, without the filling of holes: nearest point to a pixel, 0 for
+    none.
+    """
     ideal = ideal_camera(camera, water)
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     points = (

@@ -1,4 +1,6 @@
-"""Depth videos as MoSeq's and Azure's programs leave them. Every writer returns the path it wrote."""
+"""Depth videos as MoSeq's and Azure's programs leave them. Every writer returns the path it
+wrote.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def write_avi(
 def write_video_session(
     folder: Path, frames: Frames, video: str = "depth.avi", **how: object
 ) -> Path:
-    """A MoSeq session whose depth is a video: depth.avi (FFV1) or depth.mkv (raw), stamps, metadata, camera.toml."""
+    """A MoSeq session whose depth is a video: depth.avi (FFV1) or depth.mkv (raw), stamps,
+    metadata, camera.toml.
+    """
     write_moseq_folder(folder, frames)
     (folder / "depth.dat").unlink()
     write_camera(folder)
@@ -76,10 +80,12 @@ def write_mkv(
     live: bool = False,
     groups: bool = False,
 ) -> Path:
-    """Matroska as Azure's recorder writes it: 16-bit big endian pictures without compression, tagged `b16g`.
+    """Matroska as Azure's recorder writes it: 16-bit big endian pictures without compression,
+    tagged `b16g`.
 
-    The tracks other than DEPTH hold half its values. live: segment and clusters of open size, as after a crash; groups:
-    pictures in block groups instead of simple blocks; date_ns: since 2001-01-01.
+    The tracks other than DEPTH hold half its values. live: segment and clusters of open size, as
+    after a crash; groups: pictures in block groups instead of simple blocks; date_ns: since
+    2001-01-01.
     """
     times = even_ms(len(frames)) if times_ms is None else times_ms
     height, width = frames.shape[1:]

@@ -1,4 +1,6 @@
-"""Recordings on disk, as cameras and other programs write them. Every writer returns the path to open."""
+"""Recordings on disk, as cameras and other programs write them. Every writer returns the path to
+open.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ START_NS = 1_760_000_000_123_456_789  # October 2025: stamps that a float64 of s
 def depth_frames(
     n: int, width: int = 64, height: int = 48, seed: int = 0, floor_mm: int = 700
 ) -> Frames:
-    """(n, H, W) mm: a flat floor, noise, unread pixels, and a lump 30 mm high that walks along the row."""
+    """(n, H, W) mm: a flat floor, noise, unread pixels, and a lump 30 mm high that walks along the
+    row.
+    """
     rng = np.random.default_rng(seed)
     frames = floor_mm + rng.integers(-1, 2, (n, height, width))
     for k in range(n):
@@ -77,7 +81,9 @@ def write_png_folder(
     times_ns: Sequence[int] | None = None,
     **more: object,
 ) -> Path:
-    """frame_0.png, frame_1.png, ... (so that sorting by letters would be wrong), camera.toml and timestamps.csv."""
+    """frame_0.png, frame_1.png, ... (so that sorting by letters would be wrong), camera.toml and
+    timestamps.csv.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for k, frame in enumerate(frames):
         assert cv2.imwrite(str(folder / f"frame_{k}.png"), frame)
@@ -126,7 +132,9 @@ def write_moseq_folder(
 
 
 def write_archive(folder: Path, archive: Path, order: Sequence[str] | None = None) -> Path:
-    """A folder's files as .tar.gz, without a folder inside; `order` names the members and their order."""
+    """A folder's files as .tar.gz, without a folder inside; `order` names the members and their
+    order.
+    """
     with tarfile.open(archive, "w:gz", compresslevel=1) as tar:
         for name in order or sorted(path.name for path in folder.iterdir()):
             content = (folder / name).read_bytes()
@@ -154,7 +162,8 @@ def write_mcap(
 ) -> Path:
     """Foxglove protobuf depth, and (unless camera is None) one CameraCalibration per depth topic.
 
-    encoding "png" writes CompressedImage; `padding` bytes follow each row; log times lag the stamps by `log_delay_ns`.
+    encoding "png" writes CompressedImage; `padding` bytes follow each row; log times lag the stamps
+    by `log_delay_ns`.
     """
     options = MCAPWriteOptions(
         compression=compression, chunk_size=chunk_size, use_chunks=use_chunks

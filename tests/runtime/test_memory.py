@@ -1,4 +1,6 @@
-"""Arrays on disk: they hold what arrays hold, take no memory once let go of, and a full disk is told beforehand."""
+"""Arrays on disk: they hold what arrays hold, take no memory once let go of, and a full disk is
+told beforehand.
+"""
 
 from __future__ import annotations
 

@@ -45,9 +45,7 @@ def test_what_goes_wrong_is_raised_after_the_items_before_it() -> None:
         next(coming)
 
 
-def test_something_is_made_while_a_block_runs_and_what_goes_wrong_is_raised_where_it_is_wanted() -> (
-    None
-):
+def test_something_is_made_while_a_block_runs_and_its_error_is_raised_where_it_is_wanted() -> None:
     asked, begun = threading.Event(), threading.Event()
 
     def make() -> int:

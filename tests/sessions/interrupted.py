@@ -1,4 +1,6 @@
-"""A session written by a process of its own, which may be killed at any moment and started again."""
+"""A session written by a process of its own, which may be killed at any moment and started
+again.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ _PRELOADED = [
 
 
 def write_session(place: str, pause_s: float = 0.0, every_s: float = 0.0) -> None:
-    """Write the session, or go on writing it; pause_s: after each chunk, for the work itself takes no time."""
+    """Write the session, or go on writing it; pause_s: after each chunk, for the work itself takes
+    no time.
+    """
     from liex_lab.sessions import checkpoint
 
     with pytest.MonkeyPatch.context() as patch:
@@ -51,7 +55,9 @@ def _write(place: str, pause_s: float) -> None:
 
 
 def start(place: Path, pause_s: float = 0.0, every_s: float = 0.0) -> BaseProcess:
-    """A process that writes the session. It is forked off a server that has everything imported, and no threads."""
+    """A process that writes the session. It is forked off a server that has everything imported,
+    and no threads.
+    """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     process = context.Process(target=write_session, args=(str(place), pause_s, every_s))

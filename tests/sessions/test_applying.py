@@ -1,4 +1,6 @@
-"""Edits of an ethogram do what painting its frames would do; joints that are placed take the others along."""
+"""Edits of an ethogram do what painting its frames would do; joints that are placed take the others
+along.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Killed at any moment, a session goes on where it was, and its tables are those of an undisturbed run."""
+"""Killed at any moment, a session goes on where it was, and its tables are those of an undisturbed
+run.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Whatever is in a session's folder, reading it gives an answer or one sentence, and never leaves the folder."""
+"""Whatever is in a session's folder, reading it gives an answer or one sentence, and never leaves
+the folder.
+"""
 
 from __future__ import annotations
 

@@ -86,7 +86,9 @@ def test_camera_and_arena_come_back_exactly(session):
 
 
 def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
-    """The mouse goes round a circle of 150 mm, 50 mm from the wall; a third of the zone's circle covers its way."""
+    """The mouse goes round a circle of 150 mm, 50 mm from the wall; a third of the zone's circle
+    covers its way.
+    """
     bowl = Arena("round", (0.0, 0.0), 200.0, seen_share=1.0, edge="wall")
     half = Zone("upper", polygon_mm=((-300.0, 0.0), (300.0, 0.0), (300.0, 300.0), (-300.0, 300.0)))
     mouse = WalkingMouse(steady(2 * np.pi * 150 / 200), lost=(7,))
@@ -318,7 +320,10 @@ mouse = WalkingMouse(steady(n / 30), camera=PRIMESENSE)
 track, base = mouse.track(), mouse.frame(0).depth
 with SessionWriter(sys.argv[1], mouse.provenance()) as writer:
     for start in range(0, n, 30):
-        frames = [DepthFrame(i, int(track.times_ns[i]), np.roll(base, 7 * i)) for i in range(start, start + 30)]
+        frames = [
+            DepthFrame(i, int(track.times_ns[i]), np.roll(base, 7 * i))
+            for i in range(start, start + 30)
+        ]
         writer.add(frames, part(track, start, start + 30))
     session = writer.close()
 print(session.metadata["peak_memory_mb"])

@@ -1,4 +1,6 @@
-"""A mouse whose every number is known: it walks on a circle at a constant speed and may rear once."""
+"""A mouse whose every number is known: it walks on a circle at a constant speed and may
+rear once.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ SD_ROOT = np.array(
 
 @dataclass(frozen=True)
 class WalkingMouse:
-    """times_s of the frames; the body's centre goes round a circle (counter-clockwise) at speed_mm_s.
+    """times_s of the frames; the body's centre goes round a circle (counter-clockwise) at
+    speed_mm_s.
 
     rear_s: from when to when the nose is held up; lost: rows without a pose.
     """
@@ -176,7 +179,9 @@ def forget(track: Track, rows: tuple[int, ...], flag: str = "not_found") -> Trac
 
 
 def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Session:
-    """A whole session of this mouse, behaviour included; `more` goes to `provenance`, but for Session.create's own."""
+    """A whole session of this mouse, behaviour included; `more` goes to `provenance`, but for
+    Session.create's own.
+    """
     from liex_lab import behaviour
 
     own = {name: more.pop(name) for name in ("overwrite", "blueprint", "report") if name in more}

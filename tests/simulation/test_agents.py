@@ -1,4 +1,6 @@
-"""Virtual animals act as the definitions say, stay where they can be, and are the same for a seed."""
+"""Virtual animals act as the definitions say, stay where they can be, and are the same for
+a seed.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def mouse() -> mouse_acts.MouseActor:
 
 
 def measured(fish: fish_acts.FishActor, word: str, n: int = 25) -> dict[str, np.ndarray]:
-    """Of n actions: length s, mean speed and climb in lengths (a second), net turn and largest bend in degrees."""
+    """Of n actions: length s, mean speed and climb in lengths (a second), net turn and largest bend
+    in degrees.
+    """
     rows = []
     for seed in range(n):
         motion = fish.cut(np.random.default_rng(seed), word)

@@ -1,4 +1,6 @@
-"""The fish: what real ones do it can do, too; it hangs anywhere in the water; its camera errs as a light field does."""
+"""The fish: what real ones do it can do, too; it hangs anywhere in the water; its camera errs as a
+light field does.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def pictures() -> TrainingWindows:
 
 
 def real_bends(reference_data: Path) -> np.ndarray:
-    """Bends (n, 19) rad at the inner joints of annotated fish, signed by the side of the fish's own plane."""
+    """Bends (n, 19) rad at the inner joints of annotated fish, signed by the side of the fish's own
+    plane.
+    """
     xyz = np.loadtxt(reference_data / "liex_tracks" / "fish_S1_frames_1_16.txt").reshape(-1, 21, 3)
     bones = np.diff(xyz, axis=1)
     bones /= np.linalg.norm(bones, axis=-1, keepdims=True)

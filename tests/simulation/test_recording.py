@@ -1,4 +1,6 @@
-"""Synthetic recordings: the truth is true, the same seed is the same picture, and the sensors err as sensors do."""
+"""Synthetic recordings: the truth is true, the same seed is the same picture, and the sensors err
+as sensors do.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,8 @@ def test_windows_hold_the_animal_and_their_truth_projects_into_them(
     uv = uv + windows.intrinsics[:, None, 2:] - windows.origin[:, None]
     assert (uv > 15).all()
     assert (uv < windows.depth.shape[1] - 15).all()
-    # where a joint of the trunk projects there is an animal above the floor, nearer than the joint, or a hole
+    # where a joint of the trunk projects there is an animal above the floor, nearer than the joint,
+    # or a hole
     near, total = 0, 0
     for i in range(len(windows)):
         c, r = np.round(uv[i, 1]).astype(int)

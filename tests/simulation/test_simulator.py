@@ -1,4 +1,6 @@
-"""Worlds: each animal's data through one interface; an animal of the user's own lies, hangs and moves as it can."""
+"""Worlds: each animal's data through one interface; an animal of the user's own lies, hangs and
+moves as it can.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The sequences on which tracking is measured: what happens in them happens, and the truth goes with it."""
+"""The sequences on which tracking is measured: what happens in them happens, and the truth goes
+with it.
+"""
 
 from __future__ import annotations
 

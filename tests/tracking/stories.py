@@ -46,7 +46,9 @@ def noisy(pose: Pose, rng: np.random.Generator, sd_mm: float = 1.2, sd_rad: floa
 
 
 def told(seconds: np.ndarray, pose: Pose, flipped: np.ndarray | None = None) -> Observations:
-    """Frames that say this, and with less conviction the same turned round; where `flipped` the other way about."""
+    """Frames that say this, and with less conviction the same turned round; where `flipped` the
+    other way about.
+    """
     seen = Observations.empty(MOUSE, np.round(1e9 * seconds).astype(np.int64))
     other = reversed_pose(MOUSE, pose)
     flipped = np.zeros(len(seconds), bool) if flipped is None else flipped

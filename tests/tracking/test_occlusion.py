@@ -24,7 +24,9 @@ DEEP, BEAM = 200.0, 100.0
 
 
 def drawn(turn: float, u: float = 0.0) -> tuple[Pose, np.ndarray]:
-    """A fish that swims straight, turned in the picture, its middle u px beside the picture's, and its picture."""
+    """A fish that swims straight, turned in the picture, its middle u px beside the picture's, and
+    its picture.
+    """
     rotation = so3.exp(np.array([[0.0, 0.0, turn]])) @ np.diag([1.0, -1.0, -1.0])
     pose = Pose(SE3(rotation, np.zeros((1, 3))), np.zeros((1, FISH.n_joints, 3)), np.ones(1))
     middle = pose.joints(FISH)[0][[0, FISH.tip]].mean(axis=0)
@@ -75,7 +77,9 @@ def off(pose: Pose, picture: np.ndarray, true: Pose = WHOLE) -> float:
 
 
 def under_a_beam(side: int, share: float) -> np.ndarray:
-    """The picture with a beam that hides about this share of the fish at its base (-1) or its tip (1)."""
+    """The picture with a beam that hides about this share of the fish at its base (-1) or its tip
+    (1).
+    """
     ends = CAMERA.project(WHOLE.joints(FISH)[0])[[0, FISH.tip], 0]
     edge = ends[1 if side > 0 else 0] + side * share * (ends[0] - ends[1])
     u, frame = np.arange(CAMERA.width), PICTURE.copy()

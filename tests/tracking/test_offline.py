@@ -1,4 +1,6 @@
-"""From single frames to a curve: smoother than they are, one way round, bridged for a while and no longer."""
+"""From single frames to a curve: smoother than they are, one way round, bridged for a while and no
+longer.
+"""
 
 from __future__ import annotations
 

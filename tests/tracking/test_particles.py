@@ -1,4 +1,6 @@
-"""Algorithm 3: the first frame places the particles, and what follows keeps to the animal while it goes slowly."""
+"""Algorithm 3: the first frame places the particles, and what follows keeps to the animal while it
+goes slowly.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The body held against the picture: the true pose explains it, a wrong one does not, and a fat mouse stays fat."""
+"""The body held against the picture: the true pose explains it, a wrong one does not, and a fat
+mouse stays fat.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ Q, FADE = 40.0, 0.3
 
 
 def gains(times, r, q):
-    """A group's gains and what is left: keep, go, forward, back, the first measured frame, covariances."""
+    """A group's gains and what is left: keep, go, forward, back, the first measured frame,
+    covariances.
+    """
     n = len(times)
     keep, go = np.zeros((2, n))
     forward, back = np.zeros((n, 2)), np.zeros((n, 2, 2))
@@ -34,14 +36,18 @@ def smoothed(times, y, r, q):
 
 
 def transition(dt, q):
-    """Matrix (2, 2) and noise (2, 2) of the integrated Ornstein-Uhlenbeck process, by the exponential of Van Loan."""
+    """Matrix (2, 2) and noise (2, 2) of the integrated Ornstein-Uhlenbeck process, by the
+    exponential of Van Loan.
+    """
     drift = np.array([[0.0, 1.0], [0.0, -1.0 / FADE]])
     whole = expm(dt * np.block([[-drift, np.diag([0.0, q])], [np.zeros((2, 2)), drift.T]]))
     return whole[2:, 2:].T, whole[2:, 2:].T @ whole[:2, 2:]
 
 
 def by_least_squares(times, y, r, q):
-    """The same from the joint Gaussian of all states at once: the slow twin. y (n, k), r (n, k, k)."""
+    """The same from the joint Gaussian of all states at once: the slow twin. y (n, k), r
+    (n, k, k).
+    """
     n, k = y.shape
     size = 2 * k
     precision, right = np.zeros((size * n, size * n)), np.zeros(size * n)

@@ -1,8 +1,9 @@
-"""How an animal goes from one act to the next: its own way of moving, acts that flow into one another, and a place.
+"""How an animal goes from one act to the next: its own way of moving, acts that flow into one
+another, and a place.
 
-An act is a stretch of channels on a fine clock: speed, turning, climbing, and what the species adds (bends, postures).
-A `Story` strings acts together, smooths them with a causal filter as a body does, and keeps the animal inside its
-place: an act that would lead outside is drawn again.
+An act is a stretch of channels on a fine clock: speed, turning, climbing, and what the species adds
+(bends, postures). A `Story` strings acts together, smooths them with a causal filter as a body
+does, and keeps the animal inside its place: an act that would lead outside is drawn again.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ Array = NDArray[np.float64]
 
 STEP_S = 0.005  # of the clock on which an animal moves, whatever the camera's rate
 UNLABELLED = ""
-SPEED, TURN, CLIMB = 0, 1, 2  # channels that every animal has: mm/s, rad/s, rad
+# channels that every animal has: mm/s, rad/s, rad
+SPEED = 0
+TURN = 1
+CLIMB = 2
 _TRIES = 16
 _TRAITS = {
     "vigour": 0.16,
@@ -30,8 +34,8 @@ _TRAITS = {
 
 @dataclass(frozen=True)
 class Individual:
-    """One animal's own way: factors of speed, of rhythm, of bending and of how long its acts last; its size over home,
-    how restless it is (0 to 1), and which side it prefers (-1 right to 1 left).
+    """One animal's own way: factors of speed, of rhythm, of bending and of how long its acts last;
+    its size over home, how restless it is (0 to 1), and which side it prefers (-1 right to 1 left).
     """
 
     size: float
@@ -46,13 +50,17 @@ class Individual:
     def draw(
         rng: np.random.Generator, sizes: tuple[float, float], novel: bool = False
     ) -> Individual:
-        """An animal; a novel one has traits at and beyond the ends of the range that all others come from."""
+        """An animal; a novel one has traits at and beyond the ends of the range that all others
+        come from.
+        """
         low, high = (0.7, 1.5) if novel else (0.0, 1.0)
         reach = rng.uniform(low, high, len(_TRAITS)) * rng.choice([-1.0, 1.0], len(_TRAITS))
         factors = {
             name: float(np.exp(_TRAITS[name] * z)) for name, z in zip(_TRAITS, reach, strict=True)
         }
-        size, restless, side = rng.uniform(*sizes), rng.random(), rng.uniform(-0.5, 0.5)
+        size = rng.uniform(*sizes)
+        restless = rng.random()
+        side = rng.uniform(-0.5, 0.5)
         return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
 
     def way(self, rng: np.random.Generator) -> float:
@@ -62,8 +70,8 @@ class Individual:
 
 @dataclass(frozen=True)
 class Motion:
-    """A story told: channels (m, C), heading (m,) rad, position (m, 3) mm of the body's middle and the word (m,) of
-    every step of the clock; `act` (m,) numbers the acts.
+    """A story told: channels (m, C), heading (m,) rad, position (m, 3) mm of the body's middle and
+    the word (m,) of every step of the clock; `act` (m,) numbers the acts.
     """
 
     channels: Array
@@ -88,7 +96,9 @@ class Motion:
 
 
 class Story:
-    """Acts, one after the other. fits: whether an animal can be at positions (m, 3) mm with headings (m,) rad."""
+    """Acts, one after the other. fits: whether an animal can be at positions (m, 3) mm with
+    headings (m,) rad.
+    """
 
     def __init__(
         self,
@@ -105,23 +115,30 @@ class Story:
         )
         self._state = lfilter_zi(*self._taps)[:, None] * rest
         self._lag = round(2.0 * blend_s / STEP_S)
-        self.position, self.heading, self._fits = np.array(position, float), heading, fits
+        self.position = np.array(position, float)
+        self.heading = heading
+        self._fits = fits
         self._told: list[tuple[Array, Array, Array, str]] = []
         self.n_steps = 0
 
     def play(self, word: str, draw: Callable[[], Array], tries: int = _TRIES) -> bool:
-        """Add the act that `draw` returns, channels (m, C); False where none of the tries leads to a possible place."""
+        """Add the act that `draw` returns, channels (m, C); False where none of the tries leads to
+        a possible place.
+        """
         for _ in range(tries):
             channels, state = lfilter(*self._taps, wanted := draw(), axis=0, zi=self._state)
             heading = self.heading + np.cumsum(channels[:, TURN]) * STEP_S
-            run, climb = channels[:, SPEED] * STEP_S, channels[:, CLIMB]
+            run = channels[:, SPEED] * STEP_S
+            climb = channels[:, CLIMB]
             steps = np.stack(
                 [np.cos(climb) * np.cos(heading), np.cos(climb) * np.sin(heading), np.sin(climb)],
                 axis=1,
             )
             position = self.position + np.cumsum(run[:, None] * steps, axis=0)
             if self._fits(position, heading):
-                self._state, self.position, self.heading = state, position[-1], float(heading[-1])
+                self._state = state
+                self.position = position[-1]
+                self.heading = float(heading[-1])
                 self._told.append((channels, heading, position, word))
                 self.n_steps += len(wanted)
                 return True
@@ -129,10 +146,13 @@ class Story:
 
     def nudge(self, position: Array) -> None:
         """Cornered: the animal stops there and is put a little inside."""
-        self.position, self._state[:, SPEED] = np.array(position, float), 0.0
+        self.position = np.array(position, float)
+        self._state[:, SPEED] = 0.0
 
     def told(self) -> Motion:
-        """All of it. A word begins when the body, which follows with a lag, begins to show its act."""
+        """All of it. A word begins when the body, which follows with a lag, begins to show
+        its act.
+        """
         lengths = [len(heading) for _, heading, _, _ in self._told]
         word = np.repeat([word for *_, word in self._told], lengths)
         act = np.repeat(np.arange(len(lengths)), lengths)
@@ -150,7 +170,9 @@ def clock(seconds: float) -> Array:
 
 
 def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
-    """(m,) rises from 0 to 1 at `peak` of the length and falls back, smooth at both ends; 0 outside."""
+    """(m,) rises from 0 to 1 at `peak` of the length and falls back, smooth at both ends; 0
+    outside.
+    """
     x = np.clip(t / length_s, 0.0, 1.0)
     phase = np.where(x < peak, 0.5 * x / peak, 0.5 + 0.5 * (x - peak) / (1.0 - peak))
     return 0.5 - 0.5 * np.cos(2.0 * np.pi * phase)

@@ -1,14 +1,16 @@
 """The nine actions of a fish, and what it does between them, by their kinematic definitions.
 
-Ranges follow the definitions of the literature where there are any (bends of scoots and turns, speeds, durations) and
-overlap as those do: strong routine turns are weak C-turns, J-turns bend no more than scoots do, only elsewhere. Bends
-are degrees a joint of 20 bones; speeds body lengths a second.
+Ranges follow the definitions of the literature where there are any (bends of scoots and turns,
+speeds, durations) and overlap as those do: strong routine turns are weak C-turns, J-turns bend no
+more than scoots do, only elsewhere. Bends are degrees a joint of 20 bones; speeds body lengths a
+second.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +58,8 @@ _BETWEEN = 0.75  # of the acts are followed by something without a name
 
 @dataclass(frozen=True)
 class FishActor:
-    """A fish that acts. water: its lowest and highest middle, mm above the floor; camera_mm: height of the camera, in
-    whose view it stays; length_mm: its own.
+    """A fish that acts. water: its lowest and highest middle, mm above the floor; camera_mm: height
+    of the camera, in whose view it stays; length_mm: its own.
     """
 
     fish: Individual
@@ -99,16 +101,14 @@ class FishActor:
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
         """A recording: actions in random order, most of them with something unnamed between."""
-        story, names = self.begin(rng), list(_SHARES)
+        story = self.begin(rng)
+        names = list(_SHARES)
         share = np.array([_SHARES[name] for name in names]) * np.exp(
             rng.normal(0.0, 0.25, len(names))
         )
         while story.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share / share.sum()))
-            if (
-                story.play(word, lambda word=word: self.act(rng, word), 6)
-                and rng.random() > _BETWEEN
-            ):  # type: ignore[misc]
+            if story.play(word, partial(self.act, rng, word), 6) and rng.random() > _BETWEEN:
                 continue
             if not story.play(UNLABELLED, lambda: self._between(rng, None)):
                 self._go_home(rng, story)
@@ -125,7 +125,8 @@ class FishActor:
             t, c = self._blank(rng, rng.uniform(1.2, 1.6))
             c[:, TURN] = away / t[-1] * 2.0 * bump(t, t[-1])
             c[:, _FRONT], c[:, _HIND] = 0.25 * c[:, TURN], 0.4 * c[:, TURN]
-            c[:, SPEED], c[:, CLIMB] = pace * self.length_mm, level
+            c[:, SPEED] = pace * self.length_mm
+            c[:, CLIMB] = level
             return c
 
         if not story.play(UNLABELLED, lambda: home(0.5)):
@@ -185,20 +186,23 @@ class FishActor:
             np.radians(rng.normal(0.0, 14.0))
             + np.radians(10.0) * slow_noise(rng, len(t), 0.4)[:, 0]
         )
-        c[:, _FRONT], c[:, _HIND] = bend, 1.5 * bend
+        c[:, _FRONT] = bend
+        c[:, _HIND] = 1.5 * bend
         c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
         return c
 
     def _j_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.3, 1.4))
-        way, rate = self.fish.way(rng), self.fish.tempo * rng.uniform(2.2, 5.0)
+        way = self.fish.way(rng)
+        rate = self.fish.tempo * rng.uniform(2.2, 5.0)
         beats = 0.5 - 0.5 * np.cos(2 * np.pi * np.minimum(rate, 2.0 / t[-1] + rate) * t)
         c[:, _HIND] = way * self.fish.bend * rng.uniform(1.9, 4.6) * (0.25 + 0.75 * beats)
         c[:, _FRONT] = 0.12 * c[:, _HIND] + rng.normal(0.0, 0.2)
         turn = np.radians(rng.uniform(8.0, 42.0))
         c[:, TURN] = way * turn / t[-1] * (0.3 + 1.4 * beats)
         c[:, SPEED] = self.fish.vigour * rng.uniform(0.1, 1.1)
-        c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.1, 0.7), rate
+        c[:, _WAVE] = rng.uniform(0.1, 0.7)
+        c[:, _BEAT] = rate
         c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
         return c
 
@@ -211,18 +215,19 @@ class FishActor:
         total_deg: float,
         lag_s: float,
     ) -> None:
-        """Bends that add up to total_deg from head to tail at the shape's peak; the tail follows."""
-        hind, lag = rng.uniform(0.52, 0.64), max(1, round(lag_s / STEP_S))
+        """Bends that add up to total_deg from head to tail at the shape's peak; the tail
+        follows.
+        """
+        hind = rng.uniform(0.52, 0.64)
+        lag = max(1, round(lag_s / STEP_S))
         late = np.concatenate([np.zeros(lag), shape])[: len(shape)]
         c[:, _FRONT] += total_deg * (1.0 - hind) / 9.0 * shape
         c[:, _HIND] += total_deg * hind / 10.0 * late
 
     def _r_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.25, 0.95))
-        way, total = (
-            self.fish.way(rng),
-            float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0)),
-        )
+        way = self.fish.way(rng)
+        total = float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0))
         length = t[-1] * rng.uniform(0.75, 1.0)
         shape = bump(t, length, rng.uniform(0.3, 0.5))
         self._bent(rng, t, c, way * shape, total, 0.02)
@@ -237,11 +242,10 @@ class FishActor:
 
     def _c_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.16, 0.7))
-        way, total = (
-            self.fish.way(rng),
-            float(np.clip(self.fish.bend * rng.normal(132.0, 22.0), 88.0, 178.0)),
-        )
-        first, back = rng.uniform(0.05, 0.10), rng.uniform(0.06, 0.11)
+        way = self.fish.way(rng)
+        total = float(np.clip(self.fish.bend * rng.normal(132.0, 22.0), 88.0, 178.0))
+        first = rng.uniform(0.05, 0.10)
+        back = rng.uniform(0.06, 0.11)
         bend = bump(t, first + back, first / (first + back))
         counter = bump(t - first - 0.6 * back, 1.6 * back) * (t > first + 0.6 * back)
         self._bent(rng, t, c, way * (bend - rng.uniform(0.15, 0.45) * counter), total, 0.012)
@@ -271,14 +275,16 @@ class FishActor:
 
     def _zigzag(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.8, 2.6))
-        at, way = 0.0, self.fish.way(rng)
+        at = 0.0
+        way = self.fish.way(rng)
         while at < t[-1]:
             length = rng.uniform(0.16, 0.36) / self.fish.tempo
             shape = bump(t - at, length, 0.4) * (t >= at)
             turn = np.radians(rng.uniform(65.0, 140.0))
             c[:, TURN] += way * turn * shape / max(shape.sum() * STEP_S, 0.5 * length)
             self._bent(rng, t, c, way * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
-            at, way = at + length * rng.uniform(0.8, 1.3), -way
+            at = at + length * rng.uniform(0.8, 1.3)
+            way = -way
         pace = self.fish.vigour * rng.uniform(1.2, 4.5)
         c[:, SPEED] = pace * (0.8 + 0.25 * slow_noise(rng, len(t), 0.25)[:, 0])
         self._swim(rng, t, c, 0.5 * pace)
@@ -288,7 +294,8 @@ class FishActor:
     def _thrash(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4))
         beat = self.fish.tempo * rng.uniform(3.5, 7.5)
-        c[:, _WAVE], c[:, _BEAT] = self.fish.bend * rng.uniform(3.4, 7.5), beat
+        c[:, _WAVE] = self.fish.bend * rng.uniform(3.4, 7.5)
+        c[:, _BEAT] = beat
         c[:, TURN] = rng.uniform(1.0, 5.0) * np.sin(
             2 * np.pi * beat * t + rng.uniform(0, 6)
         ) + rng.normal(0.0, 0.4)
@@ -303,12 +310,15 @@ class FishActor:
         _, c = self._blank(rng, self._seconds(rng, 0.9, 2.7))
         c[:, SPEED] = rng.uniform(0.0, 0.08)
         bend = rng.normal(0.0, 0.5)
-        c[:, _FRONT], c[:, _HIND] = bend, 1.5 * bend
+        c[:, _FRONT] = bend
+        c[:, _HIND] = 1.5 * bend
         c[:, CLIMB], c[:, _ROLL] = np.radians(rng.normal(0.0, 7.0)), c[0, _ROLL]
         return c
 
     def _between(self, rng: np.random.Generator, seconds: float | None) -> Array:
-        """What has no name: gliding, hovering, slow turns and climbs below every threshold, backing."""
+        """What has no name: gliding, hovering, slow turns and climbs below every threshold,
+        backing.
+        """
         kind = rng.choice(5, p=[0.34, 0.28, 0.2, 0.1, 0.08])
         t, c = self._blank(
             rng,
@@ -322,29 +332,33 @@ class FishActor:
         c[:, TURN] = np.radians(12.0) * slow_noise(rng, len(t), 0.5)[:, 0]
         if kind == 0:
             c[:, SPEED] = vigour * rng.uniform(0.3, 2.2) * np.exp(-t / 0.45)
-            c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.0, 0.4), 3.0
+            c[:, _WAVE] = rng.uniform(0.0, 0.4)
+            c[:, _BEAT] = 3.0
         elif kind == 1:
             c[:, SPEED] = vigour * (0.3 + 0.15 * slow_noise(rng, len(t), 0.4)[:, 0])
-            c[:, _WAVE], c[:, _BEAT] = (
-                rng.uniform(0.2, 0.9),
-                self.fish.tempo * rng.uniform(1.5, 3.5),
-            )
+            c[:, _WAVE] = rng.uniform(0.2, 0.9)
+            c[:, _BEAT] = self.fish.tempo * rng.uniform(1.5, 3.5)
             c[:, _HIND] = 0.6 * slow_noise(rng, len(t), 0.4)[:, 0]
         elif kind == 2:
-            way, total, shape = self.fish.way(rng), rng.uniform(10.0, 40.0), bump(t, t[-1])
+            way = self.fish.way(rng)
+            total = rng.uniform(10.0, 40.0)
+            shape = bump(t, t[-1])
             self._bent(rng, t, c, way * shape, total, 0.03)
             c[:, TURN] += (
                 way * np.radians(total * rng.uniform(0.6, 1.0)) * shape / (shape.sum() * STEP_S)
             )
             c[:, SPEED] = vigour * rng.uniform(0.2, 1.2)
-            c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.1, 0.5), 3.0
+            c[:, _WAVE] = rng.uniform(0.1, 0.5)
+            c[:, _BEAT] = 3.0
         elif kind == 3:
             c[:, CLIMB] = np.radians(rng.uniform(6.0, 13.0)) * rng.choice([-1.0, 1.0])
             c[:, SPEED] = vigour * rng.uniform(0.2, 0.8)
-            c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.3, 0.8), 3.0
+            c[:, _WAVE] = rng.uniform(0.3, 0.8)
+            c[:, _BEAT] = 3.0
         else:
             c[:, SPEED] = -vigour * rng.uniform(0.1, 0.5)
-            c[:, _WAVE], c[:, _BEAT] = rng.uniform(0.3, 1.0), 3.5
+            c[:, _WAVE] = rng.uniform(0.3, 1.0)
+            c[:, _BEAT] = 3.5
         c[:, SPEED] *= self.length_mm
         return c
 
@@ -356,10 +370,14 @@ def fish_poses(
     rows: NDArray[np.int64],
     size: float,
 ) -> Pose:
-    """Poses (n) in the arena frame, at steps `rows` (n,), of a fish of this size over home that moves so."""
-    m, n = len(motion.heading), len(rows)
+    """Poses (n) in the arena frame, at steps `rows` (n,), of a fish of this size over home that
+    moves so.
+    """
+    m = len(motion.heading)
+    n = len(rows)
     phase = 2 * np.pi * np.cumsum(motion.channels[:, _BEAT]) * STEP_S
-    own, length = 0.5 * slow_noise(rng, m, 0.25, 4)[rows], rng.uniform(0.9, 1.1)
+    own = 0.5 * slow_noise(rng, m, 0.25, 4)[rows]
+    length = rng.uniform(0.9, 1.1)
     c = motion.channels[rows]
     yaw = bend_profile(
         habits.skeleton,
@@ -380,6 +398,8 @@ def fish_poses(
 def depth_of_water(
     habits: FishHabits, shape: BodyShape, size: float, camera_mm: float
 ) -> tuple[float, float]:
-    """The lowest and the highest middle of a fish, mm above the floor, so that all of it stays in the water."""
+    """The lowest and the highest middle of a fish, mm above the floor, so that all of it stays in
+    the water.
+    """
     reach = size * (float(np.max(shape.half_height)) + 0.36 * habits.skeleton.length)
     return reach, camera_mm - _NEAREST_MM - reach

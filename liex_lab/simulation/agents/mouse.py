@@ -1,14 +1,15 @@
 """The actions of a mouse, and what it does between them, by their kinematic definitions.
 
-Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are mm/s of a mouse of
-home size. A posture is one elevation for each of the four bones, a turn at each of the three inner joints, and how far
-the body is stretched.
+Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are
+mm/s of a mouse of home size. A posture is one elevation for each of the four bones, a turn at each
+of the three inner joints, and how far the body is stretched.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,11 @@ ACTIONS = (
     "dart",
     "stretch_attend",
 )
-_RISE, _BEND = slice(3, 7), slice(7, 10)  # elevations of the bones, turns at the inner joints, rad
-_STRETCH, _ROLL = 10, 11
+# elevations of the bones, turns at the inner joints, rad
+_RISE = slice(3, 7)
+_BEND = slice(7, 10)
+_STRETCH = 10
+_ROLL = 11
 _CHANNELS = 12
 _BLEND_S = 0.035
 _SHARES = {
@@ -72,8 +76,8 @@ _WALL_MM = 50.0  # a nose nearer to a wall can lean on it
 
 @dataclass(frozen=True)
 class MouseActor:
-    """A mouse that acts. half: half sides x and y (2,) mm of its box around the origin; rest (4,) rad: elevations of
-    its bones when it stands; spine_mm: its own.
+    """A mouse that acts. half: half sides x and y (2,) mm of its box around the origin; rest (4,)
+    rad: elevations of its bones when it stands; spine_mm: its own.
     """
 
     mouse: Individual
@@ -92,7 +96,9 @@ class MouseActor:
         return MouseActor(mouse, mouse.size * skeleton.length, half, rest)
 
     def fits(self, position: Array, heading: Array) -> bool:
-        """Whether a body with these middles and headings stays inside the box, nose and rump too."""
+        """Whether a body with these middles and headings stays inside the box, nose and
+        rump too.
+        """
         ahead = 0.55 * self.spine_mm * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         middle = position[:, :2]
         reach = np.maximum(np.abs(middle + ahead), np.abs(middle - 0.8 * ahead))
@@ -101,12 +107,11 @@ class MouseActor:
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
         """A recording: actions in random order, some of them with something unnamed between."""
         rest = np.zeros(_CHANNELS)
-        rest[_RISE], rest[_STRETCH] = self.rest, 1.0
+        rest[_RISE] = self.rest
+        rest[_STRETCH] = 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
-        story, names = (
-            Story(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits),
-            list(_SHARES),
-        )
+        story = Story(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
+        names = list(_SHARES)
         share = np.array([_SHARES[name] for name in names]) * np.exp(
             rng.normal(0.0, 0.25, len(names))
         )
@@ -114,12 +119,10 @@ class MouseActor:
             word = str(rng.choice(names, p=share / share.sum()))
             if word == "rear_supported":
                 self._to_wall(rng, story)
-            done = self._possible(story, word) and story.play(
-                word, lambda word=word: self.act(rng, word), 6
-            )  # type: ignore[misc]
+            done = self._possible(story, word) and story.play(word, partial(self.act, rng, word), 6)
             if not done and word in ("walk", "run", "dart"):  # no room ahead
                 self._turn_home(rng, story)
-                story.play(word, lambda word=word: self.act(rng, word), 8)  # type: ignore[misc]
+                story.play(word, partial(self.act, rng, word), 8)
             elif rng.random() < _BETWEEN and not story.play(
                 UNLABELLED, lambda: self._between(rng), 4
             ):
@@ -127,7 +130,9 @@ class MouseActor:
         return story.told()
 
     def _possible(self, story: Story, word: str) -> bool:
-        """Whether a rear here is of that kind: one on a wall has it before the nose, any other is away from walls."""
+        """Whether a rear here is of that kind: one on a wall has it before the nose, any other is
+        away from walls.
+        """
         if word == "rear_supported":
             return self._room(story) < _WALL_MM
         nose = story.position[:2] + 0.5 * self.spine_mm * np.array(
@@ -158,9 +163,7 @@ class MouseActor:
                 return
             speed = self.mouse.vigour * self.mouse.size * rng.uniform(90.0, 240.0)
             seconds = max(0.3, (room - 0.3 * _WALL_MM) / speed)
-            story.play(
-                "walk", lambda seconds=seconds, speed=speed: self._stride(rng, seconds, speed), 2
-            )  # type: ignore[misc]
+            story.play("walk", partial(self._stride, rng, seconds, speed), 2)
 
     def _turn_home(self, rng: np.random.Generator, story: Story) -> None:
         """Turn to the middle of the box, on the spot where there is no room."""
@@ -180,7 +183,8 @@ class MouseActor:
 
     def act(self, rng: np.random.Generator, word: str) -> Array:
         """Channels of one action."""
-        vigour, size = self.mouse.vigour, self.mouse.size
+        vigour = self.mouse.vigour
+        size = self.mouse.size
         table: dict[str, Callable[[], Array]] = {
             "walk": lambda: self._stride(
                 rng, self._seconds(rng, 0.4, 2.8), vigour * size * rng.uniform(60.0, 290.0)
@@ -299,10 +303,8 @@ class MouseActor:
             * rng.uniform(3.0, 6.0)
             * (1.0 + 0.1 * slow_noise(rng, len(t), 0.7)[:, 0])
         )
-        phase, strength = (
-            2 * np.pi * np.cumsum(rate) * STEP_S,
-            0.7 + 0.3 * slow_noise(rng, len(t), 0.6)[:, 0],
-        )
+        phase = 2 * np.pi * np.cumsum(rate) * STEP_S
+        strength = 0.7 + 0.3 * slow_noise(rng, len(t), 0.6)[:, 0]
         lick = np.radians(rng.uniform(-30.0, 30.0)) * np.clip(
             slow_noise(rng, len(t), 1.2)[:, 0], 0.0, 1.0
         )
@@ -383,8 +385,12 @@ def mouse_poses(
     size: float,
     shape: BodyShape,
 ) -> tuple[Pose, Array]:
-    """Poses (n) in the arena frame, at steps `rows` (n,), of a mouse of this size over home, and girths (n,)."""
-    c, n, skeleton = motion.channels[rows], len(rows), habits.skeleton
+    """Poses (n) in the arena frame, at steps `rows` (n,), of a mouse of this size over home, and
+    girths (n,).
+    """
+    c = motion.channels[rows]
+    n = len(rows)
+    skeleton = habits.skeleton
     turn = np.zeros((n, skeleton.n_joints))
     turn[:, 1:-1] = c[:, _BEND]
     # a body that bends to one side heads between its ends

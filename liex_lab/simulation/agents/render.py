@@ -1,6 +1,8 @@
-"""An acting animal before a virtual depth camera: the window around it, frame by frame, with the truth.
+"""An acting animal before a virtual depth camera: the window around it, frame by frame, with the
+truth.
 
-Whole pictures of a long recording would be far more work than what an action recogniser needs of them.
+Whole pictures of a long recording would be far more work than what an action recogniser needs of
+them.
 """
 
 from __future__ import annotations
@@ -30,8 +32,9 @@ _BLOCK = 256  # frames rendered at a time
 
 @dataclass(frozen=True)
 class Camerawork:
-    """One camera over a place: intrinsics (4,) of the pictures that are looked at, their size (2,) px, T_arena_camera,
-    the unit's sensor parameters (N,), and how far off the floor is taken to be (3,).
+    """One camera over a place: intrinsics (4,) of the pictures that are looked at, their size (2,)
+    px, T_arena_camera, the unit's sensor parameters (N,), and how far off the floor is taken to be
+    (3,).
     """
 
     intrinsics: Array
@@ -49,9 +52,11 @@ class Camerawork:
         height_mm: float,
         stride: int,
     ) -> Camerawork:
-        """A camera of that make, so high above the floor, of whose pictures only every `stride`-th pixel is looked at.
+        """A camera of that make, so high above the floor, of whose pictures only every `stride`-th
+        pixel is looked at.
 
-        Its picture is twice as wide and high as the sensor's, so that an animal has room for long stretches of action.
+        Its picture is twice as wide and high as the sensor's, so that an animal has room for long
+        stretches of action.
         """
         camera = sensor.camera.every(stride)
         focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
@@ -80,11 +85,13 @@ def film(
     walls: Array | None,
     window_px: int,
 ) -> Iterator[Windows]:
-    """Windows around the animal in poses (n) of the arena frame and girths (n,), some hundred at a time.
+    """Windows around the animal in poses (n) of the arena frame and girths (n,), some hundred at a
+    time.
 
     walls (n, WALL_COLUMNS): what wall each frame shows, None none.
     """
-    surface, n = Surface.of(habits.skeleton), len(girth)
+    surface = Surface.of(habits.skeleton)
+    n = len(girth)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     bends = habits.bends(rng, 1)
     for start in range(0, n, _BLOCK):

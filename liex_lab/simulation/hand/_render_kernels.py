@@ -1,4 +1,6 @@
-"""Kernels that compose a picture of a hand: what is behind it, the body that it belongs to, things beside it."""
+"""Kernels that compose a picture of a hand: what is behind it, the body that it belongs to, things
+beside it.
+"""
 
 from __future__ import annotations
 
@@ -31,12 +33,14 @@ def picture(
 ):
     """One picture or window (H, W) uint16 mm; meshes (V, 3) mm in the camera frame.
 
-    wall (4,): 1 / z = a u + b v + c behind everything and its unevenness, mm; c = 0: nothing is in range there. size:
-    (width, height) of the whole picture, whose pixel `origin` comes to lie at (0, 0).
+    wall (4,): 1 / z = a u + b v + c behind everything and its unevenness, mm; c = 0: nothing is in
+    range there. size: (width, height) of the whole picture, whose pixel `origin` comes to lie at
+    (0, 0).
     """
     shape = out.shape
     state = np.array([seed], np.uint64)
-    field, depth = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    field = np.empty(shape, np.float32)
+    depth = np.empty(shape, np.float32)
     what = np.empty(shape, np.uint8)
     smooth_field(state, table, 24.0, field)
     for r in range(shape[0]):
@@ -45,8 +49,10 @@ def picture(
             there = inverse > 1.0 / 4500.0
             depth[r, c] = 1.0 / inverse + wall[3] * field[r, c] if there else 0.0
             what[r, c] = STILL if there else NOTHING
-    rotation, translation = np.eye(3), np.zeros(3)
-    u0, v0 = float(origin[0]), float(origin[1])
+    rotation = np.eye(3)
+    translation = np.zeros(3)
+    u0 = float(origin[0])
+    v0 = float(origin[1])
     draw_onto(body, body_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what)
     if has_thing:
         draw_onto(
@@ -56,9 +62,11 @@ def picture(
     draw_onto(hand, hand_faces, rotation, translation, intrinsics, u0, v0, ANIMAL, depth, what)
     for r in range(shape[0]):
         for c in range(shape[1]):
-            u, v = origin[0] + c, origin[1] + r
+            u = origin[0] + c
+            v = origin[1] + r
             if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
-                depth[r, c], what[r, c] = 0.0, NOTHING
+                depth[r, c] = 0.0
+                what[r, c] = NOTHING
     sense(
         depth,
         what,

@@ -1,4 +1,6 @@
-"""How a hand goes from gesture to gesture: along geodesics, as fast as people do, with a rest in each."""
+"""How a hand goes from gesture to gesture: along geodesics, as fast as people do, with a rest in
+each.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,23 @@ from liex_lab.simulation.hand.pose_prior import draw_seen
 
 Array = NDArray[np.float64]
 
-# at the fastest moment of a move: the palm's turning and the quickest finger joint's, rad/s, and the palm's way, mm/s
-_TURN, _BEND, _GO = (2.0, 6.0), (5.0, 12.0), (200.0, 700.0)
-_SHORTEST_S, _REST_S = 0.25, (0.0, 0.6)
+# at the fastest moment of a move: the palm's turning and the quickest finger joint's, rad/s, and
+# the palm's way, mm/s
+_TURN = (2.0, 6.0)
+_BEND = (5.0, 12.0)
+_GO = (200.0, 700.0)
+_SHORTEST_S = 0.25
+_REST_S = (0.0, 0.6)
 _WRIST_RAD = np.radians([0.0, 22.0, 12.0])  # how a wrist is bent
-_NEARER, _ASIDE_MM = (0.93, 1.07), 15.0  # where gestures are made, beside the middle of them all
+# where gestures are made, beside the middle of them all
+_NEARER = (0.93, 1.07)
+_ASIDE_MM = 15.0
 
 
 class Gestures(NamedTuple):
-    """N moments: angles (n, J, 3); turns (n, 3, 3): T_view_palm; places (n, 3) mm, camera frame; wrists (n, 3) rad."""
+    """N moments: angles (n, J, 3); turns (n, 3, 3): T_view_palm; places (n, 3) mm, camera frame;
+    wrists (n, 3) rad.
+    """
 
     angles: Array
     turns: Array
@@ -32,9 +42,11 @@ class Gestures(NamedTuple):
 def draw_gestures(
     rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: float, middle: Array
 ) -> Gestures:
-    """N moments of somebody who goes through postures that were seen, about a point (3,) mm of the camera frame.
+    """N moments of somebody who goes through postures that were seen, about a point (3,) mm of the
+    camera frame.
 
-    Each move lasts as long as its longest part, turning, bending or going, takes at a speed drawn for it.
+    Each move lasts as long as its longest part, turning, bending or going, takes at a speed drawn
+    for it.
     """
     keys = 2 + int(n * step_s / _SHORTEST_S)
     angles, turns = draw_seen(rng, skeleton, keys)

@@ -1,4 +1,5 @@
-"""The postures of hands: what people were seen to do with them, as statistics to draw from, and what a hand can do.
+"""The postures of hands: what people were seen to do with them, as statistics to draw from, and
+what a hand can do.
 
 `hand_postures.toml` beside this module says where the statistics come from; `distil` makes them.
 """
@@ -19,7 +20,9 @@ from liex_lab.geometry import so3
 Array = NDArray[np.float64]
 
 STATISTICS = Path(__file__).with_name("pose_prior.toml")
-_N_POSTURES, _N_TURNS, _N_AXES = 8, 8, 6
+_N_POSTURES = 8
+_N_TURNS = 8
+_N_AXES = 6
 _FREE_SHARE = 0.45  # of the training postures are what a hand can do, not what was seen
 _FAN_DEG = {
     "index": 10.0,
@@ -32,11 +35,13 @@ _BLEND_SHARE = 0.3  # of the seen ones lie between two
 
 @dataclass(frozen=True)
 class HandPostures:
-    """A mixture of K kinds of postures and M of orientation. Angles in rad, D free angles in the skeleton's order.
+    """A mixture of K kinds of postures and M of orientation. Angles in rad, D free angles in the
+    skeleton's order.
 
-    share (K,); mean (K, D); axes (K, A, D): principal deviations, one standard deviation long; rest (K, D): standard
-    deviation of what they leave. turn_share (M,); turn (M, 3, 3): T_view_palm, the view's z axis pointing at the
-    viewer; turn_axes (M, 3, 3): deviations from it, one standard deviation long, in the palm's frame, as rows.
+    share (K,); mean (K, D); axes (K, A, D): principal deviations, one standard deviation long; rest
+    (K, D): standard deviation of what they leave. turn_share (M,); turn (M, 3, 3): T_view_palm, the
+    view's z axis pointing at the viewer; turn_axes (M, 3, 3): deviations from it, one standard
+    deviation long, in the palm's frame, as rows.
     """
 
     share: Array
@@ -52,7 +57,8 @@ class HandPostures:
     def load() -> HandPostures:
         """The statistics that come with the package."""
         table = tomllib.loads(STATISTICS.read_text(encoding="utf-8"))
-        postures, turns = table["postures"], table["turns"]
+        postures = table["postures"]
+        turns = table["turns"]
         return HandPostures(
             np.array([p["share"] for p in postures]),
             np.radians([p["mean_deg"] for p in postures]),
@@ -85,11 +91,15 @@ def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
 
 
 def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
-    """Angles (n, J, 3) and T_view_palm (n, 3, 3) of hands as they were seen, between two of these, or quite free."""
+    """Angles (n, J, 3) and T_view_palm (n, 3, 3) of hands as they were seen, between two of these,
+    or quite free.
+    """
     postures = HandPostures.load()
-    seen, other = postures.draw_angles(rng, skeleton, n), postures.draw_angles(rng, skeleton, n)
+    seen = postures.draw_angles(rng, skeleton, n)
+    other = postures.draw_angles(rng, skeleton, n)
     t = np.where(rng.random(n) < _BLEND_SHARE, rng.random(n), 0.0)[:, None, None]
-    angles, turns = (1.0 - t) * seen + t * other, postures.draw_turns(rng, n)
+    angles = (1.0 - t) * seen + t * other
+    turns = postures.draw_turns(rng, n)
     free = rng.random(n) < _FREE_SHARE
     angles[free] = free_angles(rng, skeleton, int(free.sum()))
     free = rng.random(n) < _FREE_SHARE
@@ -98,9 +108,12 @@ def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
 
 
 def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
-    """Postures (n, J, 3) in which every finger is bent, stretched or in between on its own, or all alike."""
+    """Postures (n, J, 3) in which every finger is bent, stretched or in between on its own, or all
+    alike.
+    """
     angles = np.zeros((n, skeleton.n_joints, 3))
-    alike, together = rng.random((n, 1)) < 0.35, rng.random((n, 1))
+    alike = rng.random((n, 1)) < 0.35
+    together = rng.random((n, 1))
     each = np.clip(rng.beta(0.5, 0.5, (n, 4)), 0.0, 1.0)
     bent = np.clip(np.where(alike, together, each) + rng.normal(0.0, 0.05, (n, 4)), 0.0, 1.0)
     spread = rng.uniform(-0.6, 1.6, n)  # fingers closed up, or fanned out
@@ -131,12 +144,15 @@ def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
 
 
 def free_turns(rng: np.random.Generator, n: int) -> Array:
-    """Orientations (n, 3, 3): palm or back towards the viewer, tilted any way, turned by any angle in the picture."""
+    """Orientations (n, 3, 3): palm or back towards the viewer, tilted any way, turned by any angle
+    in the picture.
+    """
     spin = np.zeros((n, 3))
     spin[:, 2] = rng.uniform(-np.pi, np.pi, n)
     tilt = np.zeros((n, 3))
     tilt[:, :2] = np.radians(rng.normal(0.0, 35.0, (n, 2)))
-    # the palm's z axis leaves through the back of the hand: turned about its long axis it points away from the viewer
+    # the palm's z axis leaves through the back of the hand: turned about its long axis it points
+    # away from the viewer
     over = np.zeros((n, 3))
     over[:, 0] = np.where(rng.random(n) < 0.7, np.pi, 0.0)
     return so3.exp(spin) @ so3.exp(tilt) @ so3.exp(over)

@@ -1,4 +1,6 @@
-"""Hands before a camera: somebody holds one out, an arm and a body behind it, a wall further back, things around."""
+"""Hands before a camera: somebody holds one out, an arm and a body behind it, a wall further back,
+things around.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +34,10 @@ _EDGE_MM = 110.0  # the palm stays this far inside the picture
 
 @dataclass(frozen=True)
 class HandCast:
-    """n hands and what is around each, camera frame, mm: meshes hand, arm, body, thing (n, V, 3), shown (n,) which
-    things are there, wall (n, 4) as in `_hand_stage.picture`; pose (n) of the hands, joints (n, J, 3), spine_mm (n,);
-    parameters (n, N_PARAMETERS) of the sensors and seeds (n,) of their noise. thing_faces (F, 3): of things' meshes.
+    """n hands and what is around each, camera frame, mm: meshes hand, arm, body, thing (n, V, 3),
+    shown (n,) which things are there, wall (n, 4) as in `_hand_stage.picture`; pose (n) of the
+    hands, joints (n, J, 3), spine_mm (n,); parameters (n, N_PARAMETERS) of the sensors and seeds
+    (n,) of their noise. thing_faces (F, 3): of things' meshes.
     """
 
     pose: Pose
@@ -66,7 +69,8 @@ class HandCast:
     ) -> NDArray[np.uint16]:
         """What the cameras read: (n, *shape) uint16 mm from picture pixel origin (n, 2) on.
 
-        faces of the hands' meshes; intrinsics (n, 4); size (n, 2): width and height of the whole pictures.
+        faces of the hands' meshes; intrinsics (n, 4); size (n, 2): width and height of the whole
+        pictures.
         """
         out = np.empty((len(self.seeds), *shape), np.uint16)
         with threads(parallel):
@@ -100,9 +104,11 @@ def hold_out(
     size: Array,
     p_camera: Array,
 ) -> Pose:
-    """Poses (n) in the camera frame of hands with these angles (n, J, 3), palms at points (n, 3) mm.
+    """Poses (n) in the camera frame of hands with these angles (n, J, 3), palms at points (n, 3)
+    mm.
 
-    turns (n, 3, 3): T_view_palm, in the view along the line of sight to the palm; size (n,) over home size.
+    turns (n, 3, 3): T_view_palm, in the view along the line of sight to the palm; size (n,) over
+    home size.
     """
     rotation = np.swapaxes(sight_rotations(p_camera), 1, 2) @ turns
     return Pose(SE3(rotation, p_camera), angles, size)
@@ -111,7 +117,9 @@ def hold_out(
 def draw_places(
     rng: np.random.Generator, intrinsics: Array, picture: Array, low: Array, high: Array
 ) -> Array:
-    """Points (n, 3) mm, camera frame, between depths low and high (n,), that are well inside pictures (n, 2) px."""
+    """Points (n, 3) mm, camera frame, between depths low and high (n,), that are well inside
+    pictures (n, 2) px.
+    """
     n = len(low)
     depth = rng.uniform(low, high)
     margin = np.minimum(_EDGE_MM * intrinsics[:, 0] / depth, 0.45 * picture.min(axis=1))
@@ -132,7 +140,8 @@ def assemble(
     scenery: int,
     wrists: Array | None = None,
 ) -> HandCast:
-    """Hands (n) with their arms, bodies, walls and things; `scenery` pictures in a row share the same surroundings.
+    """Hands (n) with their arms, bodies, walls and things; `scenery` pictures in a row share the
+    same surroundings.
 
     wrists (n, 3) rad: how each is bent, None draws it for every picture.
     """
@@ -163,14 +172,16 @@ def assemble(
 
 
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
-    """Torso, head and one more thing (n, V, 3) mm behind each hand, and the shoulders (n, 3) mm to which the arms lead.
+    """Torso, head and one more thing (n, V, 3) mm behind each hand, and the shoulders (n, 3) mm to
+    which the arms lead.
 
-    u (n, 3, 8) in [0, 1) says where and how large they are, and which are there. Without a torso the arm goes straight
-    on and leaves the picture.
+    u (n, 3, 8) in [0, 1) says where and how large they are, and which are there. Without a torso
+    the arm goes straight on and leaves the picture.
     """
     n = len(joints)
     behind = np.maximum(joints[:, :, 2].max(axis=1), elbow[:, 2])
-    radii, centre = np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    radii = np.empty((n, 3, 3))
+    centre = np.empty((n, 3, 3))
     radii[:, 0] = [150.0, 260.0, 90.0] + u[:, 0, :3] * [60.0, 80.0, 60.0]
     centre[:, 0, 0] = elbow[:, 0] + (2.0 * u[:, 0, 3] - 1.0) * 300.0
     centre[:, 0, 1] = elbow[:, 1] + (u[:, 0, 4] - 0.4) * 400.0
@@ -192,14 +203,17 @@ def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Arra
     power = np.stack([2.0 + u[:, 0, 6], 2.0 + 0.0 * u[:, 1, 6], 2.0 + 8.0 * u[:, 2, 6]], axis=1)
     alone = u[:, 0, 7] < 0.25
     shoulder[alone] = (elbow - 800.0 * forward)[alone]
-    radii[alone, :2], radii[u[:, 2, 7] < 0.4, 2] = 0.01, 0.01
+    radii[alone, :2] = 0.01
+    radii[u[:, 2, 7] < 0.4, 2] = 0.01
     return rounded(
         centre, radii, np.pi * (2.0 * u[:, :, 6] - 1.0) * [0.1, 0.0, 1.0], power
     ).reshape(n, -1, 3), shoulder
 
 
 def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array, NDArray[np.bool_]]:
-    """A block or ball (n, V, 3) mm beside each hand, at about its depth, and which are there (n,)."""
+    """A block or ball (n, V, 3) mm beside each hand, at about its depth, and which are
+    there (n,).
+    """
     n = len(hand)
     radii = rng.uniform(15.0, 60.0, (n, 3))
     way = rng.uniform(-np.pi, np.pi, n)
@@ -218,11 +232,14 @@ def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array,
 
 
 def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, body: Array) -> Array:
-    """A plane (m, 4) behind everything, seldom parallel to the picture, and in a fifth of the scenes out of range."""
+    """A plane (m, 4) behind everything, seldom parallel to the picture, and in a fifth of the
+    scenes out of range.
+    """
     farthest = max(float(hand[..., 2].max()), float(np.quantile(body[..., 2], 0.9)))
     distance = np.minimum(farthest, 2000.0) + rng.uniform(150.0, 1500.0, m)
     slope = rng.normal(0.0, 0.25, (m, 2))
-    a, b = slope[:, 0] / intrinsics[:, 0] / distance, slope[:, 1] / intrinsics[:, 1] / distance
+    a = slope[:, 0] / intrinsics[:, 0] / distance
+    b = slope[:, 1] / intrinsics[:, 1] / distance
     c = 1.0 / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]
     wall = np.stack([a, b, c, rng.uniform(0.0, 6.0, m)], axis=1)
     wall[rng.random(m) < 0.2, :3] = 0.0

@@ -1,4 +1,6 @@
-"""The world of the hand: training windows, test splits and gestures, rendered before an NYU camera, with the truth."""
+"""The world of the hand: training windows, test splits and gestures, rendered before an NYU camera,
+with the truth.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,17 @@ Array = NDArray[np.float64]
 
 NYU_SENSOR = Sensor("NYU Kinect", NYU_CAMERA, PRIMESENSE_KIND)
 FRAME_NS = 33_333_333
-N_SESSIONS, N_FRAMES = 40, 50
-# name: (own seed, shape family, noise, eroded pixels, share of frames with another object beside the hand)
+N_SESSIONS = 40
+N_FRAMES = 50
+# name: (own seed, shape family, noise, eroded pixels, share of frames with another object beside
+# the hand)
 SPLITS = {
     "clean": (81_001, "train", 1.0, 0, 0.0),
     "hard": (82_001, "train", 2.0, 1, 0.5),
     "other-body": (84_001, "other", 1.0, 0, 0.0),
 }
-# training pictures: (sensor, pixels of it that one pixel stands for, nearest and farthest hand, share)
+# training pictures: (sensor, pixels of it that one pixel stands for, nearest and farthest hand,
+# share)
 _KINDS = (
     (NYU_SENSOR, 1, 620.0, 1200.0, 0.55),
     (NYU_SENSOR, 2, 400.0, 700.0, 0.20),
@@ -73,16 +78,15 @@ class HandSession(TrueRecording):
         super().__init__(
             name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth
         )
-        self.skeleton, self.sensor, self.cast, self.surface = (
-            skeleton,
-            sensor,
-            cast,
-            Surface.of(skeleton),
-        )
+        self.skeleton = skeleton
+        self.sensor = sensor
+        self.cast = cast
+        self.surface = Surface.of(skeleton)
         self.spine_mm = float(cast.spine_mm[0])
         self.floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
         self.T_arena_camera = self.floor.T_arena_camera
-        self.pose, self.joints_camera = cast.pose, cast.joints
+        self.pose = cast.pose
+        self.joints_camera = cast.joints
         self.joints_arena = self.T_arena_camera @ cast.joints
 
     def _depth(self, index: int) -> Depth:
@@ -90,7 +94,8 @@ class HandSession(TrueRecording):
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth (n, H, W) mm of frames start to stop, made on all threads."""
-        c, part = self.camera, self.cast[slice(start, stop)]
+        c = self.camera
+        part = self.cast[slice(start, stop)]
         n = len(part.seeds)
         intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n, 4)).copy()
         size = np.broadcast_to(np.array([c.width, c.height]), (n, 2)).copy()
@@ -113,8 +118,8 @@ class HandSession(TrueRecording):
 class HandWorld:
     """Somebody's right hand before a depth camera.
 
-    reference: the folder with labelled hands from which the test postures come, the second person's; None draws them
-    from the statistics of the first.
+    reference: the folder with labelled hands from which the test postures come, the second
+    person's; None draws them from the statistics of the first.
     """
 
     skeleton: Skeleton
@@ -125,22 +130,26 @@ class HandWorld:
     def protocol(self) -> str:
         """What to say of the test splits beside figures measured on them."""
         how = (
-            "each of another person's right hand before an NYU camera; the hand and its size are found by the product, "
-            "nothing is handed over; flips are told by the direction from the palm to the wrist. "
+            "each of another person's right hand before an NYU camera; the hand and its size are "
+            "found by the product, nothing is handed over; flips are told by the direction from "
+            "the palm to the wrist. "
         )
         if self.reference is None:
-            return f"{how}Postures: drawn from statistics of one person's hand, as part of the training pictures are. "
+            return (
+                f"{how}Postures: drawn from statistics of one person's hand, as part of the "
+                "training pictures are. "
+            )
         return (
-            f"{how}Postures: fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on, a person after "
-            "whom no training picture is drawn. "
+            f"{how}Postures: fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} "
+            "on, a person after whom no training picture is drawn. "
         )
 
     @property
     def sources(self) -> str:
         """What the training images were made from."""
         return (
-            "rendered from a seed; postures partly drawn from statistics of labelled points of the NYU Hand Pose test "
-            f"frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
+            "rendered from a seed; postures partly drawn from statistics of labelled points of "
+            f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
         )
 
     def training_blocks(
@@ -185,7 +194,9 @@ class HandWorld:
         parallel: bool,
     ) -> TrainingWindows:
         """The images of one block."""
-        skeleton, n, m = self.skeleton, BLOCK, BLOCK // PER_SESSION
+        skeleton = self.skeleton
+        n = BLOCK
+        m = BLOCK // PER_SESSION
         each = np.repeat(np.arange(m), PER_SESSION)
         kind, intrinsics, picture, parameters = _draw_cameras(rng, m, noise, erosion_px)
         _degrade(rng, parameters, degraded_share)
@@ -272,7 +283,8 @@ class HandWorld:
     ) -> HandSession:
         """Independent frames of one person."""
         rng = np.random.default_rng(seed)
-        n, camera = N_FRAMES, NYU_SENSOR.camera
+        n = N_FRAMES
+        camera = NYU_SENSOR.camera
         drawn = float(rng.uniform(*SIZE_RANGE))
         size = np.full(n, drawn if spine_mm is None else spine_mm / self.skeleton.length)
         shape = _same(draw_hands(rng, self.skeleton, family, 1), n)
@@ -297,7 +309,9 @@ class HandWorld:
         return HandSession(name, self.skeleton, NYU_SENSOR, cast)
 
     def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-        """Angles (n, J, 3) and T_view_palm (n, 3, 3) that no training picture was drawn after, where there are any."""
+        """Angles (n, J, 3) and T_view_palm (n, 3, 3) that no training picture was drawn after,
+        where there are any.
+        """
         if self.reference is None:
             return draw_seen(rng, self.skeleton, n)
         truth = NyuReference.load(self.reference).truth
@@ -306,14 +320,16 @@ class HandWorld:
         return pose.angles, sight_rotations(pose.root.translation) @ pose.root.rotation
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
-        """A hand that goes from one gesture to the next; settings: sensor, family, noise, erosion_px, thing_share,
-        spine_mm and name as in `walking.walking_session`.
+        """A hand that goes from one gesture to the next; settings: sensor, family, noise,
+        erosion_px, thing_share, spine_mm and name as in `walking.walking_session`.
         """
         return gesture_session(self.skeleton, seed, n_frames, **settings)
 
 
 def find_reference() -> Path | None:
-    """The folder of labelled hands beside the repository or the current folder, where there is one."""
+    """The folder of labelled hands beside the repository or the current folder, where there
+    is one.
+    """
     for base in (Path.cwd(), Path(__file__).resolve().parents[3]):
         folder = base.parent / "shared" / "data" / "hand_nyu"
         if (folder / REFERENCE_FILE).is_file():
@@ -334,7 +350,9 @@ def gesture_session(
     spine_mm: float | None = None,
     name: str = "gestures",
 ) -> HandSession:
-    """N frames at 30 a second of one person who goes from gesture to gesture, holding each for a moment."""
+    """N frames at 30 a second of one person who goes from gesture to gesture, holding each for a
+    moment.
+    """
     rng = np.random.default_rng(seed)
     drawn = float(rng.uniform(*SIZE_RANGE))
     size = np.full(n_frames, drawn if spine_mm is None else spine_mm / skeleton.length)
@@ -371,19 +389,23 @@ def _same(shape: HandShape, n: int) -> HandShape:
 def _draw_cameras(
     rng: np.random.Generator, m: int, noise: float, erosion_px: int
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """Kind (m,), intrinsics (m, 4), picture size (m, 2) and sensor parameters (m, N_PARAMETERS) of m cameras."""
+    """Kind (m,), intrinsics (m, 4), picture size (m, 2) and sensor parameters (m, N_PARAMETERS) of
+    m cameras.
+    """
     kind = rng.choice(len(_KINDS), m, p=[k[4] for k in _KINDS])
-    focal, axis = rng.uniform(0.97, 1.03, (m, 1)), rng.normal(0.0, 4.0, (m, 2))
-    intrinsics, picture, parameters = np.empty((m, 4)), np.empty((m, 2), np.int64), np.empty((m, 0))
+    focal = rng.uniform(0.97, 1.03, (m, 1))
+    axis = rng.normal(0.0, 4.0, (m, 2))
+    intrinsics = np.empty((m, 4))
+    picture = np.empty((m, 2), np.int64)
+    parameters = np.empty((m, 0))
     for k, (sensor, coarse, *_) in enumerate(_KINDS):
-        rows, c = kind == k, sensor.camera
+        rows = kind == k
+        c = sensor.camera
         drawn = sensor.draw(rng, m, np.zeros(m), noise, erosion_px)
         parameters = np.where(rows[:, None], drawn, parameters) if parameters.size else drawn
         whole = (
             np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
         )
-        intrinsics[rows], picture[rows] = (
-            whole[rows],
-            (c.width // coarse, max(c.height // coarse, _LEAST_PX)),
-        )
+        intrinsics[rows] = whole[rows]
+        picture[rows] = (c.width // coarse, max(c.height // coarse, _LEAST_PX))
     return kind, intrinsics, picture, parameters

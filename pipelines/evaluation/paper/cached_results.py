@@ -1,4 +1,6 @@
-"""Results that took long to train for, kept as JSON in `datasets/kept_results` with how they were made."""
+"""Results that took long to train for, kept as JSON in `datasets/kept_results` with how they were
+made.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ _SAME_MM = 0.05  # joints of the same test frame differ by less than this betwee
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
-    """What is kept for an animal: `rows` by variant, `sensitivity` by variant; empty where nothing is."""
+    """What is kept for an animal: `rows` by variant, `sensitivity` by variant; empty where nothing
+    is.
+    """
     path = (folder or kept_results_folder()) / f"{animal}.json"
     if not path.is_file():
         return {"rows": {}, "sensitivity": {}}
@@ -40,7 +44,9 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
 def keep_results(
     folder: Path, animal: str, rows: Mapping[str, Any], sensitivity: Mapping[str, Any]
 ) -> Path:
-    """Write results in the form in which they are kept; copied into datasets/kept_results they are used again."""
+    """Write results in the form in which they are kept; copied into datasets/kept_results they are
+    used again.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{animal}.json"
     content = {
@@ -60,7 +66,9 @@ def fits(
     made_from: Mapping[str, Any],
     tests: Mapping[str, Sequence[TrueRecording]],
 ) -> bool:
-    """Whether a kept row is of the same training and of the same test frames as would be measured now."""
+    """Whether a kept row is of the same training and of the same test frames as would be measured
+    now.
+    """
     if row["made"]["from"] != json.loads(json.dumps(made_from)):
         return False
     for split, sessions in tests.items():
@@ -73,5 +81,7 @@ def fits(
 
 
 def first_joints(sessions: Sequence[TrueRecording]) -> list[list[float]]:
-    """The true joints (J, 3) mm of a split's first frame, camera frame: what the test frames are recognised by."""
+    """The true joints (J, 3) mm of a split's first frame, camera frame: what the test frames are
+    recognised by.
+    """
     return [[round(float(x), 3) for x in joint] for joint in sessions[0].joints_camera[0]]

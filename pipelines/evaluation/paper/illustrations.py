@@ -1,4 +1,6 @@
-"""One image under the loupe: its candidates as the learned metric ranks them, and the way to them (Fig. 13-16)."""
+"""One image under the loupe: its candidates as the learned metric ranks them, and the way to them
+(Fig. 13-16).
+"""
 
 from __future__ import annotations
 
@@ -19,24 +21,30 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 PROTOCOL = (
-    "Rendered images that no tree has seen, cut out by the product's foreground. The one shown is that whose best "
-    "ranked candidate has the median error of all, so it is neither the best nor the worst."
+    "Rendered images that no tree has seen, cut out by the product's foreground. The one shown is "
+    "that whose best ranked candidate has the median error of all, so it is neither the best nor "
+    "the worst."
 )
 
 
 def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
-    """What the figures of candidates and of convergence show, for a model on images it has not seen.
+    """What the figures of candidates and of convergence show, for a model on images it has not
+    seen.
 
-    ranked: the example's candidates, best score first; rank_correlation: mean over images of Spearman's correlation of
-    score and error over an image's candidates; steps: error after every joint and round, over all candidates.
+    ranked: the example's candidates, best score first; rank_correlation: mean over images of
+    Spearman's correlation of score and error over an image's candidates; steps: error after every
+    joint and round, over all candidates.
     """
     from liex_lab.estimation.proposals import N_WAYS
     from liex_lab.estimation.training import Proposals, start_candidates
 
-    skeleton, method = model.skeleton, model.method
+    skeleton = model.skeleton
+    method = model.method
     data = _unseen(skeleton, model, n_images)
     rng = np.random.default_rng(0)
-    k, n, seen = method.n_candidates, len(data.size), None
+    k = method.n_candidates
+    n = len(data.size)
+    seen = None
     if (forest := model.cascade.proposals) is not None:
         k = min(k, N_WAYS * forest.n_trees)
         seen = Proposals(
@@ -100,11 +108,15 @@ def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
 def _follow(
     cascade: Cascade, data: TrainingSet, candidates: Candidates
 ) -> tuple[list[str], list[Array], list[Array]]:
-    """Move the candidates as Algorithm 1 does, and keep errors (n K,) mm at home size and positions after each step."""
+    """Move the candidates as Algorithm 1 does, and keep errors (n K,) mm at home size and positions
+    after each step.
+    """
     from liex_lab.estimation.training import joint_error
 
     skeleton = cascade.skeleton
-    names, errors, positions = ["start"], [], []
+    names = ["start"]
+    errors = []
+    positions = []
     solved: set[int] = {0}
 
     def note() -> None:
@@ -137,7 +149,9 @@ def _rank_correlation(scores: Array, errors: Array) -> float:
 
 
 def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
-    """Where joints (m, J, 3) of one image's view frame lie in its height map: column and row (m, J, 2)."""
+    """Where joints (m, J, 3) of one image's view frame lie in its height map: column and row (m, J,
+    2).
+    """
     from liex_lab.baselines.baseline import in_camera_frame
 
     look = data.images.looks[image]

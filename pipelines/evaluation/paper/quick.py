@@ -1,4 +1,6 @@
-"""Models for `liex evaluate tables --quick`: trained within seconds, to see that every row runs. Nobody quotes them."""
+"""Models for `liex evaluate tables --quick`: trained within seconds, to see that every row runs.
+Nobody quotes them.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.training import TrainingSet
 
-_N_PAPER, _N_BASELINE = 1_024, 2_048
+_N_PAPER = 1_024
+_N_BASELINE = 2_048
 QUICK_SWEEP = Sweep(
     n_images=512,
     n_test=512,
@@ -34,7 +37,9 @@ QUICK_SWEEP = Sweep(
 def quick_subject(
     animal: str, variant: str, progress: Progress = silent
 ) -> PoseEstimator | Baseline:
-    """As `evaluate.subject_of`, from next to no training; the default is the bundled model all the same."""
+    """As `evaluate.subject_of`, from next to no training; the default is the bundled model all the
+    same.
+    """
     from liex_lab.baselines.ablations import PlainMean
     from liex_lab.estimation.estimator import PoseEstimator
 
@@ -70,7 +75,8 @@ def _quick_baseline(animal: str, variant: str) -> Baseline:
 
     from ...training.baselines import training_of
 
-    skeleton, rng = Skeleton.load(animal), np.random.default_rng(0)
+    skeleton = Skeleton.load(animal)
+    rng = np.random.default_rng(0)
     plan = training_of(variant, skeleton).plan
     if isinstance(plan, CnnPlan):
         require_torch()

@@ -8,8 +8,8 @@ from typing import Any
 
 @dataclass
 class Results:
-    """All that is known of one animal: rows by variant, missing: why a row is not there, sensitivity by variant,
-    illustration of the default.
+    """All that is known of one animal: rows by variant, missing: why a row is not there,
+    sensitivity by variant, illustration of the default.
     """
 
     animal: str

@@ -1,4 +1,6 @@
-"""The job `liex evaluate tables`: every row of the paper's Tables 1-3 and the numbers behind its figures."""
+"""The job `liex evaluate tables`: every row of the paper's Tables 1-3 and the numbers behind its
+figures.
+"""
 
 from __future__ import annotations
 
@@ -29,17 +31,19 @@ if TYPE_CHECKING:
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
 SWEPT = ("paper", "default")  # variants whose sensitivity is drawn
-_RATE_FRAMES, _RATE_REPEATS = 128, 3
-_N_SESSIONS, _QUICK_FRAMES = 40, 100
+_RATE_FRAMES = 128
+_RATE_REPEATS = 3
+_N_SESSIONS = 40
+_QUICK_FRAMES = 100
 _QUANTILES = 101
 Draw = Callable[[Mapping[str, Any], Path], list[Path]]
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured. n_frames: of each split, None all; kept: results that fit are taken from
-    datasets/kept_results; quick: every row is trained on next to nothing, to see that everything runs; n_illustrated:
-    images behind the figures of candidates and convergence.
+    """How much is measured. n_frames: of each split, None all; kept: results that fit are taken
+    from datasets/kept_results; quick: every row is trained on next to nothing, to see that
+    everything runs; n_illustrated: images behind the figures of candidates and convergence.
     """
 
     n_frames: int | None = None
@@ -60,8 +64,8 @@ def make_tables(
 ) -> list[Path]:
     """Write tables, figures and kept forms into the folder `out`; returns what was written.
 
-    quick: few frames, every row trained on next to nothing; its numbers say only that everything runs. fresh: nothing
-    kept is used. draw: makes the figures from what `results` holds.
+    quick: few frames, every row trained on next to nothing; its numbers say only that everything
+    runs. fresh: nothing kept is used. draw: makes the figures from what `results` holds.
     """
     from .cached_results import keep_results
     from .table_text import write_tables
@@ -207,7 +211,9 @@ def measured_rows(
 
 
 def _numbers(errors: PoseErrors) -> dict[str, Any]:
-    """What is kept of the errors of one split: the figures, the error of each joint, and the distribution."""
+    """What is kept of the errors of one split: the figures, the error of each joint, and the
+    distribution.
+    """
     seen = np.isfinite(errors.error_mm)
     quantiles = (
         np.quantile(errors.error_mm[seen], np.linspace(0, 1, _QUANTILES))
@@ -225,13 +231,16 @@ def _numbers(errors: PoseErrors) -> dict[str, Any]:
 def rates_of(
     animal: str, subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording]
 ) -> dict[str, dict[str, Any]]:
-    """Frames per second of each subject on at most two cores, foreground included, all on the same frames in memory."""
+    """Frames per second of each subject on at most two cores, foreground included, all on the same
+    frames in memory.
+    """
     import numba
 
     from ...build import build_scene
     from ..speed import best_seconds
 
-    recording, plan = max(sessions[:2], key=lambda session: session.width), plan_of(animal)
+    recording = max(sessions[:2], key=lambda session: session.width)
+    plan = plan_of(animal)
     scene, sample = build_scene(recording, plan, next(iter(subjects.values())).skeleton, 96)
     frames = recording.depths(0, min(len(recording), _RATE_FRAMES))
     frames = frames[np.arange(_RATE_FRAMES) % len(frames)]

@@ -1,4 +1,6 @@
-"""How the method's error depends on its five numbers (Lie-X Fig. 7), each varied with the others as they are."""
+"""How the method's error depends on its five numbers (Lie-X Fig. 7), each varied with the others as
+they are.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,10 @@ if TYPE_CHECKING:
     from liex_lab.forests.forest import Forest
 
 PROTOCOL = (
-    "Mean joint error in mm at home size on rendered images that no tree has seen, half of them degraded as in "
-    "training. Every point but those of the initial poses is a model of its own, all on the same few images, so the "
-    "errors are larger than those of the tables; only their course counts."
+    "Mean joint error in mm at home size on rendered images that no tree has seen, half of them "
+    "degraded as in training. Every point but those of the initial poses is a model of its own, "
+    "all on the same few images, so the errors are larger than those of the tables; only their "
+    "course counts."
 )
 
 
@@ -79,14 +82,16 @@ def sensitivity(
 
     from ...training.pose_model import recipe_of, rendered_set
 
-    method, recipe = method_of(variant, skeleton), recipe_of("default", skeleton)
+    method = method_of(variant, skeleton)
+    recipe = recipe_of("default", skeleton)
     recipe = replace(recipe, sizes=recipe_of("paper", skeleton).sizes)
     data = rendered_set(skeleton, method, recipe, 0, sweep.n_images, silent)
     test = rendered_set(skeleton, method, recipe, sweep.n_images, sweep.n_test, silent)
     own = chosen_values(method)
     base = _train(data, skeleton, method, recipe.seed)
     points = {number: sorted({*values, own[number]}) for number, values in sweep.values}
-    n_points, done = sum(map(len, points.values())), 0
+    n_points = sum(map(len, points.values()))
+    done = 0
     curves: dict[str, list[dict[str, float]]] = {}
     for number, values in points.items():
         curves[number] = []
@@ -118,7 +123,9 @@ def _train(data: TrainingSet, skeleton: Skeleton, method: Method, seed: int) -> 
 def _trained_with(
     base: Trained, data: TrainingSet, method: Method, number: str, value: int, seed: int
 ) -> Trained:
-    """The base model where the number does not change training, else one of its own, as far as it has to be."""
+    """The base model where the number does not change training, else one of its own, as far as it
+    has to be.
+    """
     from liex_lab.estimation.training import train_metric
 
     changed = with_value(method, number, value)

@@ -1,4 +1,6 @@
-"""Tables 1-3 as CSV, Markdown and JSON, with the paper's own numbers beside ours and in words where they disagree."""
+"""Tables 1-3 as CSV, Markdown and JSON, with the paper's own numbers beside ours and in words where
+they disagree.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ TITLES = {
     "rf": "RF",
     "cnn": "CNN",
 }
-PUBLISHED_MM = {  # Lie-X, Tables 1 and 2: mean joint error, real recordings, another camera and other animals
+# Lie-X, Tables 1 and 2: mean joint error, real recordings, another camera and other animals
+PUBLISHED_MM = {
     "fish": {
         "paper": 0.68,
         "paper-one-pose": 3.28,
@@ -79,22 +82,25 @@ _COLUMNS = (
     "command",
 )
 _QUICK = (
-    "**A quick run: few frames, and every row but the default trained on next to nothing. Its numbers say that "
-    "everything runs, and nothing about the methods.**"
+    "**A quick run: few frames, and every row but the default trained on next to nothing. Its "
+    "numbers say that everything runs, and nothing about the methods.**"
 )
 _HOW = (
-    "The test frames are rendered, with cameras, arenas and animals that no model has seen; background, floor, animal "
-    "and, for the default, its size are found by the product, for every row alike. Published numbers are of real "
-    "recordings, other cameras and other animals: they show the order of the methods, and are not to be compared with "
-    "ours in millimetres. A row is *measured* in this run, or *kept*: measured earlier, with the command, seed and "
-    "version below, because its model takes long to train; kept rows hold for the same test frames. Frames/s count the "
-    "foreground too, on frames in memory; those of a kept row are of another run, so compare its ratio to the default, "
-    "which was timed beside it."
+    "The test frames are rendered, with cameras, arenas and animals that no model has seen; "
+    "background, floor, animal and, for the default, its size are found by the product, for every "
+    "row alike. Published numbers are of real recordings, other cameras and other animals: they "
+    "show the order of the methods, and are not to be compared with ours in millimetres. A row is "
+    "*measured* in this run, or *kept*: measured earlier, with the command, seed and version "
+    "below, because its model takes long to train; kept rows hold for the same test frames. "
+    "Frames/s count the foreground too, on frames in memory; those of a kept row are of another "
+    "run, so compare its ratio to the default, which was timed beside it."
 )
 
 
 def write_tables(folder: Path, results: Sequence[Results], quick: bool) -> list[Path]:
-    """The tables of some animals as table1.csv to table3.csv, tables.md and results.json in the folder."""
+    """The tables of some animals as table1.csv to table3.csv, tables.md and results.json in the
+    folder.
+    """
     first = [r for r in results if r.animal != "hand"]
     second = [r for r in results if r.animal == "hand"]
     written = []
@@ -215,7 +221,9 @@ def _table(results: Results) -> str:
 
 
 def _words(results: Results, quick: bool) -> list[str]:
-    """Which rows are missing and, unless the run was quick, where the order is not the paper's, in sentences."""
+    """Which rows are missing and, unless the run was quick, where the order is not the paper's, in
+    sentences.
+    """
     sentences = [
         f"{TITLES[variant]} was not measured: {why}." for variant, why in results.missing.items()
     ]
@@ -247,8 +255,9 @@ def _turned_pairs(results: Results) -> Iterator[str]:
         ahead, behind = (a, b) if published[a] < published[b] else (b, a)
         if places := _where_ahead(results, behind, ahead):
             yield (
-                f"In the paper, {TITLES[ahead]} ({published[ahead]:.2f} mm) is ahead of {TITLES[behind]} "
-                f"({published[behind]:.2f} mm); here, {TITLES[behind]} is ahead on {places}."
+                f"In the paper, {TITLES[ahead]} ({published[ahead]:.2f} mm) is ahead of "
+                f"{TITLES[behind]} ({published[behind]:.2f} mm); here, {TITLES[behind]} is ahead "
+                f"on {places}."
             )
 
 

@@ -1,4 +1,6 @@
-"""`liex evaluate tables`: every row and figure is there, kept rows serve where they fit, and words follow numbers."""
+"""`liex evaluate tables`: every row and figure is there, kept rows serve where they fit, and words
+follow numbers.
+"""
 
 from __future__ import annotations
 
@@ -221,9 +223,8 @@ def test_words_follow_the_numbers():
         "here, RF is ahead on clean (4.50 against 5.00 mm), hard (5.50 against 6.00 mm)." in turned
     )
     ahead, *others = table_text._words(results_with(order | {"cnn": 1.5}), quick=False)
-    assert (
-        ahead
-        == "CNN is ahead of the default on clean (1.50 against 2.00 mm), hard (2.50 against 3.00 mm)."
+    assert ahead == (
+        "CNN is ahead of the default on clean (1.50 against 2.00 mm), hard (2.50 against 3.00 mm)."
     )
     assert len(others) == 1  # and of the paper's variant
 

@@ -1,4 +1,6 @@
-"""`liex evaluate`: the names of its numbers are an interface, and known offsets come out as they went in."""
+"""`liex evaluate`: the names of its numbers are an interface, and known offsets come out as they
+went in.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,9 @@ def toy_estimator(animal: str, variant: str, progress: Progress = silent) -> Pos
 
 @pytest.fixture
 def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Two recordings of 10 small frames stand for every split, toy models for every variant; what was asked for."""
+    """Two recordings of 10 small frames stand for every split, toy models for every variant; what
+    was asked for.
+    """
     asked: list[str] = []
 
     def small_split(

@@ -1,4 +1,6 @@
-"""A session repeated until it is long: its tables are those of a run of that length, and its report is measured."""
+"""A session repeated until it is long: its tables are those of a run of that length, and its report
+is measured.
+"""
 
 from __future__ import annotations
 

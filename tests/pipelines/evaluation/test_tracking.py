@@ -1,4 +1,6 @@
-"""`liex evaluate tracking`: every row over a sequence, handled as a recording would be, and the picture of it."""
+"""`liex evaluate tracking`: every row over a sequence, handled as a recording would be, and the
+picture of it.
+"""
 
 from __future__ import annotations
 

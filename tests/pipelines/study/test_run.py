@@ -1,4 +1,6 @@
-"""A study on real worker processes, with a run that takes no time: what fails is told, and stops no other."""
+"""A study on real worker processes, with a run that takes no time: what fails is told, and stops no
+other.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def make_study(folder: Path, names: list[str], **more: str) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
-    """Seventeen sessions on two workers, six of them broken: the study's file, what was printed, the exit code."""
+    """Seventeen sessions on two workers, six of them broken: the study's file, what was printed,
+    the exit code.
+    """
     folder = tmp_path_factory.mktemp("study")
     names = [f"good{k}" for k in range(9)] + ["unlucky", *BROKEN, "last"]
     file = make_study(folder, [*names, "skipped"], skipped='exclude = "fell asleep"')

@@ -1,4 +1,6 @@
-"""From a session to labels and back: its track, BORIS, training on what people labelled, and the bundled models."""
+"""From a session to labels and back: its track, BORIS, training on what people labelled, and the
+bundled models.
+"""
 
 from __future__ import annotations
 
@@ -138,7 +140,9 @@ def test_a_c_start_at_30_frames_a_second_is_said_to_be_less_than_a_frame() -> No
 
 
 def test_an_hour_is_recognised_in_seconds() -> None:
-    """Ten seconds are promised on two cores; a busy machine has six times as long for a sixth of it."""
+    """Ten seconds are promised on two cores; a busy machine has six times as long for a sixth of
+    it.
+    """
     import time
 
     from tests.actions.toy import going_and_staying

@@ -1,4 +1,6 @@
-"""Acted recordings: measured once, kept by recording, tracked anew, and thinned out before they are tracked."""
+"""Acted recordings: measured once, kept by recording, tracked anew, and thinned out before they are
+tracked.
+"""
 
 from __future__ import annotations
 

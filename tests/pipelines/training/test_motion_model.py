@@ -1,4 +1,6 @@
-"""`liex train tracking`: numbers that are changed are kept where tracks come nearer to the truth."""
+"""`liex train tracking`: numbers that are changed are kept where tracks come nearer to the
+truth.
+"""
 
 from __future__ import annotations
 

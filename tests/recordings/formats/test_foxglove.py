@@ -1,4 +1,6 @@
-"""Foxglove's other ways to hold depth in an MCAP file: JSON, point clouds, few large chunks, no index."""
+"""Foxglove's other ways to hold depth in an MCAP file: JSON, point clouds, few large chunks, no
+index.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ STORED = depth_frames(9)
 def write_json(
     path: Path, schema: str, contents: list[Any], calibration: dict[str, Any] | None = None
 ) -> Path:
-    """Foxglove's messages in JSON, with the least that an MCAP file may have: no chunk, no index, no summary."""
+    """Foxglove's messages in JSON, with the least that an MCAP file may have: no chunk, no index,
+    no summary.
+    """
     with path.open("wb") as file:
         writer = McapWriter(
             file,
@@ -190,7 +194,9 @@ def test_a_cloud_may_lie_in_a_frame_of_its_own(tmp_path: Path) -> None:
 def test_a_cut_chunk_gives_what_it_still_holds(
     tmp_path: Path, share: float, compression: MCAPCompression | None
 ) -> None:
-    """All frames lie in one chunk; packed ones come in blocks, of which the last is lost: at most 21 frames."""
+    """All frames lie in one chunk; packed ones come in blocks, of which the last is lost: at most
+    21 frames.
+    """
     stored = depth_frames(80)
     path = write_mcap(tmp_path / "r.mcap", stored, compression=compression, chunk_size=1 << 24)
     cut(path, share)

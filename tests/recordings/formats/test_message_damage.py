@@ -1,4 +1,6 @@
-"""What damage to one chunk of an MCAP file or a ROS bag costs; 200 variants of each are in test_damage.py."""
+"""What damage to one chunk of an MCAP file or a ROS bag costs; 200 variants of each are in
+test_damage.py.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def chunk_starts(path: Path) -> list[int]:
 def test_a_damaged_chunk_costs_its_own_frames_only(
     tmp_path: Path, write: Callable[..., Path], number: int, where: str
 ) -> None:
-    """Also the first one, which tells what the messages are, and one whose length is lost: the file's end tells."""
+    """Also the first one, which tells what the messages are, and one whose length is lost: the
+    file's end tells.
+    """
     path = write(tmp_path / ("r.mcap" if write is write_mcap else "r.bag"), STORED)
     write_camera(tmp_path)
     content = bytearray(path.read_bytes())

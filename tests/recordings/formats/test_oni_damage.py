@@ -1,4 +1,6 @@
-"""What damage to one frame of an .oni file costs, and files made to take memory; 200 variants are in test_damage.py."""
+"""What damage to one frame of an .oni file costs, and files made to take memory; 200 variants are
+in test_damage.py.
+"""
 
 from __future__ import annotations
 

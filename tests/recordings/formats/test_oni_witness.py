@@ -19,7 +19,9 @@ QVGA = Camera(285.0, 287.0, 159.5, 119.5, 320, 240)
 
 
 def noisy_frames(n: int = 6, seed: int = 0) -> np.ndarray:
-    """(n, 240, 320) uint16: like a camera's, and one of plain noise; the last pixels of each change."""
+    """(n, 240, 320) uint16: like a camera's, and one of plain noise; the last pixels of each
+    change.
+    """
     frames = depth_frames(n, 320, 240, seed)
     frames[1] = np.random.default_rng(seed).integers(0, 10_000, (240, 320))
     frames[2, -1, -40:] = frames[2, -1, -41] + 1

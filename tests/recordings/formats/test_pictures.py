@@ -1,4 +1,6 @@
-"""Pictures of the rarer kinds: PGM in both byte orders, PCLZF, and the encodings of depth that data sets have."""
+"""Pictures of the rarer kinds: PGM in both byte orders, PCLZF, and the encodings of depth that data
+sets have.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,8 @@ def test_lzf_noise_is_refused_where_the_slow_twin_refuses_it(packed: bytes, room
 
 
 XML = (
-    '<?xml version="1.0" encoding="utf-8"?>\n<rgb>\n<focal_length_x>9</focal_length_x>\n</rgb>\n<depth>\n'
+    '<?xml version="1.0" '
+    'encoding="utf-8"?>\n<rgb>\n<focal_length_x>9</focal_length_x>\n</rgb>\n<depth>\n'
     "<focal_length_x>525.5</focal_length_x><focal_length_y>526</focal_length_y><principal_point_x>320</principal_point_x>"
     "<principal_point_y>240</principal_point_y>\n<z_multiplication_factor>{z}</z_multiplication_factor>\n</depth>\n"
 )

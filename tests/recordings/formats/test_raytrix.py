@@ -1,4 +1,6 @@
-"""Raytrix exports: read through the profile that is named, refused where the numbers contradict it."""
+"""Raytrix exports: read through the profile that is named, refused where the numbers
+contradict it.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,10 @@ from tests.recordings.writers import SMALL, depth_frames
 STORED = depth_frames(3)
 FLOAT = -STORED.astype(np.float32)
 CALIBRATION = (
-    '<RayCalibData version="1.0"><diameter units="pix">23.2</diameter><rotation units="rad">1.57</rotation>'
-    '<tcp units="virtual_depth">2.25</tcp><lens_type id="0"><depth_range units="virtual_depth"><min>1.0</min>'
+    '<RayCalibData version="1.0"><diameter units="pix">23.2</diameter><rotation '
+    'units="rad">1.57</rotation>'
+    '<tcp units="virtual_depth">2.25</tcp><lens_type id="0"><depth_range '
+    'units="virtual_depth"><min>1.0</min>'
     "<max>3.2</max></depth_range></lens_type></RayCalibData>"
 )
 
@@ -84,7 +88,10 @@ def test_sixteen_bits_are_ten_micrometres(tmp_path: Path) -> None:
 
 
 def test_what_is_stated_again_counts_and_a_confirmed_profile_is_silent(tmp_path: Path) -> None:
-    more = 'sign = 1\nunit_mm = 2.0\noffset_mm = 5.0\nvalid_mm = [1000, 1500]\nevidence = "confirmed with a ruler"\n'
+    more = (
+        'sign = 1\nunit_mm = 2.0\noffset_mm = 5.0\nvalid_mm = [1000, 1500]\nevidence = "confirmed '
+        'with a ruler"\n'
+    )
     folder = write_raytrix(tmp_path, -FLOAT, "raytrix-f32-negative-mm", ".tif", write_tiff, more)
     with open_recording(folder) as recording:
         assert recording.problems == []

@@ -1,4 +1,6 @@
-"""Depth videos of MoSeq sessions: FFV1 in AVI, raw pictures in Azure's Matroska, and the camera each comes from."""
+"""Depth videos of MoSeq sessions: FFV1 in AVI, raw pictures in Azure's Matroska, and the camera
+each comes from.
+"""
 
 from __future__ import annotations
 

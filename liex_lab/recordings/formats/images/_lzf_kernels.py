@@ -1,4 +1,6 @@
-"""LZF, the small codec in which PCL packs its pictures: numba kernel. Its slow twin is tests/oracles/lzf.py."""
+"""LZF, the small codec in which PCL packs its pictures: numba kernel. Its slow twin is
+tests/oracles/lzf.py.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +9,15 @@ from numba import njit
 
 @njit(cache=True)
 def unpack_lzf(packed, out):
-    """Fill `out` (n,) uint8 from `packed` (m,) uint8; the bytes written, or -1 where the data make no sense.
+    """Fill `out` (n,) uint8 from `packed` (m,) uint8; the bytes written, or -1 where the data make
+    no sense.
 
-    A byte below 32 is followed by that many literal bytes and one more. Any other byte begins a copy from what is out
-    already: its upper 3 bits are the length less 2 (7: the next byte adds to it), its lower 5 bits and the next byte
-    the distance less 1.
+    A byte below 32 is followed by that many literal bytes and one more. Any other byte begins a
+    copy from what is out already: its upper 3 bits are the length less 2 (7: the next byte adds to
+    it), its lower 5 bits and the next byte the distance less 1.
     """
-    at, done = 0, 0
+    at = 0
+    done = 0
     while at < packed.size:
         control = int(packed[at])
         at += 1

@@ -1,4 +1,6 @@
-"""A folder of depth pictures (PNG, TIFF, PGM or PCLZF), with a camera.toml and time stamps beside them."""
+"""A folder of depth pictures (PNG, TIFF, PGM or PCLZF), with a camera.toml and time stamps beside
+them.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ class Pictures:
         self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]
     ) -> None:
         """decode: stored values of one picture -> depth (H, W) float32 mm."""
-        self.stack, self.problems = stack, problems
+        self.stack = stack
+        self.problems = problems
         self._decode = decode
         self._bad = {i for i, whole in enumerate(stack.whole) if not whole}
 
@@ -51,13 +54,16 @@ class Pictures:
         if index not in self._bad:
             self._bad.add(index)
             self.problems.append(
-                f"frame {index} ({self.stack.label(index)}) is damaged and was taken as wholly unread"
+                f"frame {index} ({self.stack.label(index)}) is damaged and was taken as wholly "
+                "unread"
             )
         return np.zeros((self.stack.height, self.stack.width), np.float32)
 
 
 def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
-    """The kind of the depth pictures of a folder, and they in natural order: frame_2 before frame_10."""
+    """The kind of the depth pictures of a folder, and they in natural order: frame_2 before
+    frame_10.
+    """
     inside = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     chosen = [
         path
@@ -68,14 +74,15 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     found = [kind for kind, files in kinds.items() if files]
     if len(found) > 1:
         raise RecordingError(
-            f"{folder} holds both {found[0]} and {found[1]} pictures, and a recording has one kind; choose with a line "
+            f"{folder} holds both {found[0]} and {found[1]} pictures, and a recording has one "
+            "kind; choose with a line "
             f'such as pattern = "*{KINDS[found[0]][0]}" under [camera] in camera.toml'
         )
     eight_bit = [path for path in chosen if path.suffix.lower() in _EIGHT_BIT]
     if not found and eight_bit:
         raise RecordingError(
-            f"expected 16-bit depth pictures (PNG or TIFF), got 8-bit pictures such as {eight_bit[0].name} "
-            f"in {folder}; give the folder of the camera's depth pictures"
+            "expected 16-bit depth pictures (PNG or TIFF), got 8-bit pictures such as "
+            f"{eight_bit[0].name} in {folder}; give the folder of the camera's depth pictures"
         )
     if not found:
         raise RecordingError(
@@ -109,8 +116,8 @@ def open_images(
 class Folder:
     """Pictures and all that is needed to make a recording of them.
 
-    path: what was asked for, a folder or one file; told: what its camera.toml says; decode: stored values -> depth
-    (H, W) float32 mm; beside: further files that say how to read the pictures.
+    path: what was asked for, a folder or one file; told: what its camera.toml says; decode: stored
+    values -> depth (H, W) float32 mm; beside: further files that say how to read the pictures.
     """
 
     path: Path
@@ -129,7 +136,9 @@ class Folder:
             raise
 
     def _recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
-        path, stack, told = self.path, self.stack, self.told
+        path = self.path
+        stack = self.stack
+        told = self.told
         the_camera = told.camera(stack.width, stack.height, camera)
         problems = [*told.problems, *stack.problems, *_say_cut(stack)]
         settled, start = self._times(fps, problems)
@@ -156,17 +165,20 @@ class Folder:
         return self.path if self.path.is_dir() else self.path.parent
 
     def _times(self, fps: float | None, problems: list[str]) -> tuple[Settled, str | None]:
-        """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they tell it.
+        """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they
+        tell it.
 
         From the stamp file, or else from the names of the pictures, or else from a stated rate.
         """
-        path, n = self.folder / self.told.timestamps, len(self.stack)
+        path = self.folder / self.told.timestamps
+        n = len(self.stack)
         if path.is_file():
             times = read_csv_times(path, self.told.time_column, self.told.time_unit)
             n, counts = match_counts(n, times, self.folder.name, path.name)
             if not n:
                 raise RecordingError(
-                    f"{path} holds no time stamp; write one per picture, or remove it and state fps in camera.toml"
+                    f"{path} holds no time stamp; write one per picture, or remove it and state "
+                    "fps in camera.toml"
                 )
             problems += [counts] if counts else []
             moment = True
@@ -180,16 +192,18 @@ class Folder:
             if hz is None:
                 raise self._no_times()
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
-            times, moment = from_rate(n, hz), False
+            times = from_rate(n, hz)
+            moment = False
         settled = settle(times[:n])
         problems += [settled.problem] if settled.problem else []
         return settled, start_of_clock(int(settled.times_ns[0])) if moment else None
 
     def _no_times(self) -> RecordingError:
         return RecordingError(
-            f"the times of the pictures in {self.folder} are not known; write {self.told.timestamps} with a line "
-            "time_ns (or time_s) and then one time per picture, or state a constant rate with fps = 30.0 under "
-            "[camera] in camera.toml" + ("" if self.told.path.is_file() else f" ({WHAT_TO_WRITE})")
+            f"the times of the pictures in {self.folder} are not known; write "
+            f"{self.told.timestamps} with a line time_ns (or time_s) and then one time per "
+            "picture, or state a constant rate with fps = 30.0 under [camera] in camera.toml"
+            + ("" if self.told.path.is_file() else f" ({WHAT_TO_WRITE})")
         )
 
 
@@ -222,7 +236,8 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
         return open_pngs(files, progress, colour=camera_file.encoding == COLOUR)
     if camera_file.encoding == COLOUR:
         raise RecordingError(
-            f'{camera_file.path} states encoding = "{COLOUR}", which is one of colour PNG pictures, but '
+            f'{camera_file.path} states encoding = "{COLOUR}", which is one of colour PNG '
+            "pictures, but "
             f"{files[0].name} is a {kind} picture; correct it"
         )
     if kind == "PGM":
@@ -243,21 +258,24 @@ def _say_cut(stack: Stack) -> list[str]:
     if not cut:
         return []
     return [
-        f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as wholly unread, the first is "
-        f"frame {cut[0]} ({stack.label(cut[0])})"
+        f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as wholly "
+        f"unread, the first is frame {cut[0]} ({stack.label(cut[0])})"
     ]
 
 
 def _refuse_negative(
     stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile
 ) -> None:
-    """Float pictures may count away from the camera with a minus sign; nothing would be left of them unread."""
+    """Float pictures may count away from the camera with a minus sign; nothing would be left of
+    them unread.
+    """
     stored = stack.read(stack.whole.index(True))
     if stored is None or stored.dtype.kind != "f" or decode(stored).any():
         return
     read = stored[np.isfinite(stored) & (stored != 0)] * camera_file.unit_mm
     if read.size and np.median(read) < 0:
         raise RecordingError(
-            f"the depths in {stack.label(stack.whole.index(True))} are negative, so its depth axis points towards the "
-            f"camera; write unit_mm = {-camera_file.unit_mm:g} under [camera] in camera.toml"
+            f"the depths in {stack.label(stack.whole.index(True))} are negative, so its depth axis "
+            f"points towards the camera; write unit_mm = {-camera_file.unit_mm:g} under [camera] "
+            "in camera.toml"
         )

@@ -1,4 +1,6 @@
-"""The NYU hand pose data set: depth in the green and blue of colour PNGs, and the joints of its joint_data.mat."""
+"""The NYU hand pose data set: depth in the green and blue of colour PNGs, and the joints of its
+joint_data.mat.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,8 @@ _NOMINAL_HZ = 30.0  # the data set holds no times; its cameras ran at this rate
 class NyuJoints:
     """Ground truth of one view, in the order of its pictures, which are numbered from 1.
 
-    names (J,): as in the file; uvd (N, J, 3): u, v pixels, depth mm; xyz (N, J, 3): mm in our camera frame (x right, y
-    down, z away), so its y is the file's with the sign turned.
+    names (J,): as in the file; uvd (N, J, 3): u, v pixels, depth mm; xyz (N, J, 3): mm in our
+    camera frame (x right, y down, z away), so its y is the file's with the sign turned.
     """
 
     names: tuple[str, ...]
@@ -85,13 +87,16 @@ def _pictures(folder: Path, view: int) -> list[Path]:
     real = [path for path in files if path.name.startswith("depth")] or files
     if not real:
         raise RecordingError(
-            f"{folder} holds no pictures depth_{view}_0000001.png of the NYU data set; give another folder"
+            f"{folder} holds no pictures depth_{view}_0000001.png of the NYU data set; give "
+            "another folder"
         )
     return sorted(real, key=lambda path: natural_key(path.name))
 
 
 def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
-    """The joints in a folder's joint_data.mat, of one view. Row i belongs to the picture with number i + 1."""
+    """The joints in a folder's joint_data.mat, of one view. Row i belongs to the picture with
+    number i + 1.
+    """
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
@@ -128,8 +133,8 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
         or uvd.shape[0] < view
     ):
         raise RecordingError(
-            f"{path} should hold joints of the shape (views, frames, {N_JOINTS}, 3), but they have {uvd.shape} and "
-            f"{xyz.shape}; give the data set's own {JOINT_FILE}"
+            f"{path} should hold joints of the shape (views, frames, {N_JOINTS}, 3), but they have "
+            f"{uvd.shape} and {xyz.shape}; give the data set's own {JOINT_FILE}"
         )
     names = tuple(
         str(np.asarray(name).ravel()[0]) for name in np.asarray(found["joint_names"]).ravel()

@@ -1,4 +1,6 @@
-"""The labels of the NYU hand data: fourteen points of a hand in pixels and mm, and where they lie on our skeleton."""
+"""The labels of the NYU hand data: fourteen points of a hand in pixels and mm, and where they lie
+on our skeleton.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ REFERENCE_FILE = "nyu_test_14joints.npz"
 N_FIRST_PERSON = 2440  # test frames before this one show the first person, the others the second
 PALM = 13  # row of the palm, where the root is
 
-# row by row: how a labelled point is made of the skeleton's joints. The thumb's second point lies on its last bone.
+# row by row: how a labelled point is made of the skeleton's joints. The thumb's second point lies
+# on its last bone.
 POINTS: dict[str, dict[str, float]] = {
     "pinky_tip": {"little_tip": 1.0},
     "pinky_mid": {"little_middle": 1.0},
@@ -57,7 +60,8 @@ NYU_IDS = (
     31,
     32,
 )  # of the data set's 36 points, from 0
-_LITTLE_WRIST, _THUMB_WRIST = 11, 12
+_LITTLE_WRIST = 11
+_THUMB_WRIST = 12
 _START_BEND = 0.3  # rad: a straight finger does not know which way to bend
 
 
@@ -78,22 +82,25 @@ def uvd_to_mm(uvd: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class NyuReference:
-    """The true points (n, 14, 3) mm, camera frame, of the NYU test frames, and what methods have answered."""
+    """The true points (n, 14, 3) mm, camera frame, of the NYU test frames, and what methods have
+    answered.
+    """
 
     truth: Array
     answers: dict[str, Array]
 
     @staticmethod
     def load(folder: str | Path) -> NyuReference:
-        """From the folder that holds nyu_test_14joints.npz, or else the data set's own joint_data.mat, which holds no
-        answers. Raises LiexError.
+        """From the folder that holds nyu_test_14joints.npz, or else the data set's own
+        joint_data.mat, which holds no answers. Raises LiexError.
         """
         path = Path(folder) / REFERENCE_FILE
         if not path.is_file() and (Path(folder) / JOINT_FILE).is_file():
             return NyuReference(uvd_to_mm(read_nyu_joints(Path(folder)).uvd[:, NYU_IDS]), {})
         if not path.is_file():
             raise LiexError(
-                f"the NYU reference should be a folder with {REFERENCE_FILE} or {JOINT_FILE}, but {folder} has neither"
+                f"the NYU reference should be a folder with {REFERENCE_FILE} or {JOINT_FILE}, but "
+                f"{folder} has neither"
             )
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as table:
@@ -110,7 +117,8 @@ class NyuReference:
             ) from None
         if names != list(POINTS) or truth.shape[1:] != (len(POINTS), 3):
             raise LiexError(
-                f"{path} should label {', '.join(POINTS)}, in this order, but labels {', '.join(names)}"
+                f"{path} should label {', '.join(POINTS)}, in this order, but labels "
+                f"{', '.join(names)}"
             )
         return NyuReference(
             truth, {name: points for name, points in found.items() if name != "groundtruth"}
@@ -119,7 +127,8 @@ class NyuReference:
 
 def fit_hands(skeleton: Skeleton, points: Array) -> Fit:
     """Hand poses (n) in the frame of the labelled points (n, 14, 3) mm."""
-    palm, wrists = points[:, PALM], points[:, [_LITTLE_WRIST, _THUMB_WRIST]]
+    palm = points[:, PALM]
+    wrists = points[:, [_LITTLE_WRIST, _THUMB_WRIST]]
     forward = _unit(palm - wrists.mean(axis=1))
     left = wrists[:, 1] - wrists[:, 0]
     left = _unit(left - np.sum(left * forward, axis=1, keepdims=True) * forward)

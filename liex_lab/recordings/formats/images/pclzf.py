@@ -1,4 +1,6 @@
-"""PCL's own pictures: `.pclzf`, 16-bit depth packed with LZF, and the intrinsics in the XML beside each."""
+"""PCL's own pictures: `.pclzf`, 16-bit depth packed with LZF, and the intrinsics in the XML beside
+each.
+"""
 
 from __future__ import annotations
 
@@ -78,10 +80,11 @@ def _decode(path: Path) -> NDArray[np.uint16] | None:
 
 
 def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
-    """Intrinsics (fx, fy, cx, cy, pixels) and unit_mm of a picture's XML; None where there is none that tells them.
+    """Intrinsics (fx, fy, cx, cy, pixels) and unit_mm of a picture's XML; None where there is none
+    that tells them.
 
-    PCL writes `frame_T.xml` beside `frame_T_depth.pclzf`, with two elements at the top, <rgb> and <depth>, which is why
-    it is no XML until something stands around them.
+    PCL writes `frame_T.xml` beside `frame_T_depth.pclzf`, with two elements at the top, <rgb> and
+    <depth>, which is why it is no XML until something stands around them.
     """
     path = picture.with_name(
         picture.name.removesuffix(picture.suffix).removesuffix("_depth") + ".xml"

@@ -1,4 +1,6 @@
-"""PGM pictures (P5, 16 bits), in the byte order of the standard or in the one that some programs write."""
+"""PGM pictures (P5, 16 bits), in the byte order of the standard or in the one that some programs
+write.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +41,8 @@ class _Header(NamedTuple):
 def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = None) -> FileStack:
     """Look at the header and the length of every file.
 
-    byte_order: "big", as the format's definition has it, or "little"; None: big, unless most pictures are plainly the
-    other way round, which is told.
+    byte_order: "big", as the format's definition has it, or "little"; None: big, unless most
+    pictures are plainly the other way round, which is told.
     """
     stack = open_files(
         files, "PGM", _look, partial(_decode, dtype=_DTYPES[byte_order or "big"]), progress
@@ -52,7 +54,8 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     if 2 * sum(_is_little(path) for path in asked) <= len(asked):
         return stack
     told = (
-        f"the pixels of {whole[0].name} make sense with the low byte first only, although PGM has the high byte first, "
+        f"the pixels of {whole[0].name} make sense with the low byte first only, although PGM has "
+        "the high byte first, "
         'so they were read so; state byte_order = "little" or "big" under [camera] in camera.toml'
     )
     return replace(stack, decode=partial(_decode, dtype=_DTYPES["little"]), problems=[told])
@@ -74,7 +77,8 @@ def _look(path: Path) -> Look:
         raise not_depth_error(str(path), "8-bit grey", header.width, header.height)
     n_pixels = header.width * header.height
     spare = path.stat().st_size - header.n_bytes - 2 * n_pixels
-    # a line's end or a comment behind the pixels is no matter; more, or less, and the header does not say the truth
+    # a line's end or a comment behind the pixels is no matter; more, or less, and the header does
+    # not say the truth
     fits = n_pixels > 0 and not too_large(header[:2]) and 0 <= spare < 2 * header.width
     return Look(header[:2]) if fits else DAMAGED
 
@@ -92,7 +96,9 @@ def _decode(path: Path, dtype: np.dtype[np.uint16]) -> NDArray[np.uint16] | None
 
 
 def _is_little(path: Path) -> bool:
-    """Whether neighbouring pixels are alike with the low byte first only: depth is smooth, and its low byte is not."""
+    """Whether neighbouring pixels are alike with the low byte first only: depth is smooth, and its
+    low byte is not.
+    """
     rough = {}
     for name, dtype in _DTYPES.items():
         picture = _decode(path, dtype)

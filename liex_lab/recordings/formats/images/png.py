@@ -37,7 +37,8 @@ _COLOURS = {
 
 
 def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | None:
-    """Pixels (H, W) uint16 of a 16-bit grey PNG, or (H, W, 3) uint8 (blue, green, red) of an 8-bit colour one.
+    """Pixels (H, W) uint16 of a 16-bit grey PNG, or (H, W, 3) uint8 (blue, green, red) of an 8-bit
+    colour one.
 
     None where it does not decode to that.
     """
@@ -55,7 +56,8 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
 
 def _sums_agree(data: NDArray[np.uint8]) -> bool:
     """Whether every chunk up to the last agrees with its check sum."""
-    view, at = data.data, len(_SIGNATURE)
+    view = data.data
+    at = len(_SIGNATURE)
     while at + 12 <= len(view):
         (length,) = struct.unpack_from(">I", view, at)
         end = at + 12 + length
@@ -70,7 +72,9 @@ def _sums_agree(data: NDArray[np.uint8]) -> bool:
 
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:
-    """Look at the head and the tail of every file, without decoding any. colour: 8-bit colour is expected."""
+    """Look at the head and the tail of every file, without decoding any. colour: 8-bit colour is
+    expected.
+    """
     return open_files(
         files, "PNG", partial(_look, colour=colour), partial(_decode, colour=colour), progress
     )
@@ -99,10 +103,13 @@ def _look(path: Path, colour: bool) -> Look:
 
 
 def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] | None:
-    """Width and height that a 16-bit grey (or 8-bit colour) PNG states in its first bytes; None where cut off."""
+    """Width and height that a 16-bit grey (or 8-bit colour) PNG states in its first bytes; None
+    where cut off.
+    """
     if not head.startswith(_SIGNATURE[: len(head)]):
         raise RecordingError(
-            f"{where} is named like a PNG picture but holds something else; remove it or give it its name"
+            f"{where} is named like a PNG picture but holds something else; remove it or give it "
+            "its name"
         )
     if len(head) < _SIZE_BYTES:
         return None
@@ -114,7 +121,8 @@ def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] |
         or too_large((width, height))
     ):
         raise RecordingError(
-            f"{where} begins like a PNG picture but its header makes no sense; remove it or copy it again"
+            f"{where} begins like a PNG picture but its header makes no sense; remove it or copy "
+            "it again"
         )
     if (bits, kind) != ((8, 2) if colour else (16, 0)):
         raise not_depth_error(where, f"{bits}-bit {_COLOURS[kind]}", width, height)

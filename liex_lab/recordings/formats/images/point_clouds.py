@@ -1,4 +1,6 @@
-"""Point clouds as XYZ text or PLY, and the depth pictures that a pinhole camera would see of them."""
+"""Point clouds as XYZ text or PLY, and the depth pictures that a pinhole camera would see
+of them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from liex_lab.runtime.progress import Progress
 
 Points = NDArray[np.float64]
 
-TEXTS, PLY = (".xyz", ".txt", ".csv", ".asc"), ".ply"
+TEXTS = (".xyz", ".txt", ".csv", ".asc")
+PLY = ".ply"
 SUFFIXES = (*TEXTS, PLY)
 _HEAD_BYTES = 1 << 16
 _TYPES = {
@@ -54,7 +57,9 @@ def open_clouds(
     to_camera: Callable[[Points], Points],
     progress: Progress,
 ) -> FileStack:
-    """Clouds as pictures (H, W) float64 mm, 0 = unread. to_camera: a file's points (n, 3) -> mm in the camera frame."""
+    """Clouds as pictures (H, W) float64 mm, 0 = unread. to_camera: a file's points (n, 3) -> mm in
+    the camera frame.
+    """
     size = (camera.width, camera.height)
 
     def decode(path: Path) -> NDArray[Any] | None:
@@ -65,7 +70,9 @@ def open_clouds(
 
 
 def see(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
-    """Depth (H, W) mm of points (n, 3) mm in the camera frame: the nearest in every pixel, 0 where there is none."""
+    """Depth (H, W) mm of points (n, 3) mm in the camera frame: the nearest in every pixel, 0 where
+    there is none.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
         p_camera = p_camera[np.isfinite(p_camera).all(axis=1) & (p_camera[:, 2] > 0)]
         uv = np.floor(camera.project(p_camera) + 0.5)
@@ -77,7 +84,9 @@ def see(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
 
 
 def read_points(path: Path, columns: tuple[int, int, int]) -> Points | None:
-    """Points (n, 3) of a file, in its own units; None where it is damaged. columns: of x, y, z in a text."""
+    """Points (n, 3) of a file, in its own units; None where it is damaged. columns: of x, y, z in a
+    text.
+    """
     try:
         return _read_ply(path) if path.suffix.lower() == PLY else _read_text(path, columns)
     except (ValueError, OverflowError, UnicodeDecodeError):
@@ -125,7 +134,9 @@ def _read_text(path: Path, columns: tuple[int, int, int]) -> Points:
 
 
 class _PlyHeader(NamedTuple):
-    """order: of bytes, empty for text; n: vertices; fields: (name, type) of each; row_bytes: of one, at least."""
+    """order: of bytes, empty for text; n: vertices; fields: (name, type) of each; row_bytes: of
+    one, at least.
+    """
 
     order: str
     n: int
@@ -135,12 +146,16 @@ class _PlyHeader(NamedTuple):
 
 
 def _ply_header(head: bytes) -> _PlyHeader | None:
-    """What the header says of the vertices; None where it is cut, or the vertices are not the first element."""
+    """What the header says of the vertices; None where it is cut, or the vertices are not the first
+    element.
+    """
     end = head.find(b"end_header")
     start = head.find(b"\n", end) + 1
     if end < 0 or not start:
         return None
-    order, n, element = None, -1, ""
+    order = None
+    n = -1
+    element = ""
     fields: list[tuple[str, str]] = []
     for line in head[:end].decode("latin-1").splitlines():
         words = line.split()

@@ -1,4 +1,6 @@
-"""Exports of Raytrix light-field cameras: depth maps and point clouds, read through a profile that is named."""
+"""Exports of Raytrix light-field cameras: depth maps and point clouds, read through a profile that
+is named.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ def open_raytrix(
 
 
 def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
-    """Whether a folder's files are named like exports, are point clouds, or hold the vendor's calibration."""
+    """Whether a folder's files are named like exports, are point clouds, or hold the vendor's
+    calibration.
+    """
     if any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE):
         return True
     for name in names:
@@ -80,8 +84,10 @@ def no_profile_error(folder: Path) -> RecordingError:
     """The sentence for a folder of exports without a raytrix.toml."""
     listed = ", ".join(shipped_profiles())
     return RecordingError(
-        f"{folder} holds exports of a Raytrix camera, whose numbers mean depth in several ways; write a {PROFILE_FILE} "
-        f'into it with a line such as profile = "raytrix-f32-negative-mm" (one of {listed}), and a camera.toml'
+        f"{folder} holds exports of a Raytrix camera, whose numbers mean depth in several ways; "
+        f"write a {PROFILE_FILE} "
+        f'into it with a line such as profile = "raytrix-f32-negative-mm" (one of {listed}), and '
+        "a camera.toml"
     )
 
 
@@ -92,8 +98,9 @@ def _with_lens(told: CameraFile, profile: Profile, stack: Stack, path: Path) -> 
     f_px = profile.focal_mm / (profile.pitch_mm * profile.resolution_divisor)
     centre = {"cx": (stack.width - 1) / 2.0, "cy": (stack.height - 1) / 2.0}
     told_once = (
-        f"the focal length of {f_px:.1f} px follows from focal_mm and pitch_mm in {path.name}; a lens that is focused "
-        "close up has a longer one, so measure a ruler at a known distance and state fx and fy in camera.toml"
+        f"the focal length of {f_px:.1f} px follows from focal_mm and pitch_mm in {path.name}; a "
+        "lens that is focused close up has a longer one, so measure a ruler at a known distance "
+        "and state fx and fy in camera.toml"
     )
     return replace(
         told,
@@ -111,8 +118,9 @@ def _check(stack: Stack, profile: Profile, path: Path) -> None:
         return
     if stored.dtype != np.dtype(profile.stored):
         raise RecordingError(
-            f"the profile {profile.name!r} is for {profile.stored} pictures, but {stack.label(first)} is "
-            f"{stored.dtype.name}; choose another profile in {path}, or change stored"
+            f"the profile {profile.name!r} is for {profile.stored} pictures, but "
+            f"{stack.label(first)} is {stored.dtype.name}; choose another profile in {path}, or "
+            "change stored"
         )
     depth = profile.read(stored)
     read = depth[np.isfinite(depth)]
@@ -121,13 +129,15 @@ def _check(stack: Stack, profile: Profile, path: Path) -> None:
     median, (low, high) = float(np.median(read)), profile.valid_mm
     if median < 0:
         raise RecordingError(
-            f"the depths in {stack.label(first)} are on the other side of the camera when read through "
-            f"{profile.name!r} (median {median:.4g} mm); change sign to {-profile.sign} in {path}"
+            f"the depths in {stack.label(first)} are on the other side of the camera when read "
+            f"through {profile.name!r} (median {median:.4g} mm); change sign to {-profile.sign} in "
+            f"{path}"
         )
     if not low <= median <= high:
         raise RecordingError(
-            f"the median depth in {stack.label(first)} is {median:.4g} mm when read through {profile.name!r}, outside "
-            f"valid_mm = [{low:g}, {high:g}]; change unit_mm, offset_mm or valid_mm in {path}"
+            f"the median depth in {stack.label(first)} is {median:.4g} mm when read through "
+            f"{profile.name!r}, outside valid_mm = [{low:g}, {high:g}]; change unit_mm, offset_mm "
+            f"or valid_mm in {path}"
         )
 
 
@@ -141,16 +151,16 @@ def _open_clouds(
     files = [p for p in inside if p.suffix.lower() in _clouds.SUFFIXES and p.name not in beside]
     if not files:
         raise RecordingError(
-            f"no point cloud (.xyz, .txt, .csv or .ply) in {folder} fits pattern = {profile.pattern!r} of "
-            f"{PROFILE_FILE}; correct it"
+            f"no point cloud (.xyz, .txt, .csv or .ply) in {folder} fits pattern = "
+            f"{profile.pattern!r} of {PROFILE_FILE}; correct it"
         )
     files.sort(key=lambda path: natural_key(path.name))
     width = stated.width if isinstance(stated, Camera) else told.width
     height = stated.height if isinstance(stated, Camera) else told.height
     if not (width and height):
         raise RecordingError(
-            f"a point cloud has no pixels, so state the camera that shall see those in {folder}: write a camera.toml "
-            "with fx, fy, cx, cy, width and height in pixels"
+            f"a point cloud has no pixels, so state the camera that shall see those in {folder}: "
+            "write a camera.toml with fx, fy, cx, cy, width and height in pixels"
         )
     camera = told.camera(width, height, stated)
     return files, _clouds.open_clouds(
@@ -174,7 +184,8 @@ def profile_points(profile: Profile) -> Callable[[_clouds.Points], _clouds.Point
 
 @dataclass(frozen=True)
 class RayCalibration:
-    """What the vendor's calibration file holds: the grid of micro-lenses, in pixels, and ranges of virtual depth.
+    """What the vendor's calibration file holds: the grid of micro-lenses, in pixels, and ranges of
+    virtual depth.
 
     It has no focal length and no metric scale, so it does not turn virtual depth into millimetres.
     """
@@ -208,7 +219,9 @@ def read_ray_calibration(path: Path) -> RayCalibration:
 
 
 def _refuse_virtual(folder: Path, profile: Profile) -> None:
-    """Virtual depth is relative; without the distances inside the camera it never becomes millimetres."""
+    """Virtual depth is relative; without the distances inside the camera it never becomes
+    millimetres.
+    """
     if profile.kind != "virtual" or profile.lens is not None:
         return
     held = ""
@@ -218,10 +231,11 @@ def _refuse_virtual(folder: Path, profile: Profile) -> None:
         except RecordingError:
             continue
         held = (
-            f" ({path.name} holds the micro-lens grid and tcp = {found.tcp:.3f} in virtual depth, but no focal length "
-            "and no metric scale)"
+            f" ({path.name} holds the micro-lens grid and tcp = {found.tcp:.3f} in virtual depth, "
+            "but no focal length and no metric scale)"
         )
     raise RecordingError(
-        f"the depth in {folder} is virtual, which is relative, and no calibration to millimetres is stated{held}; "
-        f"export metric depth, or state lens_f_mm, lens_to_grid_mm and grid_to_sensor_mm in {PROFILE_FILE}"
+        f"the depth in {folder} is virtual, which is relative, and no calibration to millimetres "
+        f"is stated{held}; export metric depth, or state lens_f_mm, lens_to_grid_mm and "
+        f"grid_to_sensor_mm in {PROFILE_FILE}"
     )

@@ -1,4 +1,6 @@
-"""raytrix.toml: which profile a folder of exports is read through, and what about it is different."""
+"""raytrix.toml: which profile a folder of exports is read through, and what about it is
+different.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,12 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Profile(BaseModel):
-    """How the stored numbers of an export mean millimetres; the keys are explained in raytrix_profiles.toml.
+    """How the stored numbers of an export mean millimetres; the keys are explained in
+    raytrix_profiles.toml.
 
-    focal_mm, pitch_mm: of the main lens and of the sensor's pixels, from which the intrinsics follow where no
-    camera.toml states them; lens_f_mm, lens_to_grid_mm, grid_to_sensor_mm: what turns virtual depth into millimetres.
+    focal_mm, pitch_mm: of the main lens and of the sensor's pixels, from which the intrinsics
+    follow where no camera.toml states them; lens_f_mm, lens_to_grid_mm, grid_to_sensor_mm: what
+    turns virtual depth into millimetres.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,13 +69,17 @@ class Profile(BaseModel):
         if self.evidence.lower().startswith(_CONFIRMED):
             return None
         return (
-            f"depth is read through the profile {self.name!r}, which is not confirmed ({self.evidence}); record a step "
-            f'of known height, and write evidence = "confirmed with a ruler" into {PROFILE_FILE} once it measures right'
+            f"depth is read through the profile {self.name!r}, which is not confirmed "
+            f"({self.evidence}); record a step "
+            f'of known height, and write evidence = "confirmed with a ruler" into {PROFILE_FILE} '
+            "once it measures right"
         )
 
     @property
     def lens(self) -> tuple[float, float, float] | None:
-        """f, distance from lens to micro-lens grid and from grid to sensor, mm, where all are stated."""
+        """f, distance from lens to micro-lens grid and from grid to sensor, mm, where all are
+        stated.
+        """
         numbers = (self.lens_f_mm, self.lens_to_grid_mm, self.grid_to_sensor_mm)
         return None if None in numbers else numbers  # type: ignore[return-value]
 
@@ -83,7 +91,9 @@ class Profile(BaseModel):
         }
 
     def read(self, stored: NDArray[Any]) -> NDArray[np.float64]:
-        """Signed mm (H, W) of stored values, NaN where they are invalid, before `valid_mm` is looked at."""
+        """Signed mm (H, W) of stored values, NaN where they are invalid, before `valid_mm` is
+        looked at.
+        """
         with np.errstate(
             invalid="ignore"
         ):  # damage may hold any bits, also those of a NaN that signals
@@ -96,7 +106,9 @@ class Profile(BaseModel):
         return self.sign * self.unit_mm * values + self.offset_mm
 
     def _from_virtual(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance from the main lens, mm: the image lies v micro-lens gaps behind the grid, and the thin lens law."""
+        """Distance from the main lens, mm: the image lies v micro-lens gaps behind the grid, and
+        the thin lens law.
+        """
         assert self.lens is not None
         f, to_grid, gap = self.lens
         v = values if self.virtual == "v" else 1.0 / (1.0 - np.where(values < 1.0, values, np.nan))
@@ -143,10 +155,11 @@ def read_profile(path: Path) -> Profile:
         return Profile(**{"name": name or path.name, **shipped.get(str(name), {}), **table})
     except ValidationError as error:
         first = error.errors()[0]
-        key, why = (
-            ".".join(str(part) for part in first["loc"]),
-            str(first["msg"]).removeprefix("Value error, "),
-        )
+        key = ".".join(str(part) for part in first["loc"])
+        why = str(first["msg"]).removeprefix("Value error, ")
         if first["type"] == "missing":
-            why = f'is not stated; name a profile that has it, as in profile = "{next(iter(shipped))}"'
+            why = (
+                "is not stated; name a profile that has it, as in profile = "
+                f'"{next(iter(shipped))}"'
+            )
         raise RecordingError(f"{path}: {f'{key} {why}' if key else why}") from None

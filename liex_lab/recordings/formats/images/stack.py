@@ -1,4 +1,6 @@
-"""Pictures of one size in order, as stored: what a stack of any kind promises, and one made of single files."""
+"""Pictures of one size in order, as stored: what a stack of any kind promises, and one made of
+single files.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ Size = tuple[int, int]  # width, height, pixels
 
 
 class Stack(Protocol):
-    """Pictures of one size, in order; `read` gives stored values (H, W), or None where a picture is cut or damaged."""
+    """Pictures of one size, in order; `read` gives stored values (H, W), or None where a picture is
+    cut or damaged.
+    """
 
     @property
     def width(self) -> int:
@@ -30,7 +34,9 @@ class Stack(Protocol):
 
     @property
     def whole(self) -> list[bool]:
-        """Which pictures are not cut short or damaged, as far as that shows without decoding them."""
+        """Which pictures are not cut short or damaged, as far as that shows without
+        decoding them.
+        """
 
     @property
     def problems(self) -> list[str]:
@@ -43,7 +49,9 @@ class Stack(Protocol):
     def __len__(self) -> int: ...
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values (H, W), or (H, W, 3) of colour pictures; None where the picture is cut or damaged."""
+        """Stored values (H, W), or (H, W, 3) of colour pictures; None where the picture is cut or
+        damaged.
+        """
 
     def label(self, index: int) -> str:
         """The file of a picture, for a sentence."""
@@ -53,7 +61,9 @@ class Stack(Protocol):
 
 
 class Look(NamedTuple):
-    """What a file says before its picture is decoded. size: None where it is cut or damaged; why: what else it is."""
+    """What a file says before its picture is decoded. size: None where it is cut or damaged; why:
+    what else it is.
+    """
 
     size: Size | None
     why: RecordingError | None = None
@@ -105,7 +115,9 @@ def open_files(
     decode: Callable[[Path], NDArray[Any] | None],
     progress: Progress,
 ) -> FileStack:
-    """Look at every file without decoding any; `look` raises for a picture that is whole but no depth."""
+    """Look at every file without decoding any; `look` raises for a picture that is whole but no
+    depth.
+    """
     looks = []
     for number, path in enumerate(files, start=1):
         looks.append(look(path))
@@ -138,7 +150,8 @@ def something_else(path: Path, kind: str) -> Look:
     return Look(
         None,
         RecordingError(
-            f"{path} is named like a {kind} picture but holds something else; remove it or give it its name"
+            f"{path} is named like a {kind} picture but holds something else; remove it or give it "
+            "its name"
         ),
     )
 
@@ -152,8 +165,10 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
     """The sentence for a picture that cannot hold depth."""
     article = "an" if found.startswith(("8", "11", "18")) else "a"
     return RecordingError(
-        f"expected 16-bit depth, got {article} {found} image of {width} x {height} pixels ({where}); give the camera's "
-        'depth pictures, or choose them with a line such as pattern = "*_depth.png" under [camera] in camera.toml'
+        f"expected 16-bit depth, got {article} {found} image of {width} x {height} pixels "
+        f"({where}); give the camera's "
+        'depth pictures, or choose them with a line such as pattern = "*_depth.png" under '
+        "[camera] in camera.toml"
     )
 
 
@@ -161,6 +176,6 @@ def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
     """The sentence for pictures of several sizes in one recording."""
     (one, w, h), (other, v, g) = pictures[:2]
     return RecordingError(
-        f"all pictures of a recording have one size, but {one} has {w} x {h} pixels and {other} {v} x {g}; "
-        "put them into two folders"
+        f"all pictures of a recording have one size, but {one} has {w} x {h} pixels and {other} "
+        f"{v} x {g}; put them into two folders"
     )

@@ -21,14 +21,17 @@ from liex_lab.recordings.formats.images.stack import (
 )
 from liex_lab.runtime.progress import Progress
 
-# tifffile reports damage twice, as an exception and in the log; the log would come out between our sentences
+# tifffile reports damage twice, as an exception and in the log; the log would come out between our
+# sentences
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 class _Page(NamedTuple):
-    """One picture: its page, and where its pixels lie when they are plain bytes in one piece (else offset -1)."""
+    """One picture: its page, and where its pixels lie when they are plain bytes in one piece (else
+    offset -1).
+    """
 
     path: Path
     page: int
@@ -39,7 +42,9 @@ class _Page(NamedTuple):
 
 @dataclass
 class TiffStack:
-    """TIFF pictures of one size, in order; whole: which of them are not cut short. One file is open at a time."""
+    """TIFF pictures of one size, in order; whole: which of them are not cut short. One file is open
+    at a time.
+    """
 
     pages: list[_Page]
     width: int
@@ -81,7 +86,8 @@ class TiffStack:
     def _decode(self, page: _Page) -> NDArray[Any] | None:
         if self._open_path != page.path:
             self.close()
-            self._open, self._open_path = tifffile.TiffFile(page.path), page.path
+            self._open = tifffile.TiffFile(page.path)
+            self._open_path = page.path
         assert self._open is not None
         try:
             return self._open.asarray(key=page.page)
@@ -101,7 +107,9 @@ class TiffStack:
 
 
 def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
-    """LZW and other codecs that tifffile leaves to another package; None where OpenCV cannot either."""
+    """LZW and other codecs that tifffile leaves to another package; None where OpenCV cannot
+    either.
+    """
     import cv2
 
     try:
@@ -138,7 +146,8 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
 
 
 def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
-    """The pictures of one file in order, their (width, height), and whether the list of pages comes to its end.
+    """The pictures of one file in order, their (width, height), and whether the list of pages comes
+    to its end.
 
     No pictures and no size where the directory is cut off.
     """
@@ -166,7 +175,8 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
     except RecordingError:
         if not any(page.whole for page in listed):
             raise
-        # damage inside a directory, or a picture of another kind behind the depth: the stack ends before it
+        # damage inside a directory, or a picture of another kind behind the depth: the stack ends
+        # before it
         return listed, size, False
     except (
         Exception
@@ -175,8 +185,11 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
 
 
 def _list_ends(tif: tifffile.TiffFile) -> bool:
-    """Whether the last page that was found says that it is the last: each page ends with the place of the next."""
-    layout, last = tif.tiff, tif.pages[len(tif.pages) - 1]
+    """Whether the last page that was found says that it is the last: each page ends with the place
+    of the next.
+    """
+    layout = tif.tiff
+    last = tif.pages[len(tif.pages) - 1]
     file = tif.filehandle
     file.seek(last.offset)
     n_tags = int.from_bytes(
@@ -187,7 +200,9 @@ def _list_ends(tif: tifffile.TiffFile) -> bool:
 
 
 def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
-    width, height, dtype = int(page.imagewidth), int(page.imagelength), np.dtype(page.dtype or "V1")
+    width = int(page.imagewidth)
+    height = int(page.imagelength)
+    dtype = np.dtype(page.dtype or "V1")
     if (
         page.samplesperpixel != 1
         or dtype.kind + str(dtype.itemsize) not in ("u2", "f4")
@@ -201,7 +216,8 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
     plain = (
         page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
     )
-    # without compression the size follows from the bytes; a directory that contradicts itself is damaged
+    # without compression the size follows from the bytes; a directory that contradicts itself is
+    # damaged
     agrees = page.compression != 1 or sum(page.databytecounts) == width * height * dtype.itemsize
     return _Page(
         path=path,
@@ -213,7 +229,9 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
 
 
 def _imagej_stack(tif: tifffile.TiffFile, first: _Page, size_bytes: int) -> list[_Page]:
-    """ImageJ describes a stack of over 4 GB as one page; its other pictures follow the first without a gap."""
+    """ImageJ describes a stack of over 4 GB as one page; its other pictures follow the first
+    without a gap.
+    """
     shape = tif.series[0].shape if tif.series else ()
     n_pictures = int(np.prod(shape[:-2])) if len(shape) > 2 else 1
     if n_pictures == 1 or first.offset < 0:

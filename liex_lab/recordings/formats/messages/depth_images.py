@@ -1,4 +1,6 @@
-"""Pictures and point clouds out of messages, as depth: the decoders that MCAP files and ROS bags share."""
+"""Pictures and point clouds out of messages, as depth: the decoders that MCAP files and ROS bags
+share.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ _PNG_HEAD = 26
 
 
 def picture_size(message: DepthMessage) -> tuple[int, int] | None:
-    """Width and height of a depth picture; None for a picture of another kind, and (0, 0) for points without rows."""
+    """Width and height of a depth picture; None for a picture of another kind, and (0, 0) for
+    points without rows.
+    """
     if isinstance(message, PointCloud):
         known = {"x", "y", "z"} <= set(
             message.columns
@@ -87,8 +91,8 @@ def decode(
 ) -> Depth | None:
     """Depth (H, W) float32 mm of the camera's size; None where the message holds no such picture.
 
-    step_mm: millimetres in a step of 16-bit depth; scale: what a camera.toml multiplies all depth by, and unread what
-    it calls unread.
+    step_mm: millimetres in a step of 16-bit depth; scale: what a camera.toml multiplies all depth
+    by, and unread what it calls unread.
     """
     if picture_size(message) not in ((camera.width, camera.height), (0, 0)):
         return None
@@ -110,7 +114,8 @@ def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
     dtype = np.dtype(_ENCODINGS[message.encoding][0]).newbyteorder(
         ">" if message.big_endian else "<"
     )
-    width, height = message.width, message.height
+    width = message.width
+    height = message.height
     step = message.step or width * dtype.itemsize
     # some writers leave out the padding of the last row
     if step < width * dtype.itemsize or step * (height - 1) + width * dtype.itemsize > len(
@@ -145,9 +150,13 @@ def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
 
 
 def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | None:
-    """Depth (H, W) mm: of points in rows their z, of others that of the nearest point that each pixel sees."""
+    """Depth (H, W) mm: of points in rows their z, of others that of the nearest point that each
+    pixel sees.
+    """
     points = {name: _column(cloud, name) for name in ("x", "y", "z")}
-    x, y, z = points["x"], points["y"], points["z"]
+    x = points["x"]
+    y = points["y"]
+    z = points["z"]
     if x is None or y is None or z is None:
         return None
     if cloud.pose is not None:
@@ -170,7 +179,9 @@ def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | Non
 
 
 def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
-    """One coordinate (height, width) of the points, m; None where the data are shorter than they should be."""
+    """One coordinate (height, width) of the points, m; None where the data are shorter than they
+    should be.
+    """
     offset, kind = cloud.columns[name]
     dtype = np.dtype(kind)
     row_step = cloud.row_step if cloud.height > 1 else 0
@@ -182,7 +193,8 @@ def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
     )
     if not cloud.width or offset + dtype.itemsize > cloud.point_step or last > len(cloud.data):
         return None
-    shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)
+    shape = (cloud.height, cloud.width)
+    strides = (row_step, cloud.point_step)
     return np.ndarray(shape, dtype, cloud.data, offset, strides).astype(np.float64)
 
 
@@ -190,10 +202,12 @@ def _moved(
     pose: tuple[float, ...], x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """The points in the camera's frame: p + q v q*, written out."""
-    at, turn = np.array(pose[:3]), np.array(pose[3:])
+    at = np.array(pose[:3])
+    turn = np.array(pose[3:])
     norm = float(np.linalg.norm(turn))
     qx, qy, qz, qw = turn / norm if norm > 0 else (0.0, 0.0, 0.0, 1.0)
-    q, v = np.array([qx, qy, qz]), np.stack([x, y, z], axis=-1)
+    q = np.array([qx, qy, qz])
+    v = np.stack([x, y, z], axis=-1)
     t = 2.0 * np.cross(q, v)
     moved = v + qw * t + np.cross(q, t) + at
     return moved[..., 0], moved[..., 1], moved[..., 2]

@@ -44,8 +44,8 @@ from liex_lab.runtime.progress import Progress
 # 16-bit pictures too, but of brightness: not chosen unless asked for
 _INFRARED = re.compile(r"(^|[/_])(ir|infra\d*|infrared\w*)([/_]|$)", re.IGNORECASE)
 _EXPECTED = (
-    "expected foxglove.RawImage or CompressedImage, or sensor_msgs Image or CompressedImage, with the encoding 16UC1, "
-    "mono16 or 32FC1 or as 16-bit PNG, or a point cloud"
+    "expected foxglove.RawImage or CompressedImage, or sensor_msgs Image or CompressedImage, with "
+    "the encoding 16UC1, mono16 or 32FC1 or as 16-bit PNG, or a point cloud"
 )
 _LIMIT_NS = 2**62  # the year 2116
 _DAMAGE = (ValueError, TypeError, KeyError, OverflowError, struct.error)
@@ -54,7 +54,9 @@ _FACTS = ("subject_id", "session_start_time")
 
 @dataclass
 class _Topic:
-    """The depth messages of one topic, in file order, and what its first one says. size: (0, 0) for loose points."""
+    """The depth messages of one topic, in file order, and what its first one says. size: (0, 0) for
+    loose points.
+    """
 
     channel: Channel
     parse: Parser
@@ -78,14 +80,18 @@ class _Topic:
         self.places.extend(message.place)
 
     def forget(self, chunk: int) -> None:
-        """Forget the messages of this chunk and those after it: they are at the end, and will be met again."""
+        """Forget the messages of this chunk and those after it: they are at the end, and will be
+        met again.
+        """
         while self.places and self.places[-3] >= chunk:
             del self.places[-3:], self.log_ns[-1], self.stamp_ns[-1]
 
 
 @dataclass
 class _Found:
-    """What a file holds. calibrations and units: by topic; parsers: None of channels that are of no use."""
+    """What a file holds. calibrations and units: by topic; parsers: None of channels that are of no
+    use.
+    """
 
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
     depths: dict[Channel, _Topic] = field(default_factory=dict)
@@ -106,13 +112,21 @@ class _Frames:
         camera_file: CameraFile,
         problems: list[str],
     ) -> None:
-        self._file, self._topic, self._camera, self._step_mm = file, topic, camera, step_mm
+        self._file = file
+        self._topic = topic
+        self._camera = camera
+        self._step_mm = step_mm
         self._places = np.array(topic.places, np.int64).reshape(-1, 3)[order]
-        self._scale, self._unread = camera_file.unit_mm, camera_file.unread
-        self._problems, self._bad, self._lock = problems, set[int](), Lock()
+        self._scale = camera_file.unit_mm
+        self._unread = camera_file.unread
+        self._problems = problems
+        self._bad = set[int]()
+        self._lock = Lock()
 
     def read(self, number: int) -> Depth:
-        """Depth (H, W) float32 mm of one picture; one that is damaged or of another size is wholly unread."""
+        """Depth (H, W) float32 mm of one picture; one that is damaged or of another size is wholly
+        unread.
+        """
         with self._lock:
             data = self._file.read(Place(*self._places[number].tolist()))
         depth = self._decode(data)
@@ -122,8 +136,8 @@ class _Frames:
         if number not in self._bad:
             self._bad.add(number)
             self._problems.append(
-                f"frame {number} of {printable(self._topic.name)} is damaged or not of {camera.width} x "
-                f"{camera.height} pixels, and was taken as wholly unread"
+                f"frame {number} of {printable(self._topic.name)} is damaged or not of "
+                f"{camera.width} x {camera.height} pixels, and was taken as wholly unread"
             )
         return np.zeros((camera.height, camera.width), np.float32)
 
@@ -172,7 +186,8 @@ def _open(
     problems: list[str] = list(camera_file.problems)
     if not file.whole:
         problems.append(
-            f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read from it"
+            f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read "
+            "from it"
         )
     the_camera = _camera(
         path, chosen, found.calibrations, camera_file, camera, file.notes, problems
@@ -204,17 +219,18 @@ def _open(
 
 
 def _stamps(topic: _Topic, order: NDArray[np.int64], problems: list[str]) -> NDArray[np.int64]:
-    """The sensor's stamps; the times of logging instead when pictures have none (zero), for two clocks do not mix."""
-    stamps, logged = (
-        np.array(topic.stamp_ns, np.int64)[order],
-        np.array(topic.log_ns, np.int64)[order],
-    )
+    """The sensor's stamps; the times of logging instead when pictures have none (zero), for two
+    clocks do not mix.
+    """
+    stamps = np.array(topic.stamp_ns, np.int64)[order]
+    logged = np.array(topic.log_ns, np.int64)[order]
     unstamped = int(((stamps == 0) & (logged != 0)).sum())
     if unstamped == 1 and len(stamps) > 1 and np.all(np.diff(stamps) > 0):
         unstamped = 0  # a clock that begins at zero with the first picture
     if unstamped:
         problems.append(
-            f"{unstamped} of {len(stamps)} pictures have no stamp of the sensor, so the times of logging are used"
+            f"{unstamped} of {len(stamps)} pictures have no stamp of the sensor, so the times of "
+            "logging are used"
         )
     return logged if unstamped else stamps
 
@@ -243,7 +259,8 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
 
 def _note(found: _Found, envelope: Envelope, parse: Parser) -> bool:
     """Take note of a message; False where it is the first picture of a topic and not depth."""
-    channel, message = envelope.channel, parse(envelope.data)
+    channel = envelope.channel
+    message = parse(envelope.data)
     if isinstance(message, Calibration):
         found.calibrations[channel.topic] = message
         return True
@@ -260,8 +277,11 @@ def _note(found: _Found, envelope: Envelope, parse: Parser) -> bool:
 
 
 def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
-    """The topic asked for, or the only one. Pictures come before point clouds, which are made of them."""
-    depths, path = list(found.depths.values()), file.path
+    """The topic asked for, or the only one. Pictures come before point clouds, which are made of
+    them.
+    """
+    depths = list(found.depths.values())
+    path = file.path
     names = ", ".join(sorted(printable(depth.name) for depth in depths))
     if topic is not None:
         for depth in depths:
@@ -277,8 +297,8 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
         if some:
             choice = sorted(printable(depth.name) for depth in some)
             raise RecordingError(
-                f"{path} holds depth pictures on {len(some)} topics, {', '.join(choice)}; choose one with --topic "
-                f"{choice[0]}, or in a plan with recording.topic"
+                f"{path} holds depth pictures on {len(some)} topics, {', '.join(choice)}; choose "
+                f"one with --topic {choice[0]}, or in a plan with recording.topic"
             )
     raise _no_depth(file)
 
@@ -323,8 +343,9 @@ def _camera(
             else " for"
         )
         raise RecordingError(
-            f"{path} holds no CameraCalibration or CameraInfo{several} {printable(topic.name)}; write a camera.toml "
-            "beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in pixels"
+            f"{path} holds no CameraCalibration or CameraInfo{several} {printable(topic.name)}; "
+            "write a camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = "
+            "... in pixels"
         )
     known = (
         (stated.width, stated.height)
@@ -334,8 +355,9 @@ def _camera(
     size = _size(topic, (known[0] or 0, known[1] or 0))
     if not min(size):
         raise RecordingError(
-            f"{path} holds points that lie in no picture on {printable(topic.name)}; write a camera.toml beside it "
-            "with [camera], width = ... and height = ... in pixels, to say which picture they are seen in"
+            f"{path} holds points that lie in no picture on {printable(topic.name)}; write a "
+            "camera.toml beside it with [camera], width = ... and height = ... in pixels, to say "
+            "which picture they are seen in"
         )
     return camera_file.camera(*size, stated)
 
@@ -343,7 +365,9 @@ def _camera(
 def _calibrated(
     topic: _Topic, where: str, calibration: Calibration, notes: dict[str, str], problems: list[str]
 ) -> Camera:
-    """The camera of a calibration; without distortion where the picture was straightened, and for points."""
+    """The camera of a calibration; without distortion where the picture was straightened, and for
+    points.
+    """
     is_cloud = plain_schema(topic.channel) in CLOUD_SCHEMAS
     straight = "rect" in topic.name.rpartition("/")[2] or is_cloud
     p = calibration.p
@@ -353,8 +377,8 @@ def _calibrated(
         bent = None if straight else Distortion.of(calibration.model, calibration.d)
     except LiexError:
         problems.append(
-            f"{printable(where)} states a lens distortion ({printable(calibration.model)}) that is not known and so "
-            "not undone"
+            f"{printable(where)} states a lens distortion ({printable(calibration.model)}) that is "
+            "not known and so not undone"
         )
     kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
     source = notes.get(
@@ -382,7 +406,9 @@ def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:
 def _calibration_of(
     topic: _Topic, calibrations: dict[str, Calibration]
 ) -> tuple[str, Calibration] | None:
-    """The calibration of the same camera: of the same frame, and among those on the topic nearest by its name."""
+    """The calibration of the same camera: of the same frame, and among those on the topic nearest
+    by its name.
+    """
     # K[0] = 0 means "not calibrated" in these messages
     usable = {
         name: c

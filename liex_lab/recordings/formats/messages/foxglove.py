@@ -53,9 +53,11 @@ def _cloud(message: Any) -> PointCloud:
         for f in message.fields
         if f.type in _FIELD_TYPES
     }
-    step, data = int(message.point_stride), message.data
+    step = int(message.point_stride)
+    data = message.data
     n = len(data) // max(step, 1)
-    at, turn = message.pose.position, message.pose.orientation
+    at = message.pose.position
+    turn = message.pose.orientation
     pose = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
     moved = any(pose[:6])
     return PointCloud(
@@ -80,7 +82,9 @@ _JSON_NAMES = {"seconds": "sec", "nanos": "nsec"}  # protobuf's name: JSON's
 
 
 class _Json:
-    """A JSON object whose keys are attributes, as protobuf's messages have them; what is missing is empty."""
+    """A JSON object whose keys are attributes, as protobuf's messages have them; what is missing is
+    empty.
+    """
 
     _TEXTS = ("frame_id", "encoding", "format", "distortion_model", "name")
     _LISTS = ("D", "K", "P")

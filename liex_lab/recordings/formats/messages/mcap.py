@@ -1,4 +1,6 @@
-"""MCAP recordings: depth in Foxglove's messages (protobuf or JSON) or in ROS's, packed or not, whole or cut."""
+"""MCAP recordings: depth in Foxglove's messages (protobuf or JSON) or in ROS's, packed or not,
+whole or cut.
+"""
 
 from __future__ import annotations
 
@@ -44,10 +46,9 @@ _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
 _BLOCK = 1 << 20
-_THREADS, _SMALL_CHUNK = (
-    2,
-    1 << 23,
-)  # chunks of so many bytes at most are unpacked before it is their turn
+# chunks of so many bytes at most are unpacked before it is their turn
+_THREADS = 2
+_SMALL_CHUNK = 1 << 23
 _FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _LARGEST_FACT = 1 << 24  # bytes of one of them
 _DAMAGE = (
@@ -71,7 +72,9 @@ def open_mcap(
     progress: Progress = silent,
     topic: str | None = None,
 ) -> Recording:
-    """One depth topic of an MCAP file as a recording. `fps` is not needed: every message has its time."""
+    """One depth topic of an MCAP file as a recording. `fps` is not needed: every message has its
+    time.
+    """
     file = path.open("rb")
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
@@ -108,7 +111,9 @@ class McapFile(MessageFile):
         return n_chunks
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
-        """Every whole message of the wanted channels, in file order; a second walk begins where the first was sure."""
+        """Every whole message of the wanted channels, in file order; a second walk begins where the
+        first was sure.
+        """
         self._learn_ending()
         with ThreadPoolExecutor(_THREADS) as unpackers:
             try:
@@ -120,7 +125,8 @@ class McapFile(MessageFile):
     def _walk(
         self, wanted: Wanted, progress: Progress, unpackers: ThreadPoolExecutor
     ) -> Iterator[Envelope]:
-        at, footer = self._sure[0], False
+        at = self._sure[0]
+        footer = False
         while at + _RECORD.size <= self.size and not footer:
             opcode, start, end = self._record(at)
             whole = end <= self.size and opcode != 0
@@ -134,7 +140,8 @@ class McapFile(MessageFile):
             elif opcode == Opcode.MESSAGE or (opcode in _FACTS and end - start <= _LARGEST_FACT):
                 data = memoryview(self.file.read(end - start))
                 yield from self._take(opcode, data, Place(-1, start, end - start), wanted)
-            at, footer = end, opcode == Opcode.FOOTER
+            at = end
+            footer = opcode == Opcode.FOOTER
             if whole and not footer:
                 self._sure = (at, len(self.chunks), self.whole)
             progress(
@@ -145,7 +152,9 @@ class McapFile(MessageFile):
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
 
     def _look_ahead(self, at: int, unpackers: ThreadPoolExecutor) -> None:
-        """Have the chunks after the one at `at` unpacked meanwhile, where the file's index says where they are."""
+        """Have the chunks after the one at `at` unpacked meanwhile, where the file's index says
+        where they are.
+        """
         n = bisect_right(self.starts, at)
         for later in self.starts[n : n + _THREADS]:
             if later + _RECORD.size + _CHUNK.size > self.size:
@@ -170,8 +179,9 @@ class McapFile(MessageFile):
         return opcode, at + _RECORD.size, at + _RECORD.size + length
 
     def _learn_ending(self) -> None:
-        """The schemas, channels and places of chunks that a finished file repeats: where the first ones are damaged,
-        they are all that tells what the messages are. A repetition that is damaged itself teaches nothing.
+        """The schemas, channels and places of chunks that a finished file repeats: where the first
+        ones are damaged, they are all that tells what the messages are. A repetition that is
+        damaged itself teaches nothing.
         """
         self.starts = []
         try:
@@ -200,7 +210,8 @@ class McapFile(MessageFile):
         self.file.seek(start)
         crc = 0
         while start < end and (block := self.file.read(min(_BLOCK, end - start))):
-            crc, start = zlib.crc32(block, crc), start + len(block)
+            crc = zlib.crc32(block, crc)
+            start = start + len(block)
         return crc
 
     def _walk_chunk(self, start: int, length: int, wanted: Wanted) -> Iterator[Envelope]:
@@ -216,7 +227,8 @@ class McapFile(MessageFile):
         at = 0
         while at + _RECORD.size <= len(data):
             opcode, length = _RECORD.unpack_from(data, at)
-            begin, at = at + _RECORD.size, at + _RECORD.size + length
+            begin = at + _RECORD.size
+            at = at + _RECORD.size + length
             if at > len(data) or opcode == 0:
                 break
             yield from self._take(opcode, data[begin:at], Place(number, begin, length), wanted)

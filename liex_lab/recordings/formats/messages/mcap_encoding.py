@@ -1,4 +1,6 @@
-"""Depth pictures and calibrations as the bytes of a message: Foxglove's in protobuf, or ROS 2's in CDR."""
+"""Depth pictures and calibrations as the bytes of a message: Foxglove's in protobuf, or ROS 2's in
+CDR.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ class Schema(NamedTuple):
 
 
 class Messages(ABC):
-    """A kind of messages. profile and encoding: MCAP's names for it; raw, packed, lens: the definitions."""
+    """A kind of messages. profile and encoding: MCAP's names for it; raw, packed, lens: the
+    definitions.
+    """
 
     profile: str
     encoding: str
@@ -67,14 +71,17 @@ def _distortion(camera: Camera) -> tuple[str, list[float]]:
 class FoxgloveMessages(Messages):
     """foxglove.RawImage, CompressedImage and CameraCalibration."""
 
-    profile, encoding = "", "protobuf"
+    profile = ""
+    encoding = "protobuf"
 
     def __init__(self) -> None:
         from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
         from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
         from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-        self._raw, self._packed, self._lens = RawImage, CompressedImage, CameraCalibration
+        self._raw = RawImage
+        self._packed = CompressedImage
+        self._lens = CameraCalibration
         self.raw, self.packed, self.lens = map(
             _protobuf_schema, (RawImage, CompressedImage, CameraCalibration)
         )
@@ -156,7 +163,10 @@ uint32 binning_x
 uint32 binning_y
 sensor_msgs/RegionOfInterest roi
 """
-_REGION = f"{_PART}sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\n"
+_REGION = (
+    f"{_PART}sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 "
+    "width\n"
+)
 
 
 def _ros_schema(name: str, *parts: str) -> Schema:
@@ -166,7 +176,8 @@ def _ros_schema(name: str, *parts: str) -> Schema:
 class RosMessages(Messages):
     """sensor_msgs/msg/Image, CompressedImage and CameraInfo."""
 
-    profile, encoding = "ros2", "cdr"
+    profile = "ros2"
+    encoding = "cdr"
     raw = _ros_schema("sensor_msgs/msg/Image", _IMAGE, _HEADER)
     packed = _ros_schema("sensor_msgs/msg/CompressedImage", _COMPRESSED, _HEADER)
     lens = _ros_schema(
@@ -206,7 +217,8 @@ class RosMessages(Messages):
 
 
 class _Cdr:
-    """ROS 2's layout: little endian, numbers at multiples of their size, which count from behind the first four bytes.
+    """ROS 2's layout: little endian, numbers at multiples of their size, which count from behind
+    the first four bytes.
 
     It begins with a header.
     """
@@ -216,7 +228,8 @@ class _Cdr:
         seconds, nanoseconds = divmod(time_ns, _SECOND)
         if not -(2**31) <= seconds < 2**31:
             raise RecordingError(
-                f"a time of {seconds} s does not fit into ROS's messages, which end in 2038; write it without --ros"
+                f"a time of {seconds} s does not fit into ROS's messages, which end in 2038; write "
+                "it without --ros"
             )
         self.content += struct.pack("<iI", seconds, nanoseconds)
         self.text(FRAME_ID)

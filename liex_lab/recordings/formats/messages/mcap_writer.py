@@ -28,7 +28,8 @@ _CHUNK_BYTES = (
 
 
 class McapDepthWriter(RecordingWriter):
-    """Whole millimetres are 16UC1; from the first frame on that is something else, depth is 32FC1 in metres.
+    """Whole millimetres are 16UC1; from the first frame on that is something else, depth is 32FC1
+    in metres.
 
     `mcap`'s own writer: Foxglove's goes on without a word when the disk is full.
     """
@@ -42,9 +43,13 @@ class McapDepthWriter(RecordingWriter):
         packing: Literal["raw", "png"] = "raw",
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        """messages: Foxglove's in protobuf, or ROS 2's; packing: of a picture within its chunk; metadata: kept too."""
+        """messages: Foxglove's in protobuf, or ROS 2's; packing: of a picture within its chunk;
+        metadata: kept too.
+        """
         super().__init__(path, camera)
-        self._packing, self._float, self._n_off = packing, False, 0
+        self._packing = packing
+        self._float = False
+        self._n_off = 0
         self._calibrated_ns: int | None = None
         self._messages: Messages = RosMessages() if messages == "ros" else FoxgloveMessages()
         self._file = path.open("wb")
@@ -62,7 +67,9 @@ class McapDepthWriter(RecordingWriter):
         return self._writer.register_channel(topic, self._messages.encoding, number)
 
     def add(self, frame: DepthFrame) -> None:
-        """Write a picture, and about once a second the calibration, so that a viewer may start anywhere."""
+        """Write a picture, and about once a second the calibration, so that a viewer may start
+        anywhere.
+        """
         time_ns = frame.time_ns
         if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
             self._calibrated_ns = time_ns
@@ -80,12 +87,14 @@ class McapDepthWriter(RecordingWriter):
             )
         steps = None if self._float else whole_steps(frame.depth, 1.0)
         if steps is not None:
-            data, encoding = steps.astype("<u2", copy=False).tobytes(), "16UC1"
+            data = steps.astype("<u2", copy=False).tobytes()
+            encoding = "16UC1"
         else:
             self._float = True
             scaled, n_off = metres(frame.depth)
             self._n_off += n_off
-            data, encoding = scaled.astype("<f4", copy=False).tobytes(), "32FC1"
+            data = scaled.astype("<f4", copy=False).tobytes()
+            encoding = "32FC1"
         size = self.camera.width, self.camera.height
         return self._messages.raw_picture(frame.time_ns, size, encoding, data)
 
@@ -96,7 +105,8 @@ class McapDepthWriter(RecordingWriter):
             self.notes.append("depth is not in whole millimetres and was written as 32-bit metres")
         if self._n_off:
             self.notes.append(
-                f"{self._n_off} depths differ in the last of their 24 bits, which metres do not hold"
+                f"{self._n_off} depths differ in the last of their 24 bits, which metres do not "
+                "hold"
             )
 
     def release(self) -> None:

@@ -1,7 +1,7 @@
 """Files of messages on named topics: what MCAP files and ROS bags have in common.
 
-A file is walked once from its beginning to its end, which needs no index and so reads cut files too; afterwards every
-message is fetched from its place.
+A file is walked once from its beginning to its end, which needs no index and so reads cut files
+too; afterwards every message is fetched from its place.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ from typing import IO, NamedTuple
 from liex_lab.errors import RecordingError
 from liex_lab.runtime.progress import Progress
 
-# A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many zeros as one likes.
+# A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many
+# zeros as one likes.
 _LARGEST_CHUNK = 1 << 27
 
 
 class Place(NamedTuple):
-    """Where a message's data lies: in the file, or (chunk >= 0) in the unpacked bytes of a chunk."""
+    """Where a message's data lies: in the file, or (chunk >= 0) in the unpacked bytes of a
+    chunk.
+    """
 
     chunk: int
     offset: int
@@ -30,7 +33,9 @@ class Place(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """What is on a topic. schema: the message's type, as in sensor_msgs/Image; encoding: protobuf, json, ros1, cdr."""
+    """What is on a topic. schema: the message's type, as in sensor_msgs/Image; encoding: protobuf,
+    json, ros1, cdr.
+    """
 
     topic: str
     schema: str
@@ -47,7 +52,8 @@ class Envelope(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Messages packed together. offset, length: of the packed bytes in the file; size: unpacked; crc: 0 for none.
+    """Messages packed together. offset, length: of the packed bytes in the file; size: unpacked;
+    crc: 0 for none.
 
     cut: the file ends before the chunk does.
     """
@@ -67,12 +73,14 @@ class DamagedChunk(Exception):
 class MessageFile(ABC):
     """An open file of messages.
 
-    whole: the file ends as it should and nothing in it was found damaged; channels: all that were met; notes: facts
-    that the file states about itself.
+    whole: the file ends as it should and nothing in it was found damaged; channels: all that were
+    met; notes: facts that the file states about itself.
     """
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
-        self.path, self.file, self.size = path, file, path.stat().st_size
+        self.path = path
+        self.file = file
+        self.size = path.stat().st_size
         self.whole = True
         self.channels: list[Channel] = []
         self.notes: dict[str, str] = {}
@@ -87,13 +95,15 @@ class MessageFile(ABC):
         """Every whole message of the wanted channels, in file order."""
 
     def go_on(self) -> int | None:
-        """Make ready for a walk over what was written behind the last whole record since; returns how many chunks the
-        walks before are sure of, None where the file has to be opened anew.
+        """Make ready for a walk over what was written behind the last whole record since; returns
+        how many chunks the walks before are sure of, None where the file has to be opened anew.
         """
         return None
 
     def resume(self, at: int) -> int:
-        """Where to go on behind a record at `at` that is damaged: at the next chunk that is known, or the end."""
+        """Where to go on behind a record at `at` that is damaged: at the next chunk that is known,
+        or the end.
+        """
         self.whole = False
         n = bisect_right(self.starts, at)
         return self.starts[n] if n < len(self.starts) else self.size
@@ -128,7 +138,9 @@ class MessageFile(ABC):
 
 
 def unpacked(packed: bytes, chunk: Chunk) -> bytes:
-    """A chunk's bytes. Of one that is cut, as many as there are: what lies before the cut is as it was written."""
+    """A chunk's bytes. Of one that is cut, as many as there are: what lies before the cut is as it
+    was written.
+    """
     try:
         data = _inflate(packed, chunk.packing, chunk.size)
     except DamagedChunk:
@@ -145,7 +157,9 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
 
 
 def _inflate(packed: bytes, packing: str, size: int) -> bytes:
-    """At most `size` bytes. Piece by piece, so that a chunk that is cut gives what it still holds."""
+    """At most `size` bytes. Piece by piece, so that a chunk that is cut gives what it still
+    holds.
+    """
     if packing in ("", "none"):
         return packed[:size]
     if packing == "zstd":

@@ -25,7 +25,9 @@ class DamagedMessage(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RawPicture:
-    """Pixels as they are. encoding: 16UC1, mono16, 32FC1, ...; step: bytes from one row to the next."""
+    """Pixels as they are. encoding: 16UC1, mono16, 32FC1, ...; step: bytes from one row to the
+    next.
+    """
 
     stamp_ns: int
     frame_id: str
@@ -49,10 +51,11 @@ class PackedPicture:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """Points in metres. width, height: of the picture they lie in, row by row; height 1: they lie anyhow.
+    """Points in metres. width, height: of the picture they lie in, row by row; height 1: they lie
+    anyhow.
 
-    columns: where within a point x, y and z lie, and NumPy's name of their type; pose: position (3) m and quaternion
-    x, y, z, w of the cloud's own frame, None where the points are in the camera's.
+    columns: where within a point x, y and z lie, and NumPy's name of their type; pose: position (3)
+    m and quaternion x, y, z, w of the cloud's own frame, None where the points are in the camera's.
     """
 
     stamp_ns: int
@@ -68,7 +71,9 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A camera's lens. k: row-major 3 x 3; d: distortion; p: row-major 3 x 4, of the rectified picture; or empty."""
+    """A camera's lens. k: row-major 3 x 3; d: distortion; p: row-major 3 x 4, of the rectified
+    picture; or empty.
+    """
 
     frame_id: str
     width: int

@@ -19,7 +19,9 @@ def plain_schema(channel: Channel) -> str:
 
 
 def parser_of(channel: Channel) -> Parser | None:
-    """What turns this channel's messages into ours; None for messages that say nothing about depth."""
+    """What turns this channel's messages into ours; None for messages that say nothing
+    about depth.
+    """
     schema = plain_schema(channel)
     if schema == UNIT_SCHEMA and not channel.topic.endswith(UNIT_TOPIC):
         return None

@@ -1,7 +1,9 @@
-"""The few `sensor_msgs` that hold depth, as ROS 1 and ROS 2 (CDR) lay them out, read without copying the pixels.
+"""The few `sensor_msgs` that hold depth, as ROS 1 and ROS 2 (CDR) lay them out, read without
+copying the pixels.
 
-Their definitions have been the same for as long as there are recordings, so they are written down here; both systems
-order the fields alike and differ in alignment, in the header and in the zero at a string's end.
+Their definitions have been the same for as long as there are recordings, so they are written down
+here; both systems order the fields alike and differ in alignment, in the header and in the zero at
+a string's end.
 """
 
 from __future__ import annotations
@@ -28,17 +30,22 @@ _MOST_FIELDS = 256
 class _Fields:
     """Reads one field after the other: ROS 1, little endian, nothing aligned."""
 
-    order, origin, aligned, end_of_text = "<", 0, False, 0
+    order = "<"
+    origin = 0
+    aligned = False
+    end_of_text = 0
 
     def __init__(self, data: memoryview) -> None:
-        self.data, self.at = data, self.origin
+        self.data = data
+        self.at = self.origin
 
     def numbers(self, kind: str, n: int = 1) -> tuple[float, ...]:
         """`n` numbers of a type, as `struct` names it."""
         size = struct.calcsize(f"<{kind}")
         if self.aligned:
             self.at += (self.origin - self.at) % size
-        begin, self.at = self.at, self.at + n * size
+        begin = self.at
+        self.at = self.at + n * size
         if self.at > len(self.data):
             raise DamagedMessage("a message ends too early")
         return struct.unpack_from(f"{self.order}{n}{kind}", self.data, begin)
@@ -57,7 +64,8 @@ class _Fields:
     def blob(self) -> memoryview:
         """Bytes with their number before them."""
         n = self.whole()
-        begin, self.at = self.at, self.at + n
+        begin = self.at
+        self.at = self.at + n
         if self.at > len(self.data):
             raise DamagedMessage("a message ends too early")
         return self.data[begin : self.at]
@@ -74,9 +82,13 @@ class _Fields:
 
 
 class _CdrFields(_Fields):
-    """The same in ROS 2: four bytes that tell the byte order, numbers aligned, strings with a zero, no counter."""
+    """The same in ROS 2: four bytes that tell the byte order, numbers aligned, strings with a zero,
+    no counter.
+    """
 
-    origin, aligned, end_of_text = 4, True, 1
+    origin = 4
+    aligned = True
+    end_of_text = 1
 
     def __init__(self, data: memoryview) -> None:
         super().__init__(data)
@@ -90,8 +102,11 @@ class _CdrFields(_Fields):
 
 def _image(fields: _Fields) -> RawPicture:
     stamp_ns, frame_id = fields.header()
-    height, width = fields.whole(), fields.whole()
-    encoding, big_endian, step = fields.text(), fields.whole("B"), fields.whole()
+    height = fields.whole()
+    width = fields.whole()
+    encoding = fields.text()
+    big_endian = fields.whole("B")
+    step = fields.whole()
     return RawPicture(
         stamp_ns, frame_id, width, height, encoding, step, bool(big_endian), fields.blob()
     )
@@ -104,15 +119,21 @@ def _packed_image(fields: _Fields) -> PackedPicture:
 
 def _camera_info(fields: _Fields) -> Calibration:
     _, frame_id = fields.header()
-    height, width = fields.whole(), fields.whole()
-    model, d = fields.text(), fields.floats()
-    k, _, p = fields.numbers("d", 9), fields.numbers("d", 9), fields.numbers("d", 12)
+    height = fields.whole()
+    width = fields.whole()
+    model = fields.text()
+    d = fields.floats()
+    k = fields.numbers("d", 9)
+    _ = fields.numbers("d", 9)
+    p = fields.numbers("d", 12)
     return Calibration(frame_id, width, height, model, d, k, p)
 
 
 def _cloud(fields: _Fields) -> PointCloud:
     stamp_ns, frame_id = fields.header()
-    height, width, n_fields = fields.whole(), fields.whole(), fields.whole()
+    height = fields.whole()
+    width = fields.whole()
+    n_fields = fields.whole()
     if n_fields > _MOST_FIELDS:
         raise DamagedMessage(f"a cloud's points have {n_fields} fields")
     found = []
@@ -123,7 +144,9 @@ def _cloud(fields: _Fields) -> PointCloud:
     columns = {
         name: (at, order + _FIELD_TYPES[kind]) for name, at, kind in found if kind in _FIELD_TYPES
     }
-    point_step, row_step, data = fields.whole(), fields.whole(), fields.blob()
+    point_step = fields.whole()
+    row_step = fields.whole()
+    data = fields.blob()
     return PointCloud(stamp_ns, frame_id, width, height, columns, point_step, row_step, data)
 
 

@@ -1,7 +1,9 @@
-"""ROS bags: `.bag` files of ROS 1 (and of the RealSense programs) and `.db3` files of ROS 2, whole or cut.
+"""ROS bags: `.bag` files of ROS 1 (and of the RealSense programs) and `.db3` files of ROS 2, whole
+or cut.
 
-A `.bag` is walked from its beginning and needs no index, which is written last and so is missing exactly where a
-recording broke off; `rosbags`, the library that the tests compare with, refuses such files.
+A `.bag` is walked from its beginning and needs no index, which is written last and so is missing
+exactly where a recording broke off; `rosbags`, the library that the tests compare with, refuses
+such files.
 """
 
 from __future__ import annotations
@@ -33,7 +35,11 @@ _VERSION = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
-_MESSAGE, _HEADER, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
+_MESSAGE = 2
+_HEADER = 3
+_CHUNK = 5
+_CHUNK_INFO = 6
+_CONNECTION = 7
 _LARGEST_HEADER = 1 << 24  # bytes; a connection's holds the definition of its messages
 _DAMAGE = (KeyError, ValueError, OverflowError, struct.error)
 
@@ -45,7 +51,9 @@ def open_bag(
     progress: Progress = silent,
     topic: str | None = None,
 ) -> Recording:
-    """One depth topic of a ROS bag as a recording. `fps` is not needed: every message has its time."""
+    """One depth topic of a ROS bag as a recording. `fps` is not needed: every message has
+    its time.
+    """
     file = path.open("rb")
     magic = file.read(len(_SQLITE))
     if magic.startswith(_VERSION):
@@ -55,7 +63,8 @@ def open_bag(
     file.close()
     if magic.startswith(_MAGIC):
         raise RecordingError(
-            f"{path} is a bag of an old ROS; bring it to version 2.0 with `rosbag fix` and give that"
+            f"{path} is a bag of an old ROS; bring it to version 2.0 with `rosbag fix` and give "
+            "that"
         )
     raise RecordingError(
         f"{path} is named like a ROS bag but holds something else; give another file"
@@ -71,7 +80,8 @@ class BagFile(MessageFile):
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
         """Every whole message of the wanted channels, in file order."""
-        at, indexed = len(_VERSION), False
+        at = len(_VERSION)
+        indexed = False
         while at + _U32.size <= self.size:
             try:
                 header, begin, end = self._record(at)
@@ -90,7 +100,8 @@ class BagFile(MessageFile):
                     )
                 at = end
             except DamagedChunk:
-                self.whole, at = False, end
+                self.whole = False
+                at = end
             except (*_DAMAGE, IndexError):
                 at = self.resume(at)
             progress(
@@ -113,7 +124,9 @@ class BagFile(MessageFile):
         return _fields(memoryview(block)[:n_header]), begin, begin + n_data
 
     def _learn_ending(self, header: dict[str, bytes]) -> bool:
-        """The connections and places of chunks that the index at the end repeats; False where there is no index."""
+        """The connections and places of chunks that the index at the end repeats; False where there
+        is no index.
+        """
         if header.get("encryptor"):
             raise RecordingError(
                 f"{self.path} is an encrypted bag, which cannot be read; give it without encryption"
@@ -186,7 +199,9 @@ class BagFile(MessageFile):
 
 
 def _fields(header: memoryview) -> dict[str, bytes]:
-    """The named fields of a header: each with its length before it, and an = between name and value."""
+    """The named fields of a header: each with its length before it, and an = between name and
+    value.
+    """
     fields: dict[str, bytes] = {}
     at = 0
     while at < len(header):
@@ -204,7 +219,8 @@ class Db3File(MessageFile):
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         super().__init__(path, file)
-        # opened by several threads, of which one reads at a time; immutable: no lock file is made beside it
+        # opened by several threads, of which one reads at a time; immutable: no lock file is made
+        # beside it
         uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
         self._base = sqlite3.connect(uri, uri=True, check_same_thread=False)
 

@@ -1,4 +1,6 @@
-"""A session out of a .tar.gz: streamed once, and every byte that a cut archive still holds is kept."""
+"""A session out of a .tar.gz: streamed once, and every byte that a cut archive still holds
+is kept.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ _GZIP_MAGIC = b"\x1f\x8b"
 
 @dataclass(frozen=True)
 class Unpacked:
-    """What came out of an archive. files: by plain names; seen: all names; cut: the archive is cut or damaged."""
+    """What came out of an archive. files: by plain names; seen: all names; cut: the archive is cut
+    or damaged.
+    """
 
     files: dict[str, Path]
     seen: frozenset[str]
@@ -37,17 +41,22 @@ class Unpacked:
 class _Patient:
     """The unpacked bytes of a tar, followed by zeros without end once the archive breaks off.
 
-    tarfile throws away the block in which an archive ends too early. Here it never ends, and `n_true` says how many of
-    the bytes were real; a tar ends in zeros by itself, so the walk over its members ends too.
+    tarfile throws away the block in which an archive ends too early. Here it never ends, and
+    `n_true` says how many of the bytes were real; a tar ends in zeros by itself, so the walk over
+    its members ends too.
     """
 
     def __init__(self, file: IO[bytes], size: int, progress: Progress) -> None:
-        self._file, self._size, self._progress = file, size, progress
+        self._file = file
+        self._size = size
+        self._progress = progress
         self._zipped = file.read(2) == _GZIP_MAGIC
         file.seek(0)
         self._inflate = zlib.decompressobj(31)
-        self._buffer, self._pending = bytearray(), b""
-        self.n_true, self._n_zeros = 0, 0
+        self._buffer = bytearray()
+        self._pending = b""
+        self.n_true = 0
+        self._n_zeros = 0
         self.ended = False  # nothing more will come
         self.whole = not self._zipped  # it ended where it should
 
@@ -64,7 +73,9 @@ class _Patient:
         return block + bytes(n - len(block))
 
     def finish(self) -> None:
-        """Read to the end: a tar is over before the gzip around it is, and only gzip's end tells that it is whole."""
+        """Read to the end: a tar is over before the gzip around it is, and only gzip's end tells
+        that it is whole.
+        """
         while not self.ended:
             self._buffer.clear()
             self._fill()
@@ -104,10 +115,13 @@ class _Patient:
             self.whole = self._inflate.eof
         except zlib.error:
             self._salvage(spare)
-            self.ended, self.whole = True, False
+            self.ended = True
+            self.whole = False
 
     def _salvage(self, inflate: zlib._Decompress) -> None:
-        """What comes out before the damage: zlib keeps back all of a piece in which it finds some."""
+        """What comes out before the damage: zlib keeps back all of a piece in which it
+        finds some.
+        """
         for size in (_PIECE, 1):
             with suppress(zlib.error):
                 while self._pending:
@@ -132,7 +146,8 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
                         continue
                     if name in wanted and name in seen:
                         raise RecordingError(
-                            f"{archive} holds more than one {name}; unpack it and give the folder of one session"
+                            f"{archive} holds more than one {name}; unpack it and give the folder "
+                            "of one session"
                         )
                     seen.add(name)
                     if name in wanted:
@@ -141,8 +156,8 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
         except tarfile.TarError:
             if not seen:
                 raise RecordingError(
-                    f"{archive} should be a MoSeq session packed as .tar.gz, but nothing can be unpacked from it; "
-                    "pack the session's folder again"
+                    f"{archive} should be a MoSeq session packed as .tar.gz, but nothing can be "
+                    "unpacked from it; pack the session's folder again"
                 ) from None
             cut = True
         stream.finish()
@@ -158,7 +173,8 @@ def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Pati
         with to.open("wb") as out:
             while written < member.size:
                 block = source.read(min(_BLOCK, member.size - written))
-                # tarfile reads ahead by whole blocks, never behind: what lies beyond n_true is padding
+                # tarfile reads ahead by whole blocks, never behind: what lies beyond n_true is
+                # padding
                 real = min(len(block), max(0, stream.n_true - member.offset_data - written))
                 out.write(block[:real])
                 written += real
@@ -167,8 +183,8 @@ def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Pati
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise RecordingError(
-                f"there is no room to unpack {member.size / 1e9:.1f} GB into {to.parent}; free some, or set TMPDIR to "
-                "a folder on a larger disk"
+                f"there is no room to unpack {member.size / 1e9:.1f} GB into {to.parent}; free "
+                "some, or set TMPDIR to a folder on a larger disk"
             ) from None
         raise
     return False

@@ -1,6 +1,8 @@
-"""The depth camera of an Azure Kinect (and the Orbbec Femto, its successor): from its factory calibration, or typical.
+"""The depth camera of an Azure Kinect (and the Orbbec Femto, its successor): from its factory
+calibration, or typical.
 
-The factory states normalised numbers of the whole sensor; a depth mode shows a part of it, perhaps binned two by two.
+The factory states normalised numbers of the whole sensor; a depth mode shows a part of it, perhaps
+binned two by two.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ from liex_lab.optics.camera import Camera, Distortion
 
 
 class Mode(NamedTuple):
-    """A depth mode: size of its pictures, pixels; side of the sensor once binned; the picture's corner on it."""
+    """A depth mode: size of its pictures, pixels; side of the sensor once binned; the picture's
+    corner on it.
+    """
 
     name: str
     width: int
@@ -40,7 +44,9 @@ _DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth
 
 
 class FactoryLens(NamedTuple):
-    """What a calibration says. shares: cx, cy, fx, fy of the sensor; distortion: k1 k2 p1 p2 k3 k4 k5 k6."""
+    """What a calibration says. shares: cx, cy, fx, fy of the sensor; distortion: k1 k2 p1 p2 k3 k4
+    k5 k6.
+    """
 
     shares: tuple[float, float, float, float]
     distortion: tuple[float, ...]
@@ -52,7 +58,9 @@ def mode_of(width: int, height: int) -> Mode | None:
 
 
 def read_calibration(data: bytes) -> FactoryLens | None:
-    """The depth camera in the JSON that recorders attach to their files; None where it does not tell one."""
+    """The depth camera in the JSON that recorders attach to their files; None where it does not
+    tell one.
+    """
     try:
         cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
         depth = next(
@@ -70,7 +78,9 @@ def read_calibration(data: bytes) -> FactoryLens | None:
 
 
 def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
-    """The camera of a depth mode; pixel (0, 0) is the centre of the top-left pixel, hence the half."""
+    """The camera of a depth mode; pixel (0, 0) is the centre of the top-left pixel, hence
+    the half.
+    """
     cx, cy, fx, fy = _TYPICAL if lens is None else lens.shares
     facts: dict[str, Any] = {
         "fx": fx * mode.side,

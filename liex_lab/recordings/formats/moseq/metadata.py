@@ -13,11 +13,10 @@ from liex_lab.recordings.timestamps import Times, median_step, start_of_day
 
 STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
 METADATA = "metadata.json"
-AZURE, KINECT, OTHER = (
-    "Azure Kinect",
-    "Kinect v2",
-    "other",
-)  # cameras, as far as they are told apart
+# cameras, as far as they are told apart
+AZURE = "Azure Kinect"
+KINECT = "Kinect v2"
+OTHER = "other"
 
 _CAMERA_KEYS = (
     "camera",
@@ -44,8 +43,9 @@ _PLAUSIBLE_HZ = (0.5, 2000.0)
 class Metadata:
     """What metadata.json says.
 
-    size: (width, height), None when unstated; dtype: of the stored depths; camera: `AZURE`, `KINECT`, `OTHER` or
-    None when it does not say, and camera_name: its words; facts: for `Recording.metadata`; problems: sentences.
+    size: (width, height), None when unstated; dtype: of the stored depths; camera: `AZURE`,
+    `KINECT`, `OTHER` or None when it does not say, and camera_name: its words; facts: for
+    `Recording.metadata`; problems: sentences.
     """
 
     size: tuple[int, int] | None
@@ -60,7 +60,9 @@ _NOTHING = Metadata(None, "<u2", None, "", {}, [])
 
 
 def read_metadata(path: Path | None, cut: bool) -> Metadata:
-    """What metadata.json tells; it is often missing, and then there is nothing to say. cut: its archive is."""
+    """What metadata.json tells; it is often missing, and then there is nothing to say. cut: its
+    archive is.
+    """
     if path is None:
         return _NOTHING
     try:
@@ -78,7 +80,8 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         raise RecordingError(
             f"{METADATA} of the session is not JSON ({error}); correct or remove it"
         ) from None
-    facts, problems = {}, []
+    facts = {}
+    problems = []
     for key, ours in (("SubjectName", "subject_id"), ("SessionName", "session_name")):
         if isinstance(document.get(key), str) and document[key].strip():
             facts[ours] = document[key].strip()
@@ -109,7 +112,9 @@ def _stated_size(value: Any) -> tuple[int, int] | None:
 
 
 def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
-    """Which camera the metadata name, and in which words: programs that record for MoSeq have no common key for it."""
+    """Which camera the metadata name, and in which words: programs that record for MoSeq have no
+    common key for it.
+    """
     told = {key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()}
     name = next(
         (told[key] for key in _CAMERA_KEYS if isinstance(told.get(key), str) and told[key].strip()),
@@ -126,7 +131,8 @@ def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
 def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple[str, Times] | None:
     """The file of time stamps and what it holds; None where there is none.
 
-    depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a column in another unit.
+    depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a
+    column in another unit.
     """
     name = next((name for name in STAMPS if name in files), None)
     if name is None:
@@ -146,8 +152,9 @@ def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple
     step = median_step(times)
     if not named and step > 0 and not _PLAUSIBLE_HZ[0] <= 1e9 / step <= _PLAUSIBLE_HZ[1]:
         problems.append(
-            f"the stamps in {name} were taken as {'milli' if name == 'depth_ts.txt' else ''}seconds, as MoSeq writes "
-            f"them, which makes {1e9 / step:.3g} frames/s; if they have another unit, say so in a first line such as "
-            "time_ns or time_s"
+            f"the stamps in {name} were taken as "
+            f"{'milli' if name == 'depth_ts.txt' else ''}seconds, as MoSeq writes them, which "
+            f"makes {1e9 / step:.3g} frames/s; if they have another unit, say so in a first line "
+            "such as time_ns or time_s"
         )
     return name, times

@@ -1,4 +1,6 @@
-"""MoSeq sessions: depth.dat, depth.avi or depth.mkv with stamps and metadata, in a folder or in a .tar.gz."""
+"""MoSeq sessions: depth.dat, depth.avi or depth.mkv with stamps and metadata, in a folder or in a
+.tar.gz.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,8 @@ _OTHER_SIZES = (
 class RawFrames:
     """Frames one after the other in a file without a header, read with `seek`; a `Stack`.
 
-    Not a memory map: mapped pages count as the process's memory, and a long session would look like a leak.
+    Not a memory map: mapped pages count as the process's memory, and a long session would look like
+    a leak.
     """
 
     path: Path
@@ -65,7 +68,8 @@ class RawFrames:
     problems: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._file, self._lock = self.path.open("rb"), Lock()
+        self._file = self.path.open("rb")
+        self._lock = Lock()
 
     def __len__(self) -> int:
         return self.n
@@ -99,7 +103,9 @@ class RawFrames:
 def open_moseq(
     path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
 ) -> Recording:
-    """A MoSeq session: its folder, its depth.dat, a depth video, or the archive around all of it."""
+    """A MoSeq session: its folder, its depth.dat, a depth video, or the archive around all
+    of it.
+    """
     names = (*STAMPS, METADATA, CAMERA_FILE)
     if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
         folder = path if path.is_dir() else path.parent
@@ -114,7 +120,8 @@ def open_moseq(
         found = Unpacked(files, frozenset(), False)
         name = folder.resolve().name if depth.name in DEPTHS else depth.stem
         return _Session(path, depth, found, camera, fps, progress).open(name, list(files.values()))
-    # gzip has no random access, so the session is streamed once into a folder that lives as long as the recording
+    # gzip has no random access, so the session is streamed once into a folder that lives as long as
+    # the recording
     folder = Path(tempfile.mkdtemp(prefix="liex-"))
     try:
         found = unpack(path, (*DEPTHS, *names), folder, progress)
@@ -148,7 +155,9 @@ def _archive_name(path: Path) -> str:
 
 
 class _Session:
-    """A session while it is opened: its depth file, what lies beside it, and what was odd so far."""
+    """A session while it is opened: its depth file, what lies beside it, and what was odd
+    so far.
+    """
 
     def __init__(
         self,
@@ -159,8 +168,12 @@ class _Session:
         fps: float | None,
         progress: Progress,
     ) -> None:
-        self.path, self.depth, self.cut, self.progress = path, depth, found.cut, progress
-        self.stated_camera, self.fps = camera, fps
+        self.path = path
+        self.depth = depth
+        self.cut = found.cut
+        self.progress = progress
+        self.stated_camera = camera
+        self.fps = fps
         self.camera_file = CameraFile.read(found.files.get(CAMERA_FILE, path.parent / CAMERA_FILE))
         self.metadata: Metadata = read_metadata(found.files.get(METADATA), found.cut)
         self.problems = [*self.camera_file.problems, *self.metadata.problems]
@@ -189,8 +202,8 @@ class _Session:
         video = open_video(self.depth, self.progress)
         if self.metadata.size not in (None, (video.width, video.height)):
             self.problems.append(
-                f"{METADATA} states pictures of {self.metadata.size}, but those in {self.depth.name} have "
-                f"{video.width} x {video.height} pixels, which was used"
+                f"{METADATA} states pictures of {self.metadata.size}, but those in "
+                f"{self.depth.name} have {video.width} x {video.height} pixels, which was used"
             )
         if video.truncated or self.cut:
             self.problems.append(
@@ -204,8 +217,9 @@ class _Session:
         n, left_over = divmod(n_bytes, 2 * width * height)
         if not n:
             raise RecordingError(
-                f"{DEPTH} of {self.path} holds {n_bytes} bytes, less than one frame of {width} x {height} pixels "
-                f"({2 * width * height} bytes); copy the recording again, or state DepthResolution in {METADATA}"
+                f"{DEPTH} of {self.path} holds {n_bytes} bytes, less than one frame of {width} x "
+                f"{height} pixels ({2 * width * height} bytes); copy the recording again, or state "
+                f"DepthResolution in {METADATA}"
             )
         if left_over or self.cut:
             where = (
@@ -221,18 +235,23 @@ class _Session:
     def _size_of_camera(self) -> tuple[int, int] | None:
         if isinstance(self.stated_camera, Camera):
             return self.stated_camera.width, self.stated_camera.height
-        width, height = self.camera_file.width, self.camera_file.height
+        width = self.camera_file.width
+        height = self.camera_file.height
         return (width, height) if width and height else None
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
-        """That of a Kinect v2, unless the stamps say that another camera's size fits and this one does not."""
+        """That of a Kinect v2, unless the stamps say that another camera's size fits and this one
+        does not.
+        """
         n = 0 if self.stamps is None else len(self.stamps[1])
         kinect_bytes = 2 * _KINECT_V2_SIZE[0] * _KINECT_V2_SIZE[1]
         other = next(((w, h) for w, h in _OTHER_SIZES if n and n_bytes == 2 * w * h * n), None)
         if other is not None and n_bytes % kinect_bytes:
             raise RecordingError(
-                f"{DEPTH} of {self.path} does not fit frames of 512 x 424 pixels, but it fits {n} of {other[0]} x "
-                f'{other[1]}; write {{"DepthResolution": [{other[0]}, {other[1]}]}} into {METADATA} if that is your '
+                f"{DEPTH} of {self.path} does not fit frames of 512 x 424 pixels, but it fits {n} "
+                f"of {other[0]} x "
+                f'{other[1]}; write {{"DepthResolution": [{other[0]}, {other[1]}]}} into '
+                f"{METADATA} if that is your "
                 "camera"
             )
         return _KINECT_V2_SIZE
@@ -269,8 +288,11 @@ class _Session:
         )
 
     def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
-        """Stated, or else from the factory's calibration in the file, or else typical of the camera that recorded."""
-        width, height = stack.width, stack.height
+        """Stated, or else from the factory's calibration in the file, or else typical of the camera
+        that recorded.
+        """
+        width = stack.width
+        height = stack.height
         if self.stated_camera is not None or self.camera_file.intrinsics:
             return self.camera_file.camera(width, height, self.stated_camera)
         mode = mode_of(width, height)
@@ -295,20 +317,23 @@ class _Session:
             else "a camera that is not known"
         )
         raise RecordingError(
-            f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a camera.toml beside it with "
-            "[camera], fx = ..., fy = ..., cx = ... and cy = ... in pixels"
+            f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a "
+            "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
+            "pixels"
         )
 
     def _which_camera(self, track: DepthTrack | None) -> str | None:
-        """The camera as the files name it; where they do not, only a Kinect v2 has pictures of its size."""
+        """The camera as the files name it; where they do not, only a Kinect v2 has pictures of its
+        size.
+        """
         if track is not None and any(name.startswith("K4A_") for name in track.tags):
             return AZURE
         return self.metadata.camera or KINECT
 
     def _say_typical(self, camera: str) -> None:
         self.problems.append(
-            f"the files hold no intrinsics, so those of a typical {camera} were taken; state your camera's "
-            "own in a camera.toml beside the recording"
+            f"the files hold no intrinsics, so those of a typical {camera} were taken; state your "
+            "camera's own in a camera.toml beside the recording"
         )
 
     def _times(self, n: int, track: DepthTrack | None) -> Times:
@@ -323,28 +348,33 @@ class _Session:
                 self.problems += [counts] if counts else []
                 return stamps[:n]
             self.problems.append(
-                f"{self.depth.name} holds {n} frames but {name} holds {len(stamps)} time stamps; those of the video "
-                "itself are used"
+                f"{self.depth.name} holds {n} frames but {name} holds {len(stamps)} time stamps; "
+                "those of the video itself are used"
             )
         hz = rate(self.fps, "the call")
         if own is not None and not (own.even and hz):
             if own.even:
                 self.problems.append(
-                    f"there are no time stamps, so the constant {1e9 / max(median_step(own.times_ns), 1):g} frames/s "
-                    f"that {self.depth.name} states were assumed"
+                    "there are no time stamps, so the constant "
+                    f"{1e9 / max(median_step(own.times_ns), 1):g} frames/s that {self.depth.name} "
+                    "states were assumed"
                 )
             return own.times_ns
         origin = "as stated" if hz else "which is the usual rate; state fps if yours differs"
         self.problems.append(
-            f"there are no time stamps, so a constant {hz or _NOMINAL_HZ:g} frames/s was assumed, {origin}"
+            f"there are no time stamps, so a constant {hz or _NOMINAL_HZ:g} frames/s was assumed, "
+            f"{origin}"
         )
         return from_rate(n, hz or _NOMINAL_HZ)
 
     def _continue(self, stamps: Times, n: int) -> Times:
-        """Stamps for the frames whose own were cut off: a whole frame is worth more than its exact time."""
-        step, n_lost = max(1, median_step(stamps)), n - len(stamps)
+        """Stamps for the frames whose own were cut off: a whole frame is worth more than its exact
+        time.
+        """
+        step = max(1, median_step(stamps))
+        n_lost = n - len(stamps)
         self.problems.append(
-            f"the time stamps of the last {n_lost} frames are cut off, so these frames were taken to follow every "
-            f"{step / 1e6:.4g} ms, the median step of those before"
+            f"the time stamps of the last {n_lost} frames are cut off, so these frames were taken "
+            f"to follow every {step / 1e6:.4g} ms, the median step of those before"
         )
         return np.concatenate([stamps, stamps[-1] + step * np.arange(1, n_lost + 1)])

@@ -1,10 +1,11 @@
 """The 16z code of PrimeSense recordings: steps between neighbouring pixels, in half bytes.
 
-A stream begins with a whole number (u16) and goes on with bytes. 0xE1 to 0xEE: 2 to 28 pixels like the last one (0xEF:
-30); 0xFF: a wide step follows; any other byte is two steps down, each counted from 6, where 15 in the low half says
-that a wide step follows and 13 that there is none. A wide step is a byte from 0x80 on, counted from 192, or else a
-whole number of 15 bits, high byte first. The numbers are depths (`16zP`) or indices into a table of the frame's own
-depths (`16zT`). What it means is OpenNI's decoder; tests/oracles/oni.py is the slow twin.
+A stream begins with a whole number (u16) and goes on with bytes. 0xE1 to 0xEE: 2 to 28 pixels like
+the last one (0xEF: 30); 0xFF: a wide step follows; any other byte is two steps down, each counted
+from 6, where 15 in the low half says that a wide step follows and 13 that there is none. A wide
+step is a byte from 0x80 on, counted from 192, or else a whole number of 15 bits, high byte first.
+The numbers are depths (`16zP`) or indices into a table of the frame's own depths (`16zT`). What it
+means is OpenNI's decoder; tests/oracles/oni.py is the slow twin.
 """
 
 from __future__ import annotations
@@ -14,15 +15,20 @@ from numba import njit
 from numpy.typing import NDArray
 
 WORST_BYTES_A_PIXEL = 3  # a wide step for every pixel: its mark, and two bytes
-_RUN, _WIDE = 0xE0, 0xFF
+_RUN = 0xE0
+_WIDE = 0xFF
 _LARGEST = 0x7FFF  # the largest whole number the code can hold after the first
 _LONGEST_RUN = 15  # pairs
 
 
 @njit(cache=True, nogil=True)
 def _unpack(stream, table, out):
-    """Fill out (n,) with table[number] for each number of the stream; False where they do not fit one another."""
-    n_bytes, n_pixels, n_table = len(stream), len(out), len(table)
+    """Fill out (n,) with table[number] for each number of the stream; False where they do not fit
+    one another.
+    """
+    n_bytes = len(stream)
+    n_pixels = len(out)
+    n_table = len(table)
     if n_bytes < 2 or n_pixels < 1:
         return False
     value = np.int64(stream[0]) | np.int64(stream[1]) << 8
@@ -30,7 +36,8 @@ def _unpack(stream, table, out):
         return False
     last = table[value]
     out[0] = last
-    at, i = 2, 1
+    at = 2
+    i = 1
     while at < n_bytes:
         byte = np.int64(stream[at])
         at += 1
@@ -73,10 +80,15 @@ def _unpack(stream, table, out):
 
 @njit(cache=True, nogil=True)
 def _pack(numbers, out):
-    """Encode numbers (n,) into out (3 n + 2,); how many bytes were used, 0 where a number is too large for the code."""
+    """Encode numbers (n,) into out (3 n + 2,); how many bytes were used, 0 where a number is too
+    large for the code.
+    """
     value = np.int64(numbers[0])
-    out[0], out[1] = value & 0xFF, value >> 8
-    at, run, half = 2, 0, -1
+    out[0] = value & 0xFF
+    out[1] = value >> 8
+    at = 2
+    run = 0
+    half = -1
     for i in range(1, len(numbers)):
         number = np.int64(numbers[i])
         step = value - number
@@ -108,11 +120,13 @@ def _pack(numbers, out):
             out[at + 1] = step + 192
             at += 2
         elif number <= _LARGEST:
-            out[at + 1], out[at + 2] = number >> 8, number & 0xFF
+            out[at + 1] = number >> 8
+            out[at + 2] = number & 0xFF
             at += 3
         else:
             return 0
-    # the run was there before the half that waits for its other half: OpenNI2 has them the wrong way round, and so
+    # the run was there before the half that waits for its other half: OpenNI2 has them the wrong
+    # way round, and so
     # loses the last pixels of a frame
     if run:
         out[at] = _RUN + run
@@ -125,7 +139,8 @@ def _pack(numbers, out):
 
 @njit(cache=True, nogil=True)
 def _tabulate(pixels, rank, table, numbers):
-    """The depths that occur, sorted, into table; each pixel's place among them into numbers (n,); how many there are.
+    """The depths that occur, sorted, into table; each pixel's place among them into numbers (n,);
+    how many there are.
 
     rank (65536,): zeros, and zeros again afterwards.
     """
@@ -147,9 +162,11 @@ def _tabulate(pixels, rank, table, numbers):
 def unpack_16z(
     payload: NDArray[np.uint8], meaning: NDArray[np.float32], n_pixels: int, embedded_table: bool
 ) -> NDArray[np.float32] | None:
-    """A packed frame as depth (n_pixels,); None where it is damaged or has another number of pixels.
+    """A packed frame as depth (n_pixels,); None where it is damaged or has another number of
+    pixels.
 
-    meaning (65536,): the depth, mm, that each stored value stands for; embedded_table: `16zT` and not `16zP`.
+    meaning (65536,): the depth, mm, that each stored value stands for; embedded_table: `16zT` and
+    not `16zP`.
     """
     table = meaning
     if embedded_table:
@@ -157,17 +174,21 @@ def unpack_16z(
         start = 2 + 2 * n_table
         if len(payload) < start:
             return None
-        table, payload = meaning[payload[2:start].view("<u2")], payload[start:]
+        table = meaning[payload[2:start].view("<u2")]
+        payload = payload[start:]
     depth = np.empty(n_pixels, np.float32)
     return depth if _unpack(payload, table, depth) else None
 
 
 def pack_16z(pixels: NDArray[np.uint16], embedded_table: bool) -> bytes | None:
-    """Pixels (n,) as `16zT` (with embedded_table) or `16zP`; None where depths are too many or too large for it."""
+    """Pixels (n,) as `16zT` (with embedded_table) or `16zP`; None where depths are too many or too
+    large for it.
+    """
     if not embedded_table:
         stream = np.empty(WORST_BYTES_A_PIXEL * pixels.size + 2, np.uint8)
         return stream[:n].tobytes() if (n := _pack(pixels, stream)) else None
-    table, numbers = np.empty(1 << 16, np.uint16), np.empty_like(pixels)
+    table = np.empty(1 << 16, np.uint16)
+    numbers = np.empty_like(pixels)
     n_table = _tabulate(pixels, np.zeros(1 << 16, np.uint16), table, numbers)
     stream = np.empty(WORST_BYTES_A_PIXEL * pixels.size + 2, np.uint8)
     if n_table > 0xFFFF or not (n := _pack(numbers, stream)):

@@ -1,4 +1,6 @@
-"""What is in an .oni file: its depth nodes, how each looked at the scene, and where its frames lie."""
+"""What is in an .oni file: its depth nodes, how each looked at the scene, and where its
+frames lie.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,14 @@ from liex_lab.recordings.formats.oni.records import (
 )
 from liex_lab.runtime.progress import Progress
 
-MODE, CROPPING, MIRROR, UNIT = "xnMapOutputMode", "xnCropping", "xnMirror", "oniPixelFormat"
-FIELD_OF_VIEW, OLD_LENS = "xnFOV", "xnRealWorldTranslationData"
-PLANE_DISTANCE, PLANE_PIXEL = "ZPD", "ZPPS"
+MODE = "xnMapOutputMode"
+CROPPING = "xnCropping"
+MIRROR = "xnMirror"
+UNIT = "oniPixelFormat"
+FIELD_OF_VIEW = "xnFOV"
+OLD_LENS = "xnRealWorldTranslationData"
+PLANE_DISTANCE = "ZPD"
+PLANE_PIXEL = "ZPPS"
 INTRINSICS = "liexIntrinsics"  # ours: fx, fy, cx, cy, for the format itself knows no optical axis
 _OF_LOOK = (MODE, CROPPING, MIRROR, UNIT)
 _WANTED = (*_OF_LOOK, FIELD_OF_VIEW, OLD_LENS, PLANE_DISTANCE, PLANE_PIXEL, INTRINSICS)
@@ -37,14 +44,16 @@ _LARGEST_VALUE = 64  # bytes; those that are wanted have at most 32
 _MANY = 100
 _MILLIMETRES = 100  # the pixel format that holds where none is stated
 
-# A file of an hour has several GB, and looking at each of its records takes minutes on a slow disk: there the seek
+# A file of an hour has several GB, and looking at each of its records takes minutes on a slow disk:
+# there the seek
 # table is believed where it can be. Everywhere else the records themselves say what is whole.
 SCAN_UP_TO_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
 class Look:
-    """How frames were taken. width, height: of the full picture; part: x, y, width, height of what was recorded of it.
+    """How frames were taken. width, height: of the full picture; part: x, y, width, height of what
+    was recorded of it.
 
     pixel_format: OpenNI's number for the unit; fps: as stated, not as it was.
     """
@@ -64,10 +73,12 @@ class Look:
 
 @dataclass
 class DepthNode:
-    """A depth camera of the file. One entry for each of its frames: time, place and size of its payload, its look.
+    """A depth camera of the file. One entry for each of its frames: time, place and size of its
+    payload, its look.
 
-    A size of -1 is not known yet: then the place is that of the record. looks: each with its number in `look_of`, None
-    where a picture size was never stated; n_stated: frames by the node's own count.
+    A size of -1 is not known yet: then the place is that of the record. looks: each with its number
+    in `look_of`, None where a picture size was never stated; n_stated: frames by the node's own
+    count.
     """
 
     name: str
@@ -162,7 +173,8 @@ def index_file(file: OniFile, progress: Progress) -> OniIndex:
         if index is not None:
             file.whole = True
             return index
-    index, sound = OniIndex(), True
+    index = OniIndex()
+    sound = True
     for record in file.walk(progress):
         sound = index.take(record) and sound
     file.whole = file.whole and sound
@@ -170,8 +182,11 @@ def index_file(file: OniFile, progress: Progress) -> OniIndex:
 
 
 def _by_seek_tables(file: OniFile, progress: Progress) -> OniIndex | None:
-    """The index from the tables of a file that was closed properly; None where they cannot be believed."""
-    end, index = file.record_at(file.end_at), OniIndex()
+    """The index from the tables of a file that was closed properly; None where they cannot be
+    believed.
+    """
+    end = file.record_at(file.end_at)
+    index = OniIndex()
     if end is None or end.kind != END:
         return None
     for record in file.walk(progress):
@@ -188,7 +203,9 @@ def _by_seek_tables(file: OniFile, progress: Progress) -> OniIndex | None:
 
 
 def _seek_table(file: OniFile, number: int, node: DepthNode) -> NDArray[np.void] | None:
-    """Time and position of every frame of a node; None where there is no table, or one that makes no sense."""
+    """Time and position of every frame of a node; None where there is no table, or one that makes
+    no sense.
+    """
     record = file.record_at(node.seek_table)
     layout = np.dtype(OLD_SEEK_ENTRY if file.old else SEEK_ENTRY)
     if record is None or record.kind != SEEK_TABLE or not node.n_stated:

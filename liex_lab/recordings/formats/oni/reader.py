@@ -1,4 +1,6 @@
-"""PrimeSense and OpenNI recordings (.oni): depth as 16-bit numbers, raw or in either of OpenNI's two 16z codes."""
+"""PrimeSense and OpenNI recordings (.oni): depth as 16-bit numbers, raw or in either of OpenNI's
+two 16z codes.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import Settled, from_rate, settle, start_of_clock
 from liex_lab.runtime.progress import Progress, silent
 
-RAW, WITH_TABLE, WITHOUT_TABLE = b"NONE", b"16zT", b"16zP"
+RAW = b"NONE"
+WITH_TABLE = b"16zT"
+WITHOUT_TABLE = b"16zP"
 _CODECS = (RAW, WITH_TABLE, WITHOUT_TABLE)
 _UNIT_MM = {100: 1.0, 101: 0.1}  # OpenNI's pixel formats of depth
 _SHIFTS = (102, 103)
@@ -38,7 +42,9 @@ _LATEST_US = 2**62 // 1000
 _NOMINAL_HZ = 30.0
 _N_PROBED = 5
 
-_VGA_FOCAL, _VGA_WIDTH = 570.342, 640  # of PrimeSense's reference design: 120 mm / (2 x 0.1052 mm)
+# of PrimeSense's reference design: 120 mm / (2 x 0.1052 mm)
+_VGA_FOCAL = 570.342
+_VGA_WIDTH = 640
 _SENSOR_WIDTH = 1280  # pixels that the plane's pixel size (ZPPS) is stated for
 _USUAL_SIZES = ((160, 120), (320, 240), (640, 480), (1280, 960), (1280, 1024))
 _FIELDS_OF_VIEW = (math.radians(5.0), math.radians(170.0))
@@ -50,24 +56,32 @@ class OniFrames:
     def __init__(
         self, file: OniFile, node: DepthNode, look: Look, how: CameraFile, problems: list[str]
     ) -> None:
-        """look: what frames must agree with to be of this recording; how: a camera.toml beside it."""
-        self._file, self._node, self._look, self._problems = file, node, look, problems
+        """look: what frames must agree with to be of this recording; how: a camera.toml
+        beside it.
+        """
+        self._file = file
+        self._node = node
+        self._look = look
+        self._problems = problems
         self._looks = list(node.looks)
-        self._unit_mm, self._unread = _UNIT_MM[look.pixel_format] * how.unit_mm, how.unread
+        self._unit_mm = _UNIT_MM[look.pixel_format] * how.unit_mm
+        self._unread = how.unread
         self._meaning = depth_mm(np.arange(1 << 16, dtype=np.uint16), self._unit_mm, self._unread)
         self._bad: set[int] = set()
         self._lock = Lock()
 
     def read(self, number: int) -> Depth:
-        """Depth (H, W) float32 mm of one frame; one that is damaged or of another size is wholly unread."""
+        """Depth (H, W) float32 mm of one frame; one that is damaged or of another size is wholly
+        unread.
+        """
         depth = self.decode(number)
         if depth is not None:
             return depth
         if number not in self._bad:
             self._bad.add(number)
             self._problems.append(
-                f"frame {number} is damaged or not of {self._look.width} x {self._look.height} pixels, and was taken "
-                "as wholly unread"
+                f"frame {number} is damaged or not of {self._look.width} x {self._look.height} "
+                "pixels, and was taken as wholly unread"
             )
         return np.zeros((self._look.height, self._look.width), np.float32)
 
@@ -91,7 +105,8 @@ class OniFrames:
 
     def _payload(self, number: int, n_pixels: int) -> bytes:
         """The stored bytes of a frame; none where they cannot be so many pixels."""
-        place, size = self._node.places[number], self._node.sizes[number]
+        place = self._node.places[number]
+        size = self._node.sizes[number]
         with self._lock:
             if size < 0:
                 record = self._file.record_at(place)
@@ -113,7 +128,9 @@ class OniFrames:
 def open_oni(
     path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
 ) -> Recording:
-    """The depth of an .oni file as a recording. `fps` is used only where every frame has the same time."""
+    """The depth of an .oni file as a recording. `fps` is used only where every frame has the same
+    time.
+    """
     file = OniFile.open(path)
     try:
         return _open(path, file, camera, fps, progress)
@@ -129,14 +146,16 @@ def _open(
     problems: list[str] = []
     node = _choose(path, file, index, problems)
     look = _look(path, node, problems)
-    n, whole = len(node), file.whole and (node.n_stated is None or node.n_stated <= len(node))
+    n = len(node)
+    whole = file.whole and (node.n_stated is None or node.n_stated <= len(node))
     if node.n_stated not in (None, n):
         problems.append(
             f"{path.name} promises {node.n_stated} frames of {node.name}, and {n} are in it"
         )
     if not whole:
         problems.append(
-            f"{path.name} is cut or damaged; {n} whole frame{'' if n == 1 else 's'} can be read from it"
+            f"{path.name} is cut or damaged; {n} whole frame{'' if n == 1 else 's'} can be read "
+            "from it"
         )
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems += camera_file.problems
@@ -149,8 +168,8 @@ def _open(
         for i in np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()
     ):
         raise RecordingError(
-            f"{path} states pictures of {look.width} x {look.height} pixels, but its frames do not unpack to that; it "
-            "is damaged, so copy it again"
+            f"{path} states pictures of {look.width} x {look.height} pixels, but its frames do not "
+            "unpack to that; it is damaged, so copy it again"
         )
     start = start_of_clock(int(times[0]))
     return Recording(
@@ -169,7 +188,9 @@ def _open(
 
 
 def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> DepthNode:
-    """The depth node with frames, by its kind: names are Depth, Depth1, or anything. The first, if there are more."""
+    """The depth node with frames, by its kind: names are Depth, Depth1, or anything. The first, if
+    there are more.
+    """
     nodes = [node for node in index.depth.values() if len(node)]
     cut = "" if file.whole else "the file is cut or damaged, and "
     if not nodes:
@@ -181,12 +202,13 @@ def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> 
     node = nodes[0]
     if len(nodes) > 1:
         problems.append(
-            f"{path.name} holds frames of {len(nodes)} depth cameras; those of the first, {node.name}, are read"
+            f"{path.name} holds frames of {len(nodes)} depth cameras; those of the first, "
+            f"{node.name}, are read"
         )
     if node.codec not in _CODECS:
         raise RecordingError(
-            f"{path} holds its depth in the code {node.codec.decode('latin-1')!r}, and {cut}NONE, 16zT and 16zP can be "
-            "read; record it again without compression"
+            f"{path} holds its depth in the code {node.codec.decode('latin-1')!r}, and {cut}NONE, "
+            "16zT and 16zP can be read; record it again without compression"
         )
     return node
 
@@ -203,8 +225,8 @@ def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
         )
     if not 0 < look.width * look.height <= _MOST_PIXELS:
         raise RecordingError(
-            f"{path} states pictures of {look.width} x {look.height} pixels, which no depth camera has; it is damaged, "
-            "so copy it again"
+            f"{path} states pictures of {look.width} x {look.height} pixels, which no depth camera "
+            "has; it is damaged, so copy it again"
         )
     if look.pixel_format not in _UNIT_MM:
         what = (
@@ -213,8 +235,8 @@ def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
             else f"the unit {look.pixel_format}"
         )
         raise RecordingError(
-            f"{path} holds {what} (oniPixelFormat), and depth in steps of 1 mm or 0.1 mm can be read; record it again "
-            "as depth"
+            f"{path} holds {what} (oniPixelFormat), and depth in steps of 1 mm or 0.1 mm can be "
+            "read; record it again as depth"
         )
     others = sum(
         int(n)
@@ -223,18 +245,19 @@ def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
     )
     if others:
         problems.append(
-            f"{others} of {len(node)} frames have another size or unit than {look.width} x {look.height} pixels, and "
-            "are taken as wholly unread"
+            f"{others} of {len(node)} frames have another size or unit than {look.width} x "
+            f"{look.height} pixels, and are taken as wholly unread"
         )
     if look.mirrored:
         problems.append(
-            "the camera delivered mirror images (xnMirror); left and right were put back in their places"
+            "the camera delivered mirror images (xnMirror); left and right were put back in their "
+            "places"
         )
     if look.part[2:] != (look.width, look.height):
         x, y, width, height = look.part
         problems.append(
-            f"the camera recorded only {width} x {height} pixels at ({x}, {y}) of its {look.width} x {look.height}; "
-            "the rest is unread"
+            f"the camera recorded only {width} x {height} pixels at ({x}, {y}) of its {look.width} "
+            f"x {look.height}; the rest is unread"
         )
     return look
 
@@ -252,15 +275,16 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
             else "which the file names as its rate; state fps if yours differs"
         )
         problems.append(
-            f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, {origin}"
+            f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, "
+            f"{origin}"
         )
         return settle(from_rate(n, hz))
     order = np.arange(n)
     sane = np.maximum.accumulate(np.where(stamps <= _LATEST_US, order, 0))
     if n_wild := int((sane != order).sum()):
         problems.append(
-            f"{n_wild} of {n} time stamps are damaged, for they are later than any clock; these frames were taken to "
-            "follow the one before at once"
+            f"{n_wild} of {n} time stamps are damaged, for they are later than any clock; these "
+            "frames were taken to follow the one before at once"
         )
     times_us = np.minimum(stamps[sane], np.uint64(_LATEST_US)).astype(np.int64)
     settled = settle(times_us * 1000 + (order - sane))
@@ -276,8 +300,11 @@ def _camera(
     stated: Lens | None,
     problems: list[str],
 ) -> Camera:
-    """Stated by the caller, or else in a camera.toml beside the file, or else what the camera said of itself."""
-    # a camera.toml comes first here: what is in the file is the design of the make and no calibration of this camera
+    """Stated by the caller, or else in a camera.toml beside the file, or else what the camera said
+    of itself.
+    """
+    # a camera.toml comes first here: what is in the file is the design of the make and no
+    # calibration of this camera
     if stated is not None or camera_file.intrinsics:
         return camera_file.camera(look.width, look.height, stated)
     ours = node.numbers(INTRINSICS, "<dddd")
@@ -290,15 +317,17 @@ def _camera(
         return Camera(ours[0], ours[1], ours[2], ours[3], look.width, look.height, source=source)
     focal, source = _stated_focal(node, look, problems)
     if focal is None and (look.width, look.height) in _USUAL_SIZES:
-        focal, source = (_VGA_FOCAL * look.width / _VGA_WIDTH,) * 2, "typical PrimeSense"
+        focal = (_VGA_FOCAL * look.width / _VGA_WIDTH,) * 2
+        source = "typical PrimeSense"
         problems.append(
-            "the file states no field of view, so the intrinsics of a typical PrimeSense camera were taken; state your "
-            "camera's own in a camera.toml beside the recording"
+            "the file states no field of view, so the intrinsics of a typical PrimeSense camera "
+            "were taken; state your camera's own in a camera.toml beside the recording"
         )
     if focal is None:
         raise RecordingError(
-            f"{path} states no field of view for its {look.width} x {look.height} pixels; write a camera.toml beside "
-            "it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in pixels"
+            f"{path} states no field of view for its {look.width} x {look.height} pixels; write a "
+            "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
+            "pixels"
         )
     # OpenNI places the optical axis at half the size, counted as we count pixels
     cx = look.width / 2 if not look.mirrored else look.width - 1 - look.width / 2
@@ -308,7 +337,9 @@ def _camera(
 def _stated_focal(
     node: DepthNode, look: Look, problems: list[str]
 ) -> tuple[tuple[float, float] | None, str]:
-    """Focal lengths (fx, fy) px and where they come from; (None, "") where the file states none that can be."""
+    """Focal lengths (fx, fy) px and where they come from; (None, "") where the file states none
+    that can be.
+    """
     size = look.width, look.height
     found: list[tuple[tuple[float, float], str]] = []
     if (view := node.numbers(FIELD_OF_VIEW, "<dd")) is not None and all(
@@ -319,7 +350,8 @@ def _stated_focal(
     if (plane := node.numbers(OLD_LENS, "<ddd")) is not None and plane[1] * plane[2] > 0:
         focal = plane[0] / (plane[1] * plane[2])
         found.append(((focal, focal), f"lens in the .oni file ({OLD_LENS})"))
-    distance, pixel = node.number(PLANE_DISTANCE), node.numbers(PLANE_PIXEL, "<d")
+    distance = node.number(PLANE_DISTANCE)
+    pixel = node.numbers(PLANE_PIXEL, "<d")
     if distance is not None and pixel is not None and pixel[0] > 0:
         focal = distance / pixel[0] * look.width / _SENSOR_WIDTH
         found.append(((focal, focal), "lens in the .oni file (ZPD and ZPPS)"))
@@ -327,7 +359,8 @@ def _stated_focal(
         if _can_be(focal_lengths, size):
             return focal_lengths, source
         problems.append(
-            f"the {source} cannot be: focal lengths of {focal_lengths[0]:g} and {focal_lengths[1]:g} px"
+            f"the {source} cannot be: focal lengths of {focal_lengths[0]:g} and "
+            f"{focal_lengths[1]:g} px"
         )
     return None, ""
 

@@ -1,4 +1,6 @@
-"""The records of an .oni file: a header and then one after the other, each with its size; sources: OpenNI's player."""
+"""The records of an .oni file: a header and then one after the other, each with its size; sources:
+OpenNI's player.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +18,28 @@ FILE_HEADER: Final = struct.Struct(
     "<4sBBHIQI"
 )  # magic, major, minor, maintenance, build, last time, highest node id
 VERSION: Final = (1, 0, 1, 0)
-_OLDEST, _FIRST_WIDE = (
-    (1, 0, 0, 4),
-    (1, 0, 1, 0),
-)  # before 1.0.1.0, positions in the file have 32 bits
+# before 1.0.1.0, positions in the file have 32 bits
+_OLDEST = (1, 0, 0, 4)
+_FIRST_WIDE = (1, 0, 1, 0)
 
 RECORD_MAGIC: Final = 0x0052494E  # "NIR" and a zero byte
 HEADER: Final = struct.Struct(
     "<IIIIIQ"
 )  # magic, kind, node, size of header and fields, of payload, position it undoes
 _OLD_HEADER = struct.Struct("<IIIIII")
-_OLD_NODE, _NODE_5, NODE = 0x02, 0x0C, 0x0D
-INTEGER, REAL, TEXT, BYTES = 0x03, 0x04, 0x05, 0x06
-NODE_REMOVED, DATA_BEGIN, NODE_READY, FRAME, END, SEEK_TABLE = 0x07, 0x08, 0x09, 0x0A, 0x0B, 0x0E
+_OLD_NODE = 0x02
+_NODE_5 = 0x0C
+NODE = 0x0D
+INTEGER = 0x03
+REAL = 0x04
+TEXT = 0x05
+BYTES = 0x06
+NODE_REMOVED = 0x07
+DATA_BEGIN = 0x08
+NODE_READY = 0x09
+FRAME = 0x0A
+END = 0x0B
+SEEK_TABLE = 0x0E
 NODES: Final = (_OLD_NODE, _NODE_5, NODE)
 PROPERTIES: Final = (INTEGER, REAL, TEXT, BYTES)
 
@@ -49,7 +60,9 @@ _BLOCK = 1 << 20
 
 
 class Record(NamedTuple):
-    """A record whose end is where another begins; `fields` are its first bytes after the header, `size` its own."""
+    """A record whose end is where another begins; `fields` are its first bytes after the header,
+    `size` its own.
+    """
 
     kind: int
     node: int
@@ -79,7 +92,9 @@ class _Head(NamedTuple):
 
 @dataclass
 class OniFile:
-    """An open .oni file. old: positions in it have 32 bits; whole: it ends as it should and nothing is damaged."""
+    """An open .oni file. old: positions in it have 32 bits; whole: it ends as it should and nothing
+    is damaged.
+    """
 
     file: IO[bytes]
     size: int
@@ -100,8 +115,9 @@ class OniFile:
             version = FILE_HEADER.unpack(head)[1:5]
             if not _OLDEST <= version <= VERSION:
                 raise RecordingError(
-                    f"{path} says that it is of version {'.'.join(map(str, version))} of its format, and versions "
-                    "1.0.0.4 to 1.0.1.0 can be read; record it again with OpenNI2, or copy it again if it is damaged"
+                    f"{path} says that it is of version {'.'.join(map(str, version))} of its "
+                    "format, and versions 1.0.0.4 to 1.0.1.0 can be read; record it again with "
+                    "OpenNI2, or copy it again if it is damaged"
                 )
         except BaseException:
             file.close()
@@ -116,10 +132,12 @@ class OniFile:
     def walk(self, progress: Progress) -> Iterator[Record]:
         """Every record, in file order; where one is damaged, from the next that can be found.
 
-        A record counts only if another one, or the end of the file, begins where it ends. The last one of a cut file
-        is left out.
+        A record counts only if another one, or the end of the file, begins where it ends. The last
+        one of a cut file is left out.
         """
-        head, ended, told = self._search(FILE_HEADER.size), False, -1
+        head = self._search(FILE_HEADER.size)
+        ended = False
+        told = -1
         self.whole = head is not None and head.at == FILE_HEADER.size
         while head is not None:
             ended = head.kind == END
@@ -196,7 +214,9 @@ class OniFile:
 
 
 def parse_node(record: Record) -> tuple[str, int, bytes, int | None, int]:
-    """Name, kind, codec, number of frames (None where not stated), position of the seek table (0: none) of a node."""
+    """Name, kind, codec, number of frames (None where not stated), position of the seek table (0:
+    none) of a node.
+    """
     name, rest = take_text(record.fields)
     kind, codec = _NODE_FIELDS.unpack_from(rest)
     if record.kind == _OLD_NODE:

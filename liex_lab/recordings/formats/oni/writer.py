@@ -28,7 +28,9 @@ Codec = Literal["16zT", "16zP", "NONE"]
 _NODE = 1
 _LARGEST = {"16zT": 0xFFFF, "16zP": 0x7FFF, "NONE": 0xFFFF}  # stored value
 _PIXEL_FORMATS = {1.0: 100, 0.1: 101}  # mm in a stored step: OpenNI's number for it
-_UNKNOWN_COUNT, _UNKNOWN_TIME = 0xFFFFFFFF, 2**64 - 1  # what stands in a file until it is closed
+# what stands in a file until it is closed
+_UNKNOWN_COUNT = 0xFFFFFFFF
+_UNKNOWN_TIME = 2**64 - 1
 _NOMINAL_FPS = 30.0
 _MOST_IN_SEEK_TABLE = (
     288_000  # OpenNI2 cannot open a file with a longer table, but one without a table
@@ -47,10 +49,11 @@ def write_oni(
 ) -> Path:
     """Write a recording as .oni, frame by frame; the file has its name only when it is whole.
 
-    codec: 16zT packs best and loses nothing, 16zP holds depths up to 32,767 steps, NONE does not pack; unit_mm: of a
-    stored step, 1.0 or 0.1; exact: refuse depths that are no whole number of steps instead of rounding them. Times
-    keep the recording's own clock, rounded to microseconds. The intrinsics are kept as a property of our own, and as
-    the angles of view that other programs read.
+    codec: 16zT packs best and loses nothing, 16zP holds depths up to 32,767 steps, NONE does not
+    pack; unit_mm: of a stored step, 1.0 or 0.1; exact: refuse depths that are no whole number of
+    steps instead of rounding them. Times keep the recording's own clock, rounded to microseconds.
+    The intrinsics are kept as a property of our own, and as the angles of view that other programs
+    read.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -94,8 +97,12 @@ class OniWriter:
         *,
         exact: bool = True,
     ) -> None:
-        """rate_hz: what the file says of itself; every frame has its own time. The others are those of `write_oni`."""
-        self._codec, self._unit_mm, self._exact = codec, unit_mm, exact
+        """rate_hz: what the file says of itself; every frame has its own time. The others are those
+        of `write_oni`.
+        """
+        self._codec = codec
+        self._unit_mm = unit_mm
+        self._exact = exact
         self._entries: list[tuple[int, int]] = []  # time in µs and position of every frame
         self._file: IO[bytes] = path.open("wb")
         try:
@@ -125,8 +132,8 @@ class OniWriter:
         )
         if payload is None:
             raise RecordingError(
-                f"frame {len(self._entries)} holds more different depths than the code {self._codec} can tell apart; "
-                "write it with the code NONE"
+                f"frame {len(self._entries)} holds more different depths than the code "
+                f"{self._codec} can tell apart; write it with the code NONE"
             )
         before = self._entries[-1][1] if self._entries else 0
         self._entries.append((time_us, self._file.tell()))
@@ -137,7 +144,8 @@ class OniWriter:
     def close(self) -> None:
         """Write what belongs at the end, and the counts at the beginning."""
         self._write(records.NODE_REMOVED, undoes=self._node_at)
-        n, last = len(self._entries), self._entries[-1][0] if self._entries else 0
+        n = len(self._entries)
+        last = self._entries[-1][0] if self._entries else 0
         table_at = 0
         if n <= _MOST_IN_SEEK_TABLE:
             table_at = self._file.tell()
@@ -193,20 +201,23 @@ class OniWriter:
         steps = np.rint(depth / np.float32(self._unit_mm))
         if steps.size and steps.max() > _LARGEST[self._codec]:
             raise RecordingError(
-                f"frame {number} holds depths up to {depth.max():.0f} mm, and {self._codec} holds up to "
-                f"{_LARGEST[self._codec] * self._unit_mm:.0f} mm in steps of {self._unit_mm:g} mm; write it as MCAP"
+                f"frame {number} holds depths up to {depth.max():.0f} mm, and {self._codec} holds "
+                f"up to {_LARGEST[self._codec] * self._unit_mm:.0f} mm in steps of "
+                f"{self._unit_mm:g} mm; write it as MCAP"
             )
         # compared as the reader will compute it, for 0.1 is no number of a float32
         if self._exact and np.any(steps * np.float32(self._unit_mm) != depth):
             raise RecordingError(
-                f"frame {number} holds depths between steps of {self._unit_mm:g} mm, and .oni has no finer ones; write "
-                "it as MCAP, or allow the depths to be rounded"
+                f"frame {number} holds depths between steps of {self._unit_mm:g} mm, and .oni has "
+                "no finer ones; write it as MCAP, or allow the depths to be rounded"
             )
         return steps.astype("<u2")
 
 
 def _properties(camera: Camera, pixel_format: int, rate_hz: float) -> list[tuple[int, str, bytes]]:
-    """Kind, name and value of what a node says of itself; OpenNI2's player wants all but the last, in this form."""
+    """Kind, name and value of what a node says of itself; OpenNI2's player wants all but the last,
+    in this form.
+    """
     mode = struct.pack("<III", camera.width, camera.height, round(min(max(rate_hz, 1.0), 1000.0)))
     view = [
         2 * math.atan(n / 2 / f) for n, f in ((camera.width, camera.fx), (camera.height, camera.fy))
@@ -239,7 +250,9 @@ def _properties(camera: Camera, pixel_format: int, rate_hz: float) -> list[tuple
 
 @contextmanager
 def _in_place(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write under; the file gets its own when the block ends, and is gone where it fails."""
+    """A name beside `path` to write under; the file gets its own when the block ends, and is gone
+    where it fails.
+    """
     part = path.with_name(f"{path.name}.part-{os.getpid()}")
     try:
         yield part

@@ -1,4 +1,6 @@
-"""Where the pictures of an AVI file lie: one walk over its chunks, which needs no index and so reads cut files too."""
+"""Where the pictures of an AVI file lie: one walk over its chunks, which needs no index and so
+reads cut files too.
+"""
 
 from __future__ import annotations
 
@@ -33,9 +35,13 @@ class _Chunk(NamedTuple):
 
 
 def index_avi(path: Path, progress: Progress) -> DepthTrack:
-    """The first video stream of an AVI file. Its times are steps of a constant rate: an AVI knows no others."""
+    """The first video stream of an AVI file. Its times are steps of a constant rate: an AVI knows
+    no others.
+    """
     size = path.stat().st_size
-    track, slots, n_slots = DepthTrack(even=True), [], 0
+    track = DepthTrack(even=True)
+    slots = []
+    n_slots = 0
     kinds: list[bytes] = []  # of the streams, in order
     scale = rate = n_stated = 0
     number = b""
@@ -49,7 +55,10 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
                 kind, *_, a, b, _, n = _STREAM.unpack(_read(file, chunk)[: _STREAM.size])
                 kinds.append(kind)
                 if kind == b"vids" and not number:
-                    number, scale, rate, n_stated = b"%02d" % (len(kinds) - 1), a, b, n
+                    number = b"%02d" % (len(kinds) - 1)
+                    scale = a
+                    rate = b
+                    n_stated = n
             elif chunk.name == b"strf" and kinds and number == b"%02d" % (len(kinds) - 1):
                 track.take_bitmap_header(_read(file, chunk))
             elif number and chunk.name in (number + b"dc", number + b"db"):
@@ -66,7 +75,9 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
 
 
 def _walk(file: IO[bytes], size: int, track: DepthTrack) -> Iterator[_Chunk]:
-    """Every chunk that lies whole in the file, lists stepped into; marks the track where the file breaks off."""
+    """Every chunk that lies whole in the file, lists stepped into; marks the track where the file
+    breaks off.
+    """
     at = 0
     while at + _CHUNK.size <= size:
         file.seek(at)

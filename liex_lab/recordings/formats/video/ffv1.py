@@ -1,4 +1,6 @@
-"""FFV1 pictures: PyAV's decoder, and the check sums that it does not look at. Slow twin: tests/oracles/ffv1.py."""
+"""FFV1 pictures: PyAV's decoder, and the check sums that it does not look at. Slow twin:
+tests/oracles/ffv1.py.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,15 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.images.stack import not_depth_error
 
-_KEY = 0x7F80  # a picture that needs none before it begins with at least this: its first coded bit is 1
+# a picture that needs none before it begins with at least this: its first coded bit is 1
+_KEY = 0x7F80
 
 
 @njit(cache=True)
 def crc_table():
-    """Remainders (256,) uint32 of every byte, by the polynomial of the FFV1 specification, high bit first."""
+    """Remainders (256,) uint32 of every byte, by the polynomial of the FFV1 specification, high bit
+    first.
+    """
     table = np.empty(256, np.uint32)
     for byte in range(256):
         rest = byte << 24
@@ -30,9 +35,11 @@ def crc_table():
 
 @njit(cache=True)
 def slices_agree(data, table):
-    """Whether the slices of a picture, found from its last byte backwards, all agree with their check sums.
+    """Whether the slices of a picture, found from its last byte backwards, all agree with their
+    check sums.
 
-    Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the whole slice's 0.
+    Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the
+    whole slice's 0.
     """
     end = data.size
     while end > 8:
@@ -55,10 +62,13 @@ def is_key(head: bytes) -> bool:
 
 
 class Ffv1:
-    """A decoder of one FFV1 stream of 16-bit grey pictures: feed it pictures in order, from a key picture on."""
+    """A decoder of one FFV1 stream of 16-bit grey pictures: feed it pictures in order, from a key
+    picture on.
+    """
 
     def __init__(self, width: int, height: int, private: bytes) -> None:
-        self._size, self._private = (width, height), private
+        self._size = (width, height)
+        self._private = private
         self._table = crc_table()
         self._summed = False  # whether this stream has check sums; its pictures tell
         self._codec = self.fresh()
@@ -71,7 +81,9 @@ class Ffv1:
         return codec
 
     def decode(self, data: bytes) -> NDArray[np.uint16] | None:
-        """Stored values (H, W); None where the picture is damaged. The next one must then be a key picture."""
+        """Stored values (H, W); None where the picture is damaged. The next one must then be a key
+        picture.
+        """
         agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
         self._summed = self._summed or agree  # chance agrees once in four thousand million times
         if self._summed and not agree:
@@ -90,7 +102,9 @@ class Ffv1:
 
 
 def require_depth(stream: Ffv1, keys: Iterable[bytes], where: str) -> None:
-    """Refuse a stream none of whose key pictures `keys` decodes, or which decode to something else than 16-bit grey."""
+    """Refuse a stream none of whose key pictures `keys` decodes, or which decode to something else
+    than 16-bit grey.
+    """
     for data in keys:
         try:
             frames = stream.fresh().decode(av.Packet(data))

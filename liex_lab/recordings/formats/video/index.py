@@ -24,10 +24,11 @@ BITMAP_HEADER = struct.Struct(
 class DepthTrack:
     """What an AVI or a Matroska file tells of its depth pictures.
 
-    codec: `FFV1`, a key of `RAW`, or the name of one that is not read; private: the codec's own header; offsets, sizes
-    (n,): bytes of every picture that lies whole in the file; times_ns (n,); even: the times are steps of a constant
-    rate, for the container knows no others; whole: the file ends where it should and holds as many pictures as it says.
-    tags, attachments (bytes by file name): of the whole file; session_start: ISO 8601 where the file tells it.
+    codec: `FFV1`, a key of `RAW`, or the name of one that is not read; private: the codec's own
+    header; offsets, sizes (n,): bytes of every picture that lies whole in the file; times_ns (n,);
+    even: the times are steps of a constant rate, for the container knows no others; whole: the file
+    ends where it should and holds as many pictures as it says. tags, attachments (bytes by file
+    name): of the whole file; session_start: ISO 8601 where the file tells it.
     """
 
     codec: str = ""
@@ -48,16 +49,17 @@ class DepthTrack:
         if len(data) < BITMAP_HEADER.size:
             return
         _, width, height, _, bits, code, *_ = BITMAP_HEADER.unpack_from(data)
-        self.width, self.height = (
-            max(width, 0),
-            abs(height),
-        )  # negative: rows from the top, as ours are
+        # negative: rows from the top, as ours are
+        self.width = max(width, 0)
+        self.height = abs(height)
         name = code.decode("ascii", "replace")
         self.codec = FFV1 if name.upper() == "FFV1" else name.strip("\0") or f"{bits}-bit bitmaps"
         self.private = data[BITMAP_HEADER.size :]
 
 
 def even_times(slots: list[int], scale: int, rate: int) -> NDArray[np.int64]:
-    """Stamps (n,) ns of the pictures in these slots of a constant rate of `rate` / `scale` per second, exactly."""
+    """Stamps (n,) ns of the pictures in these slots of a constant rate of `rate` / `scale` per
+    second, exactly.
+    """
     step = Fraction(10**9 * scale, rate)
     return np.array([round(slot * step) for slot in slots], np.int64)

@@ -1,4 +1,6 @@
-"""Where the depth pictures of a Matroska file lie: one walk over its elements, which needs no index."""
+"""Where the depth pictures of a Matroska file lie: one walk over its elements, which needs no
+index.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,21 @@ from liex_lab.recordings.timestamps import LIMIT_NS
 from liex_lab.runtime.progress import Progress
 
 _MAGIC = b"\x1aE\xdf\xa3"
-_SEGMENT, _CLUSTER, _GROUP = 0x18538067, 0x1F43B675, 0xA0
+_SEGMENT = 0x18538067
+_CLUSTER = 0x1F43B675
+_GROUP = 0xA0
 _STEPPED_INTO = (
     _SEGMENT,
     _CLUSTER,
     _GROUP,
 )  # a live recording leaves their sizes open, so none is relied on
-_INFO, _TRACKS, _TAGS, _ATTACHMENTS = 0x1549A966, 0x1654AE6B, 0x1254C367, 0x1941A469
-_CLUSTER_TIME, _SIMPLE_BLOCK, _BLOCK = 0xE7, 0xA3, 0xA1
+_INFO = 0x1549A966
+_TRACKS = 0x1654AE6B
+_TAGS = 0x1254C367
+_ATTACHMENTS = 0x1941A469
+_CLUSTER_TIME = 0xE7
+_SIMPLE_BLOCK = 0xA3
+_BLOCK = 0xA1
 _PASSED_OVER = (
     0x1A45DFA3,
     0x114D9B74,
@@ -44,17 +53,17 @@ _PASSED_OVER = (
     0x75A2,
     0x8E,  # within clusters and block groups
 )
-_NUMBER, _UID, _TYPE, _NAME, _CODEC, _PRIVATE, _VIDEO, _ENCODINGS = (
-    0xD7,
-    0x73C5,
-    0x83,
-    0x536E,
-    0x86,
-    0x63A2,
-    0xE0,
-    0x6D80,
-)
-_WIDTH, _HEIGHT, _COLOUR_SPACE = 0xB0, 0xBA, 0x2EB524
+_NUMBER = 0xD7
+_UID = 0x73C5
+_TYPE = 0x83
+_NAME = 0x536E
+_CODEC = 0x86
+_PRIVATE = 0x63A2
+_VIDEO = 0xE0
+_ENCODINGS = 0x6D80
+_WIDTH = 0xB0
+_HEIGHT = 0xBA
+_COLOUR_SPACE = 0x2EB524
 _HEADER_BYTES = 1 << 22
 _LACING = 0x06  # flags of a block that holds several pictures, which no recorder of depth makes
 _MOST_TICKS = 2**60  # a clock beyond that is damage
@@ -79,7 +88,9 @@ class _Track:
 
 
 def index_mkv(path: Path, progress: Progress) -> DepthTrack:
-    """The depth track of a Matroska file: the one titled or tagged DEPTH, else the first of 16-bit grey pictures."""
+    """The depth track of a Matroska file: the one titled or tagged DEPTH, else the first of 16-bit
+    grey pictures.
+    """
     size = path.stat().st_size
     found = _Walk()
     with path.open("rb", buffering=0) as file:
@@ -97,22 +108,22 @@ def index_mkv(path: Path, progress: Progress) -> DepthTrack:
         good = pictures[:, 1] == 2 * depth.width * depth.height
         pictures = pictures[: len(good) if good.all() else int(np.argmin(good))]
         found.whole = found.whole and bool(good.all())
-    depth.offsets, depth.sizes = pictures[:, 0].tolist(), pictures[:, 1].tolist()
+    depth.offsets = pictures[:, 0].tolist()
+    depth.sizes = pictures[:, 1].tolist()
     limit = LIMIT_NS // found.scale_ns
     depth.times_ns = np.clip(pictures[:, 2], -limit, limit) * found.scale_ns
     depth.tags = {name: value for (uid, name), value in found.tags.items() if uid in (0, track.uid)}
-    depth.attachments, depth.whole, depth.session_start = (
-        found.attachments,
-        found.whole,
-        found.start,
-    )
+    depth.attachments = found.attachments
+    depth.whole = found.whole
+    depth.session_start = found.start
     return depth
 
 
 class _Walk:
     """What has been met so far.
 
-    pictures: offset, size, time in ticks, offset, ... by track number; tags: by (track uid or 0, name).
+    pictures: offset, size, time in ticks, offset, ... by track number; tags: by (track uid or 0,
+    name).
     """
 
     def __init__(self) -> None:
@@ -120,7 +131,8 @@ class _Walk:
         self.pictures: dict[int, array[int]] = {}
         self.tags: dict[tuple[int, str], str] = {}
         self.attachments: dict[str, bytes] = {}
-        self.scale_ns, self.whole = 10**6, True
+        self.scale_ns = 10**6
+        self.whole = True
         self.start: str | None = None
         self._cluster_time = 0
 
@@ -187,12 +199,15 @@ class _Walk:
             if some:
                 return some[0]
         raise RecordingError(
-            f"{path} holds no video track, or is cut short before it is named; give a recording with depth"
+            f"{path} holds no video track, or is cut short before it is named; give a recording "
+            "with depth"
         )
 
 
 def _elements(file: IO[bytes], at: int, size: int, found: _Walk) -> Iterator[_Element]:
-    """Every element that lies whole in the file, in order; says where the file breaks off or makes no sense."""
+    """Every element that lies whole in the file, in order; says where the file breaks off or makes
+    no sense.
+    """
     while at < size:
         file.seek(at)
         head = file.read(12)
@@ -270,13 +285,17 @@ def _read_track(entry: bytes) -> _Track:
         _number(table, _TYPE) == 1,
         _text(table, _NAME),
     )
-    depth, codec, private = track.depth, _text(table, _CODEC), table.get(_PRIVATE, [b""])[0]
+    depth = track.depth
+    codec = _text(table, _CODEC)
+    private = table.get(_PRIVATE, [b""])[0]
     if codec == "V_MS/VFW/FOURCC":
         depth.take_bitmap_header(private)
     video = _table(table.get(_VIDEO, [b""])[0])
-    depth.width, depth.height = _number(video, _WIDTH), _number(video, _HEIGHT)
+    depth.width = _number(video, _WIDTH)
+    depth.height = _number(video, _HEIGHT)
     if codec == "V_FFV1":
-        depth.codec, depth.private = FFV1, private
+        depth.codec = FFV1
+        depth.private = private
     elif codec == "V_UNCOMPRESSED":
         depth.codec = _text(video, _COLOUR_SPACE)
     elif not depth.codec:

@@ -23,16 +23,22 @@ _N_ASKED = 3  # key pictures, one of which must be depth: the first may be damag
 class DepthVideo:
     """The depth track of a video file as pictures of one size; also a `Stack`.
 
-    track: where they lie, and their times. FFV1 pictures build on the ones before them back to the last key picture
-    (one in twelve, usually), so reading in order decodes each once and reading at random some more.
+    track: where they lie, and their times. FFV1 pictures build on the ones before them back to the
+    last key picture (one in twelve, usually), so reading in order decodes each once and reading at
+    random some more.
     """
 
     def __init__(self, path: Path, track: DepthTrack) -> None:
-        self.track, self.width, self.height = track, track.width, track.height
+        self.track = track
+        self.width = track.width
+        self.height = track.height
         self.problems: list[str] = []
-        self._path, self._file, self._lock = path, path.open("rb", buffering=0), Lock()
+        self._path = path
+        self._file = path.open("rb", buffering=0)
+        self._lock = Lock()
         self._ffv1: Ffv1 | None = None
-        self._keys, self._next = np.zeros(0, np.int64), -1
+        self._keys = np.zeros(0, np.int64)
+        self._next = -1
         if track.codec == FFV1:
             try:
                 self._begin_ffv1()
@@ -66,7 +72,9 @@ class DepthVideo:
         return not self.track.whole
 
     def read(self, index: int) -> NDArray[np.uint16] | None:
-        """Stored values (H, W) uint16; None where the picture, or one that it builds on, is damaged."""
+        """Stored values (H, W) uint16; None where the picture, or one that it builds on, is
+        damaged.
+        """
         with self._lock:
             if self._ffv1 is None:
                 raw = np.frombuffer(self._bytes(index), RAW[self.track.codec])
@@ -113,7 +121,8 @@ def open_video(path: Path, progress: Progress) -> DepthVideo:
     if track.codec != FFV1 and track.codec not in RAW:
         named = f"is packed with {track.codec!r}" if track.codec else "has no video in it"
         raise RecordingError(
-            f"expected 16-bit depth in FFV1 or uncompressed, but {path} {named}; give the video of the depth itself"
+            f"expected 16-bit depth in FFV1 or uncompressed, but {path} {named}; give the video of "
+            "the depth itself"
         )
     if (
         not track.offsets
