@@ -1,1 +1,1 @@
-"""The views: they read session folders and compute no science."""
+"""The views (dashboard, report, replays, figures): they read sessions and compute no science."""

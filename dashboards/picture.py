@@ -1,5 +1,4 @@
-"""The picture in README.md: some of the report's own figures on one small page, photographed by a
-browser.
+"""The picture in README.md: some of the report's own figures, rendered by a headless browser.
 
 After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again.
 """
@@ -32,8 +31,10 @@ svg image {{ image-rendering: pixelated; }}
 
 
 def page(session: Session) -> str:
-    """A page of four fitted frames, the way over the floor, and actions, speed and nose height over
-    time.
+    """HTML page of four fitted frames, the path over the floor, and actions and curves over time.
+
+    Args:
+        session: the opened session.
     """
     template = (TEMPLATES / "report.html.j2").read_text(encoding="utf-8")
     style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
@@ -60,7 +61,20 @@ def page(session: Session) -> str:
 
 
 def photograph(session: str | Path, png: str | Path, browser: str = "chromium") -> Path:
-    """Write the page of a session as a PNG; `browser` is the command of a Chromium."""
+    """Write the page of a session as a PNG.
+
+    Args:
+        session: the session's folder.
+        png: the file to write.
+        browser: the command of a Chromium.
+
+    Returns:
+        Path of the PNG.
+
+    Raises:
+        subprocess.CalledProcessError: the browser failed.
+        subprocess.TimeoutExpired: the browser took longer than two minutes.
+    """
     with tempfile.TemporaryDirectory(prefix="liex-") as folder:
         html = Path(folder) / "page.html"
         html.write_text(page(Session.open(session)), encoding="utf-8")

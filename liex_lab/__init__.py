@@ -1,4 +1,6 @@
-"""Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.
+"""Marker-less 3D pose estimation of animals in depth recordings, after the Lie-X method.
+
+A depth recording goes in; 3D skeletons, a replay and behaviour tables come out:
 
     session_folder = liex_lab.run_session("recording.mcap", plan=liex_lab.Plan.load("mouse"))
     poses = liex_lab.Session.open(session_folder).poses

@@ -1,4 +1,4 @@
-"""`python -m liex_lab` is `liex`."""
+"""Entry point of `python -m liex_lab`, which is the command `liex`."""
 
 from liex_lab.cli import main
 

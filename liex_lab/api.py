@@ -1,8 +1,9 @@
-"""Where jobs and views meet: what `liex run` and `liex demo` do, for Python as for the command
-line.
+"""Public Python interface: one function for each job of the command line.
 
-`pipelines` and `dashboards` do not know each other; this module hands the views to the job that
-writes a session.
+`run_session` is `liex run`, `run_demo` is `liex demo`, and so on. The folders `pipelines` (jobs)
+and `dashboards` (views) do not import each other; this module hands the views, which are the layout
+of the Rerun replay and the HTML report, to the job that writes a session. Jobs are imported when
+they are called.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.study.status import Standing
+    from liex_lab.pipelines.study.status import SessionStatus
     from liex_lab.pipelines.verify import Finding
-    from liex_lab.pipelines.workers import Crew
+    from liex_lab.pipelines.workers import WorkerPool
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions.corrections import Correction
 
@@ -36,17 +37,34 @@ def run_session(
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
     workers: int = 1,
-    crew: Crew | None = None,
+    crew: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording and write the session folder `out/<recording's
-    name>.liex`; returns it.
+    """Measure every frame of a depth recording and write a session folder; returns its path.
 
-    recording: a path, or a recording that is open already; plan: None takes the mouse's; folder:
-    the session folder itself, where it should have another name; notes: what session.json is to
-    hold besides; workers: processes that look at stretches of a long recording side by side, or a
-    crew of others; the tables are the same. Raises a LiexError that says what to do, and leaves
-    nothing half-written, where the recording, the plan or the animal in it cannot be used.
+    Background subtraction, pose estimation of single frames by the Lie-X method, association and
+    smoothing over the whole recording, kinematics and ethogram, in this order. Nothing half-written
+    is left behind where the recording, the plan or the animal in it cannot be used.
+
+    Args:
+        recording: path of a recording, or address of a virtual one, or a recording that is open
+            already.
+        plan: all settings of the run; None takes the bundled plan of the mouse.
+        out: the folder into which the session folder `<recording's name>.liex` is written.
+        folder: the session folder itself, where it should have another name.
+        overwrite: replace a session that is there already.
+        notes: further facts for session.json, see `SessionWriter.note`.
+        workers: processes that look at shards of a long recording side by side; the tables are the
+            same for any number of them.
+        crew: a worker pool of the caller's own instead of `workers` processes of this machine.
+        progress: told how far the work is.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        LiexError: the recording, the plan or the animal in it cannot be used; the message says what
+            to do.
     """
     from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
     from liex_lab.dashboards.report.views import write_views
@@ -81,9 +99,21 @@ def correct_session(
 ) -> Path:
     """Add corrections to a session, or take some back by their numbers; tables and report follow.
 
-    what: made by the functions of `liex_lab.sessions.correcting`; with neither `what` nor `undo`,
-    everything is made again. author: "" takes who is logged in. What was measured stays as it is;
-    see `liex_lab.sessions.corrections`.
+    What was measured stays as it is; see `liex_lab.sessions.corrections`. With neither `what` nor
+    `undo`, everything that follows from the corrections is made again.
+
+    Args:
+        session: the session folder.
+        what: corrections made by the functions of `liex_lab.sessions.correcting`.
+        undo: numbers of corrections to take back.
+        author: whose corrections they are; "" takes who is logged in.
+        progress: told how far the work is.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        SessionError: a correction cannot be applied, or another program is correcting the session.
     """
     from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
     from liex_lab.dashboards.report.views import write_views
@@ -109,8 +139,23 @@ def follow_live(
     patience_s: float = 3.0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Skeletons of a recording that goes on, in a Rerun viewer; returns counts and measured
-    latencies.
+    """Show the skeletons of a recording that goes on in a Rerun viewer; returns measured latencies.
+
+    Args:
+        source: a file or folder that is being written, HOST:PORT of a sender, or, with `replay`, a
+            recording.
+        plan: all settings of the run.
+        replay: send a finished recording at its own pace, as if it were live.
+        to: 'viewer' starts a viewer on this machine; else the address of one, or a file .rrd.
+        patience_s: a file that has not grown for so many seconds is taken for finished.
+        progress: told how many frames have been followed.
+
+    Returns:
+        Table of numbers: name, n_frames, n_live (frames whose latency was measured),
+        latency_median_ms and latency_p95_ms (None where there is none), n_measured, n_bridged.
+
+    Raises:
+        LiexError: the source is over before it has a frame, or cannot be read.
     """
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
@@ -133,7 +178,14 @@ def follow_live(
 
 
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
-    """The bundled sample recording as a session; an earlier session of the demo is replaced."""
+    """Measure the bundled sample recording; returns its session folder.
+
+    An earlier session of the demo in the same place is replaced.
+
+    Args:
+        out: the folder into which the session folder is written.
+        progress: told how far the work is.
+    """
     from liex_lab.catalog import find_sample
 
     return run_session(
@@ -152,13 +204,29 @@ def run_study(
     only: Sequence[str] = (),
     dry_run: bool = False,
     board: Callable[[int], AbstractContextManager[Board]] = progress_board,
-) -> list[Standing]:
-    """Measure what is to be done of a study; returns where every session stands then.
+) -> list[SessionStatus]:
+    """Measure the sessions of a study that are to be done; returns the status of every session.
 
-    workers: processes on this machine, 0 one for every two cores; scheduler: the address of a Dask
-    scheduler; slurm: a file that says how to ask Slurm; retry: try failed sessions again; again:
-    all sessions; only: ids of sessions; dry_run: only look. A session that fails leaves failed.json
-    and stops no other.
+    A session that fails leaves failed.json in its folder and stops no other. The study's table is
+    written again at the end.
+
+    Args:
+        study: the study file, or the folder that holds study.toml.
+        workers: processes on this machine; 0 takes one for every two cores.
+        scheduler: address of a Dask scheduler whose workers are used instead.
+        slurm: TOML file that says how to ask Slurm for workers; not together with `scheduler`.
+        retry: try sessions again that failed before.
+        again: measure done and failed sessions again, too; excluded ones stay out.
+        only: ids of the sessions to measure; () takes all.
+        dry_run: measure nothing; return the status of the sessions as they are.
+        board: makes, for a number of jobs, the display of all of them (a context manager).
+
+    Returns:
+        One `SessionStatus` per session, in the order of the study file.
+
+    Raises:
+        StudyError: the study file or its settings cannot be used, or another process is measuring
+            the study.
     """
     from liex_lab.pipelines.study.run import run_study as job
 
@@ -184,11 +252,21 @@ def serve_dashboard(
     told: Callable[[str], None] = print,
     progress: Progress = silent,
 ) -> None:
-    """Serve a study, or a folder with sessions in it, to browsers until interrupted; `told` hears
-    the address.
+    """Serve a study, or a folder with sessions in it, to browsers until interrupted.
 
     On a host other than this machine alone, every visitor has to know a token, which is part of the
-    address. Raises MissingPackageError where the extra `dashboard` is not installed.
+    address, and no replay is opened.
+
+    Args:
+        study: a study file, its folder, or a folder with sessions in it.
+        host: the network address to listen on; the default is this machine alone.
+        port: the port to listen on.
+        told: called with the dashboard's address once it is served.
+        progress: told how far the loading of the sessions is.
+
+    Raises:
+        MissingPackageError: the extra `dashboard` is not installed.
+        StudyError: there is no such study.
     """
     import secrets
 
@@ -211,6 +289,14 @@ def serve_dashboard(
     token = "" if alone else secrets.token_urlsafe(24)
 
     def correct(folder: Path, what: Sequence[Correction], undo: Sequence[int], author: str) -> None:
+        """Correct a session on behalf of the dashboard.
+
+        Args:
+            folder: the session folder.
+            what: corrections to add.
+            undo: numbers of corrections to take back.
+            author: whose corrections they are.
+        """
         correct_session(folder, what, undo=undo, author=author)
 
     app = make_app(data, token=token, show_replay=show_replay if alone else None, correct=correct)
@@ -220,8 +306,22 @@ def serve_dashboard(
 def verify_session(
     session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
-    """Whether a session is what it was when it was written; with its recording, whether that gives
-    the same again.
+    """Check whether a session is what it was when it was written; returns what was found.
+
+    Compared are the facts in session.json, the files with their SHA-256, the logs, the model and
+    the corrections.
+
+    Args:
+        session: the session folder.
+        recording: its recording, which is then measured again, to see whether it gives the same;
+            this takes as long as the first time. None leaves that out.
+        progress: told how far the second measurement is.
+
+    Returns:
+        One `Finding` per thing that was looked at; its state is ok, wrong or note.
+
+    Raises:
+        SessionError: there is no session at all.
     """
     from liex_lab.pipelines.verify import verify_session as job
 
@@ -229,8 +329,17 @@ def verify_session(
 
 
 def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
-    """A session of so many minutes of a virtual mouse, made of few pictures over and over; what it
-    cost in memory.
+    """Write a session of a virtual mouse of any length; returns its cost in memory and time.
+
+    The frames of one short recording are repeated to and fro, so that only what grows with the
+    length of a recording is measured.
+
+    Args:
+        minutes: length of the recording, min, at 30 frames per second.
+        out: the folder into which the session folder long.liex is written.
+
+    Returns:
+        `peak_memory_mb` (None where the system does not tell) and `seconds`.
     """
     from liex_lab.dashboards.report.report import write_report
     from liex_lab.pipelines.evaluation.long_sessions import write_long as job
@@ -241,8 +350,18 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
 def run_scale(
     n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
-    """What a study costs: sessions per hour by workers, memory by length of recording, and where
-    the time goes.
+    """Measure what a study costs: sessions per hour, memory, and where the time goes.
+
+    Sessions per hour are given by number of workers (one and two measured, more simulated), memory
+    by length of recording.
+
+    Args:
+        n_frames: length of each virtual recording, frames of 640 x 480 px.
+        minutes: lengths of recording whose memory is measured, min.
+        progress: told how far the work is.
+
+    Returns:
+        Table of numbers, with the definitions and assumptions behind them as text.
     """
     from liex_lab.pipelines.evaluation.scale import evaluate_scale
 
@@ -258,8 +377,18 @@ def evaluate_tracking(
     figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Single frames, Algorithm 3 and the default tracker on a test sequence; figure: a PNG of error
-    over time.
+    """Compare single frames, Lie-X Algorithm 3 and the default tracker on a test sequence.
+
+    Args:
+        animal: name of the skeleton: fish, mouse or hand.
+        sequence: name of the fixed virtual test sequence.
+        model: a pose model by name or path; None takes the animal's bundled one.
+        n_frames: only so many frames of the sequence; None takes all.
+        figure: the PNG of joint error over time to draw; None draws none.
+        progress: told how far the work is.
+
+    Returns:
+        Table of numbers: figures of each row, speed, and the protocol as text.
     """
     from functools import partial
 
@@ -279,8 +408,23 @@ def evaluate_actions(
     figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Actions named on cut-out sequences and on uncut recordings; figure: a PNG of the confusion
-    matrices.
+    """Score action recognition on cut-out sequences and on uncut virtual recordings.
+
+    Args:
+        animal: one for which actions are generated: fish or mouse.
+        model: an action model by name or path; None takes the bundled one or, where there is none,
+            trains one now.
+        pose_model: the pose model that measures the frames; None takes the animal's own.
+        minutes: length of the uncut test recordings, min.
+        figure: the PNG of the confusion matrices to draw; None draws none.
+        progress: told how far the work is.
+
+    Returns:
+        Table of numbers: accuracy on sequences, F1 of the timeline, both by frame rate, and the
+        protocol as text.
+
+    Raises:
+        LiexError: no actions are generated for this animal.
     """
     from functools import partial
 
@@ -302,12 +446,15 @@ def run_tables(
     fresh: bool = False,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Every row of the paper's Tables 1-3 and its figures, written into `out`; returns what was
-    written.
+    """Make every row of Tables 1-3 of the Lie-X paper and its figures; returns the files written.
 
-    animals: () takes those with a bundled model. n_frames: only so many of each split. quick: a few
-    minutes' run whose numbers say only that everything runs. fresh: nothing kept is used, which
-    takes hours.
+    Args:
+        out: the folder that tables and figures are written into.
+        animals: names of animals; () takes those with a bundled model.
+        n_frames: only so many frames of each split; None takes all.
+        quick: a few minutes' run whose numbers say only that everything runs.
+        fresh: nothing kept is used; every variant is trained again, which takes hours.
+        progress: told how far the work is.
     """
     from liex_lab.catalog import bundled_models
     from liex_lab.dashboards.paper.plates import draw_figures

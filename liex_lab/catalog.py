@@ -1,5 +1,7 @@
-"""What comes with the package: the bundled models with their cards, and the data sets with their
-samples.
+"""Bundled models with their model cards, and the data sets with their sample recordings.
+
+A model is an .npz file of arrays; its card is the JSON file of the same name, which states the
+model's SHA-256. A model whose bytes do not agree with its card is refused.
 """
 
 from __future__ import annotations
@@ -17,10 +19,13 @@ MODELS = _HERE / "models"
 
 
 def datasets_folder() -> Path:
-    """The folder `datasets`: inside the package once installed, beside it in a clone.
+    """Path of the folder `datasets`: inside the package once installed, beside it in a clone.
 
     importlib.resources does not find a folder without code in an editable install, so the two
     places are tried.
+
+    Raises:
+        LiexError: the folder is in neither place.
     """
     for folder in (_HERE / "datasets", _HERE.parent / "datasets"):
         if folder.is_dir():
@@ -32,12 +37,19 @@ def datasets_folder() -> Path:
 
 
 def kept_results_folder() -> Path:
-    """The folder of results that took long to train for, one JSON for each animal."""
+    """Path of the folder of results that took long to train for, one JSON for each animal."""
     return datasets_folder() / "kept_results"
 
 
 def find_sample(name: str) -> Path:
-    """The bundled sample recording `name`: a file or a folder of `datasets`."""
+    """Path of a bundled sample recording.
+
+    Args:
+        name: its file or folder in `datasets`.
+
+    Raises:
+        LiexError: there is no such sample; the message lists those that there are.
+    """
     folder = datasets_folder()
     if name and (folder / name).exists():
         return folder / name
@@ -52,8 +64,15 @@ def find_sample(name: str) -> Path:
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
-    """The cards of the bundled models by name, in alphabetical order; the hashes are not checked
-    here.
+    """Cards of the bundled models by model name, in alphabetical order.
+
+    The hashes that the cards state are not checked here.
+
+    Args:
+        folder: where the models lie.
+
+    Raises:
+        ModelError: a model lacks its card, or the card cannot be used.
     """
     return {
         path.stem: _read_card(path.with_suffix(".json")) for path in sorted(folder.glob("*.npz"))
@@ -61,11 +80,17 @@ def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
 
 
 def find_model(model: str | Path, folder: Path = MODELS) -> Path:
-    """The model file of a bundled name ('mouse') or of a path, once its SHA-256 agrees with its
-    card.
+    """Path of a model file, once its SHA-256 agrees with its card.
 
     The card is the .json of the same name beside the .npz. A bundled model has one; a model of the
     user's own may.
+
+    Args:
+        model: a bundled name, such as 'mouse', or the path of an .npz.
+        folder: where the bundled models lie.
+
+    Raises:
+        ModelError: there is no such model, or it is damaged or was changed.
     """
     bundled = folder / f"{model}.npz"
     path = bundled if bundled.is_file() else Path(model)
@@ -90,7 +115,11 @@ def find_model(model: str | Path, folder: Path = MODELS) -> Path:
 
 
 def sha256(path: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal."""
+    """SHA-256 of a file's bytes, in hexadecimal.
+
+    Args:
+        path: the file.
+    """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

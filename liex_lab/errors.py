@@ -1,13 +1,15 @@
-"""The errors a user can put right. Each message is one sentence: what was expected, what came, what
-to do.
+"""Errors that a user can put right.
+
+Each message is one sentence: what was expected, what came, what to do.
 """
 
 from __future__ import annotations
 
 
 class LiexError(Exception):
-    """Something the user can put right; the command line prints its message alone, without a
-    traceback.
+    """Base of every error that the user can put right.
+
+    The command line prints its message alone, without a traceback.
     """
 
     def __str__(self) -> str:
@@ -16,33 +18,40 @@ class LiexError(Exception):
 
 
 class RecordingError(LiexError):
-    """A recording that cannot be opened or read."""
+    """Raised for a recording that cannot be opened or read."""
 
 
 class PlanError(LiexError):
-    """A plan, or a value in it, that cannot be used."""
+    """Raised for a plan, or a value in it, that cannot be used."""
 
 
 class ModelError(LiexError):
-    """A model that is missing, damaged or made for another animal."""
+    """Raised for a model that is missing, damaged or made for another animal."""
 
 
 class SessionError(LiexError):
-    """A session folder that is missing, unfinished or not ours."""
+    """Raised for a session folder that is missing, unfinished or not of liex_lab."""
 
 
 class StudyError(LiexError):
-    """A study file, or something in it, that cannot be used."""
+    """Raised for a study file, or something in it, that cannot be used."""
 
 
 class EstimationError(LiexError):
-    """A recording in which the animal cannot be measured."""
+    """Raised for a recording in which the animal cannot be measured."""
 
 
 class MissingPackageError(LiexError):
-    """An optional package that is needed for what was asked and not installed."""
+    """Raised where an optional package is needed for what was asked and is not installed."""
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of what an error of another package says, as a part of a sentence."""
+    """First line of what an error of another package says, as a part of a sentence.
+
+    Args:
+        error: the error; its type's name stands in for an empty message.
+
+    Returns:
+        At most 200 characters.
+    """
     return str(error).strip().partition("\n")[0][:200] or type(error).__name__

@@ -1,5 +1,9 @@
-"""A small network as arrays: what scikit-learn has trained, run by numpy alone, with the same bits
-on any number of cores.
+"""Multilayer perceptron: trained by scikit-learn's Adam, run by NumPy alone.
+
+    x_0 = clip((x - centre) / scale, +-LIMIT),   x_{k+1} = max(0, x_k W_k + b_k)
+
+with rectified linear units between the layers and none after the last, which gives logits. Training
+and prediction give the same bits on any number of cores.
 """
 
 from __future__ import annotations
@@ -20,8 +24,12 @@ LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
 
 @dataclass(frozen=True)
 class Network:
-    """Layers (weights, bias) on standardised features, rectified between: weights as they are
-    multiplied, no code.
+    """A trained multilayer perceptron: plain weights, no code.
+
+    Attributes:
+        centre: (F,) float32 mean of each feature.
+        scale: (F,) float32 standard deviation of each feature.
+        layers: (weights (before, after), bias (after,)) of each layer, float32; rectified between.
     """
 
     centre: NDArray[np.float32]
@@ -29,8 +37,15 @@ class Network:
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
 
     def logits(self, features: NDArray[np.floating]) -> Array:
-        """(m, K) of features (m, F): the same bits on any number of cores, which products of BLAS's
-        threads are not.
+        """Logits of samples.
+
+        They have the same bits on any number of cores, as products of BLAS with threads do not.
+
+        Args:
+            features: (m, F) features; beyond LIMIT standard deviations they are clipped.
+
+        Returns:
+            (m, K) logits.
         """
         x = np.clip((features - self.centre) / self.scale, -LIMIT, LIMIT)
         with serial_products():
@@ -53,9 +68,26 @@ def descend(
     weight_decay: float,
     seed: int,
 ) -> list[tuple[Array, Array]]:
-    """Layers (weights, bias) that tell the labels (m,) of inputs (m, F), by scikit-learn's
-    stochastic gradient descent (Adam), whose rate falls with a cosine; the last gives one number
-    where there are two labels, else one for each. The same bits on any number of cores.
+    """Train a multilayer perceptron classifier by Adam with a cosine-annealed learning rate.
+
+    scikit-learn's `MLPClassifier` is trained epoch by epoch on the cross-entropy loss; the rate of
+    epoch e is least_rate + rate (1 + cos(pi e / epochs)) / 2. The result has the same bits on any
+    number of cores.
+
+    Args:
+        inputs: (m, F) features.
+        labels: (m,) class labels.
+        hidden: neurons of each hidden layer.
+        epochs: times that every sample is seen.
+        batch: samples of a step.
+        rate: learning rate of the first epoch, less least_rate.
+        least_rate: learning rate that the schedule falls towards.
+        weight_decay: L2 penalty of the weights.
+        seed: of the initial weights and of the order of samples.
+
+    Returns:
+        (weights, bias) of each layer; the last layer has one output where there are two labels,
+        else one for each.
     """
     from sklearn.neural_network import MLPClassifier
 

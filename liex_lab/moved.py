@@ -1,7 +1,8 @@
-"""Modules that have moved: their old dotted paths still import, and say once where they live now.
+"""Import hook (a meta path finder) for modules that have moved.
 
-The table holds every public module of version 0.1 that has another place since. An old path is the
-very module at the new one, not a copy of it.
+Old dotted paths still import, with one FutureWarning that says where the module lives now. `MOVED`
+holds every public module of version 0.1 that has another place since. An old path is the very
+module at the new one, not a copy of it.
 """
 
 from __future__ import annotations
@@ -101,7 +102,11 @@ class _Forward(Loader):
     """Loads the module at the new path in place of the old one."""
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """The module at its new path; a warning says where that is."""
+        """The module at its new path; a warning says where that is.
+
+        Args:
+            spec: the forwarding spec, whose name is the old path.
+        """
         new = MOVED[spec.name]
         # seen without asking for it, unlike a DeprecationWarning
         warnings.warn(
@@ -112,7 +117,11 @@ class _Forward(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Nothing is run again: the module has run at its new path, and keeps that path's spec."""
+        """Run nothing again: the module has run at its new path, and keeps that path's spec.
+
+        Args:
+            module: what `create_module` returned.
+        """
         module.__spec__ = self._own
 
 
@@ -122,7 +131,13 @@ class _MovedModules(MetaPathFinder):
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """The forwarding spec of an old path; None for every other name."""
+        """Forwarding spec of an old path; None for every other name.
+
+        Args:
+            name: the dotted path that is imported.
+            path: not used.
+            target: not used.
+        """
         return ModuleSpec(name, _Forward()) if name in MOVED else None
 
 

@@ -1,5 +1,7 @@
-"""From a plan to objects: the one place where names and numbers of a plan become a recording, a
-tracker, rules.
+"""From a plan to objects: recording, background subtraction, estimator, tracker, provenance, rules.
+
+The one place where names and numbers of a plan become objects of the library (a factory for each).
+A slip in the plan is told before any work is done.
 """
 
 from __future__ import annotations
@@ -42,10 +44,17 @@ _SPANS = (
 def build_recording(
     recording: str | Path | Recording, plan: Plan, progress: Progress = silent
 ) -> Recording:
-    """The recording at a path, or one that is open already, as an ideal camera in air would have
-    made it.
+    """The recording as an ideal camera in air would have made it.
 
     Lens distortion, the water's refraction and a mirror are undone whenever a frame is read.
+
+    Args:
+        recording: a path or address, or a recording that is open already.
+        plan: states camera, water surface, mirror, frame rate and topic.
+        progress: told while an archive is unpacked or an index made.
+
+    Raises:
+        RecordingError: the recording cannot be opened.
     """
     from liex_lab.recordings.rectify import mirrored, rectified
 
@@ -56,10 +65,18 @@ def build_recording(
 def open_planned(
     recording: str | Path | Recording, plan: Plan, progress: Progress = silent
 ) -> Recording:
-    """The recording at a path, opened as the plan says, or one that is open already; the plan's
-    camera overrules.
+    """The recording opened as the plan says, its pictures as they are; the plan's camera overrules.
 
     A plan that states all four intrinsics opens a recording that has none, too.
+
+    Args:
+        recording: a path or address, or a recording that is open already, whose camera is replaced.
+        plan: states the camera, and frame rate and topic of recordings that need them.
+        progress: told while an archive is unpacked or an index made.
+
+    Raises:
+        RecordingError: the recording cannot be opened, or is cut short and the plan does not accept
+            that.
     """
     from liex_lab.recordings import open_recording
 
@@ -78,7 +95,11 @@ def open_planned(
 
 
 def build_water(plan: Plan) -> Water | None:
-    """The water surface of the plan, if there is one."""
+    """The plan's water surface, None where it states no height of one.
+
+    Args:
+        plan: its section `water`.
+    """
     from liex_lab.optics.refraction import Water
 
     stated = plan.water.model_dump()
@@ -110,7 +131,14 @@ def _overruled(camera: Camera, plan: Plan) -> Camera:
 
 
 def plan_of(animal: str) -> Plan:
-    """The bundled plan of an animal, or one for the animal of a skeleton's TOML."""
+    """The bundled plan of an animal, or one for the animal of a skeleton's TOML.
+
+    The latter expects a spine of 0.6 to 1.8 times the skeleton's own length, and a model `NAME.npz`
+    named as the skeleton's file.
+
+    Args:
+        animal: name of a bundled plan, or the path of a skeleton's TOML.
+    """
     from liex_lab.body.skeleton import Skeleton
 
     if animal in known_plans():
@@ -132,8 +160,16 @@ def plan_of(animal: str) -> Plan:
 
 
 def build_estimator(plan: Plan) -> PoseEstimator:
-    """The estimator of the plan's animal; the last one is kept, for a study's next session mostly
-    wants the same.
+    """The pose estimator of the plan's model and animal.
+
+    The last one is kept, since a study's next session mostly wants the same.
+
+    Args:
+        plan: its sections `estimation` and `animal`.
+
+    Raises:
+        ModelError: there is no such model, or its file is damaged.
+        PlanError: the model was made for another skeleton than the plan's.
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.catalog import find_model, sha256
@@ -154,7 +190,13 @@ def build_estimator(plan: Plan) -> PoseEstimator:
 
 @lru_cache(maxsize=1)
 def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
-    """The estimator of a model file. digest: another content is another model."""
+    """The pose estimator of a model file; the last one stays in memory.
+
+    Args:
+        path: the model file.
+        digest: its SHA-256: another content is another model.
+        n_candidates: initial poses per frame; 0 takes the method's own number.
+    """
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
 
@@ -164,8 +206,17 @@ def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
 def build_tracker(
     recording: Recording, plan: Plan, estimator_of: Callable[[], PoseEstimator] | None = None
 ) -> FrameTracker:
-    """The tracker of a recording: its scene learned, the animal's size and girth found.
-    estimator_of: waits for the plan's, where that is being made already.
+    """The tracker of a recording, its background learned and the animal's size and girth found.
+
+    Args:
+        recording: an open recording.
+        plan: animal, foreground, estimation and tracking.
+        estimator_of: waits for the plan's estimator where that is being made already; None makes
+            it.
+
+    Raises:
+        EstimationError: no floor or no animal is found in the sampled frames.
+        PlanError: the file of zones or the model does not fit.
     """
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -182,27 +233,49 @@ def build_tracker(
 def build_scene(
     recording: Recording, plan: Plan, skeleton: Skeleton, n_frames: int
 ) -> tuple[Foreground, NDArray[np.float32]]:
-    """What tells the animal from the rest of the pictures, and the sample (n, H, W) mm that it was
-    learned from.
+    """The learned segmentation and the sampled frames it was learned from.
+
+    Background subtraction with a floor plane, or for a hand segmentation by distance.
+
+    Args:
+        recording: an open recording.
+        plan: expected spine lengths, and the foreground's thresholds, mm.
+        skeleton: its view says which segmentation is used.
+        n_frames: how many frames are sampled, spread over the recording.
+
+    Returns:
+        The segmenter, and the sample (n, H, W) float32 mm, 0 where unread.
+
+    Raises:
+        EstimationError: no floor or no animal is found in the sample.
     """
     from liex_lab.body.skeleton import FOREGROUNDS
-    from liex_lab.foreground.background_segmenter import Scene
-    from liex_lab.foreground.hand_segmenter import NearestScene
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+    from liex_lab.foreground.hand_segmenter import HandSegmenter
 
     animal = plan.animal
     foreground = plan.foreground
     if skeleton.view.foreground == FOREGROUNDS[1]:
-        return NearestScene.learn(
+        return HandSegmenter.learn(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
-    return Scene.learn(recording, sizes, n_frames, foreground.min_height_mm, skeleton.view)
+    return BackgroundSubtraction.learn(
+        recording, sizes, n_frames, foreground.min_height_mm, skeleton.view
+    )
 
 
 def build_provenance(
     recording: Recording, plan: Plan, tracker: FrameTracker, progress: Progress = silent
 ) -> Provenance:
-    """What the session says about its origin."""
+    """What the session says about its origin: recording, camera, plan, model, animal, arena, zones.
+
+    Args:
+        recording: an open recording; hashing its content is the longest wait here.
+        plan: names the model and the zones.
+        tracker: the prepared tracker: background, animal's size, girth.
+        progress: told while the content is hashed.
+    """
     from liex_lab.catalog import find_model, sha256
     from liex_lab.sessions import Provenance
 
@@ -230,27 +303,43 @@ def build_provenance(
 
 
 def build_arena(scene: Foreground, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
-    """The shape of the arena, where there is one, and the plan's zones in it."""
+    """The outline of the arena's floor, and the plan's zones placed in it, arena frame, mm.
+
+    Args:
+        scene: the learned segmentation; a hand has no arena, so its outline is unknown.
+        plan: names the file of zones.
+    """
     from liex_lab.arena.floor import Floor
     from liex_lab.arena.outline import UNKNOWN, find_arena
-    from liex_lab.foreground.background_segmenter import Scene
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 
     arena = UNKNOWN
-    if isinstance(scene, Scene):
+    if isinstance(scene, BackgroundSubtraction):
         floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
         arena = find_arena(scene.background, floor, scene.grid)
     return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
 
 
 def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
-    """The zones of the plan, as they were drawn."""
+    """The zones of the plan as they were drawn, () where it names none.
+
+    Args:
+        plan: its setting `arena.zones`.
+
+    Raises:
+        PlanError: the file of zones cannot be used.
+    """
     from liex_lab.arena.zones import read_zones
 
     return read_zones(plan.arena.zones) if plan.arena.zones else ()
 
 
 def build_surroundings(provenance: Provenance) -> Surroundings:
-    """What measures of behaviour have to know of arena, zones and water."""
+    """What measures of behaviour have to know of arena, zones and water.
+
+    Args:
+        provenance: the session's origin.
+    """
     from liex_lab.behaviour.places import Surroundings, surface_height_mm
 
     surface = surface_height_mm(provenance.floor_distance_mm, provenance.optics)
@@ -258,15 +347,27 @@ def build_surroundings(provenance: Provenance) -> Surroundings:
 
 
 def build_rules(plan: Plan) -> MouseRules:
-    """The thresholds of the behaviours."""
+    """Thresholds of the behaviours that rules name.
+
+    Args:
+        plan: its section `behaviour`.
+    """
     from liex_lab.behaviour.bouts import MouseRules
 
     return MouseRules(**plan.behaviour.model_dump())
 
 
 def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
-    """The recogniser of the plan: the named one, or the animal's bundled one; None where the rules
-    name actions.
+    """The plan's action recogniser: the named or the bundled one; None where rules name actions.
+
+    Args:
+        plan: its setting `actions.model`: a name, a path, `rules`, or None for the animal's bundled
+            one.
+        skeleton: the animal's skeleton.
+
+    Raises:
+        ModelError: there is no such model.
+        PlanError: the model was made for another skeleton.
     """
     from liex_lab.actions.storage import bundled_action_models, load_action_model
 

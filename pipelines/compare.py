@@ -1,4 +1,8 @@
-"""The job `liex compare`: sessions in, groups compared, tables out."""
+"""Group comparison of a cohort, `liex compare`: sessions in, tests between groups out as tables.
+
+Each measure and pair of groups is tested by a permutation test or a mixed model over the units that
+were assigned to a group, with false discovery rates over the whole table (see `behaviour.cohort`).
+"""
 
 from __future__ import annotations
 
@@ -26,13 +30,25 @@ def compare_sessions(
     engine: str = "auto",
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Compare the groups of all sessions in the given folders; writes stats, sessions, columns.json
-    and methods.txt.
+    """Compare the groups of all sessions in the given folders and write the tables.
 
-    places: session folders, or folders with sessions anywhere in them. measures: columns of the
-    summary; () takes the usual ones and every action's share. reference: compare with this group
-    only. animals: a CSV with subject_id and any of group, cage, sex, batch, which overrules what
-    the sessions say. Returns the table's rows and the files.
+    Writes stats.parquet, stats.csv, sessions.csv, columns.json and methods.txt.
+
+    Args:
+        places: session folders, or folders with sessions anywhere in them.
+        out: folder of the tables; it is made where it is missing.
+        measures: columns of the summary; () takes the usual ones and every action's share.
+        reference: compare with this group only; None compares all pairs.
+        animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrules what
+            the sessions say.
+        engine: `auto`, `permutation` or `mixed`.
+        progress: told session by session.
+
+    Returns:
+        `stats`: the table's rows; `folder`: where the files are.
+
+    Raises:
+        SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
     """
     from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods, usual_measures
     from liex_lab.sessions import Session
@@ -77,7 +93,16 @@ def compare_sessions(
 
 
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:
-    """Every session in the folders, each once, in order of their paths."""
+    """Every session in the folders, each once, in order of their paths.
+
+    Folders inside a session, such as its older tables, are no sessions.
+
+    Args:
+        places: session folders, or folders with sessions anywhere in them.
+
+    Raises:
+        SessionError: one is no folder, or has no session in it.
+    """
     found: set[Path] = set()
     for place in map(Path, places):
         if not place.is_dir():

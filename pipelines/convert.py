@@ -1,5 +1,8 @@
-"""The job behind `liex convert`: any recording that opens, written as MCAP, as .oni or as a folder
-of PNG pictures.
+"""Conversion of recordings, `liex convert`: any depth recording to MCAP, .oni or a folder of PNGs.
+
+MCAP keeps every depth as it is. 16-bit pictures keep whole steps of a size, mm: the largest of
+those that the format can state of which all depths of some frames are multiples, or the nearest
+steps of one that is stated.
 """
 
 from __future__ import annotations
@@ -42,8 +45,13 @@ _PICTURE = re.compile(r"frame_\d+\.png")
 
 @dataclass(frozen=True)
 class Converted:
-    """What was written. notes: sentences about what is not as it was; problems: of the recording
-    that was read.
+    """What was written.
+
+    Attributes:
+        path: the recording that was written.
+        n_frames: its number of frames.
+        notes: sentences about what is not as it was.
+        problems: of the recording that was read.
     """
 
     path: Path
@@ -64,13 +72,25 @@ def convert(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Converted:
-    """Write a recording as `to`: NAME.mcap, NAME.oni, or else a folder of PNG pictures.
+    """Write a recording as MCAP, .oni or a folder of PNG pictures.
 
-    MCAP keeps every depth; 16-bit pictures keep whole steps of a size that is found, or, where
-    `step_mm` is stated, the nearest steps. ros: ROS 2's messages in the MCAP file instead of
-    Foxglove's. `camera`, `fps` and `topic` are those of `open_recording`. The target has its name
-    only when it is whole. Raises RecordingError where something is in its place or the depth does
-    not fit.
+    The target has its name only when it is whole.
+
+    Args:
+        recording: a path or address, or a recording that is open already.
+        to: NAME.mcap, NAME.oni, or else a folder for PNG pictures.
+        camera: intrinsics that come before what the files state, as in `open_recording`.
+        fps: frame rate of recordings without stamps, as in `open_recording`.
+        topic: depth topic of a message log, as in `open_recording`.
+        step_mm: mm for each step of 16-bit pictures; depths are rounded to it. None finds one that
+            keeps them.
+        ros: ROS 2 messages in the MCAP file instead of Foxglove's.
+        overwrite: replace a recording that is in its place.
+        progress: told frame by frame.
+
+    Raises:
+        RecordingError: something is in its place, the depths do not fit, or the recording cannot be
+            opened.
     """
     target = Path(to)
     _check_target(target, overwrite)

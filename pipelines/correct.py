@@ -1,4 +1,9 @@
-"""The job `liex correct`: what people correct is kept beside a session, and every table follows."""
+"""Corrections of a session by people, `liex correct`: kept in a log beside it, every table follows.
+
+What was measured is never written again. The folder `corrected` holds an append-only log of
+flips, moved joints and edited bouts, and the tables that follow from those that stand; it is
+replaced as a whole by a rename.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +51,26 @@ def correct_session(
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Add corrections to a session and take others back, by their numbers; with neither, make
-    everything again.
+    """Add corrections to a session and take others back; with neither, make everything again.
 
-    All at once or not at all: the folder `corrected` is replaced by a rename. Corrections that were
-    made on an earlier measurement of the recording apply to this one from then on. Raises
-    SessionError where one cannot be applied.
+    All at once or not at all. Corrections that were made on an earlier measurement of the recording
+    apply to this one from then on.
+
+    Args:
+        session: the session folder.
+        what: corrections to add.
+        undo: numbers of corrections to take back.
+        author: who corrects.
+        blueprint: makes the layout of the corrected replay, see `SessionWriter`.
+        report: makes the report again, see `SessionWriter`; None leaves it.
+        progress: told the stage.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        SessionError: a correction cannot be applied, there is none, those of the log were made on
+            another measurement, or another program corrects the session.
     """
     from liex_lab.sessions import Session
     from liex_lab.sessions.lock import locked
@@ -90,8 +109,9 @@ def correct_session(
 
 
 def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | None) -> Log:
-    """Write the tables that are others than the session's own, and a replay to be shown with the
-    session's own; returns the log that lists them.
+    """Write the tables that differ from the session's own, and a replay to be shown with its own.
+
+    Returns the log that lists them.
     """
     from liex_lab.sessions.applying import corrected_track
     from liex_lab.sessions.evidence import provenance_of
@@ -127,7 +147,7 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
 
 
 def _told(log: Log) -> dict[str, Any]:
-    """The standing corrections in short: `corrections` of session.json as it is read."""
+    """The standing corrections in short for session.json: numbers by kind, authors, last time."""
     made = [(entry.what, entry.author) for entry in log.standing if entry.what is not None]
     kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
     return {

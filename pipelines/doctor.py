@@ -1,5 +1,8 @@
-"""The job `liex doctor`: what is in a recording, and what a lab should know before it trusts it.
-Needs no model.
+"""Quality report of a recording, `liex doctor`: what is in it, and what to know before trusting it.
+
+Needs no model. Looks at stamps (rate, jitter, gaps, faults), camera and lens, depth range and
+unread pixels, and in frames spread over the recording at floor, noise, arena, water and animal.
+`FINDINGS` lists every number with its unit; problems are sentences that say what to do.
 """
 
 from __future__ import annotations
@@ -73,11 +76,19 @@ def examine(
     topic: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Look at a recording as the plan says; the result has the keys of `FINDINGS`, and only JSON's
-    own types.
+    """The findings of a recording: the keys of `FINDINGS`, in types that JSON can hold.
 
-    fps, topic: come before the plan's. A recording that is cut short is looked at as far as it
-    goes; one that cannot be opened at all raises a RecordingError.
+    A recording that is cut short is looked at as far as it goes.
+
+    Args:
+        path: a file, folder or address of a recording.
+        plan: camera, water surface, expected sizes; None takes the default plan.
+        fps: frame rate of recordings without stamps, before the plan's.
+        topic: depth topic of a message log, before the plan's.
+        progress: told while an archive is unpacked or an index made.
+
+    Raises:
+        RecordingError: the recording cannot be opened at all.
     """
     from liex_lab.foreground.background import sample_frames, stride_for
     from liex_lab.recordings.rectify import rectified
@@ -114,9 +125,7 @@ def examine(
 
 
 def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
-    """The plan with what was asked for on the command line; what is cut short is wanted as far as
-    it goes.
-    """
+    """The plan with what the command line asks for; a recording that is cut short is accepted."""
     settings = ["recording.accept_truncated=true"]
     settings += [f"recording.fps={fps!r}"] if fps is not None else []
     settings += [f"recording.topic={topic}"] if topic is not None else []
@@ -230,7 +239,11 @@ def _finite(value: float) -> float | None:
 
 
 def print_report(findings: dict[str, Any]) -> None:
-    """The findings in one screen to read, and the problems below."""
+    """Print the findings on one screen, and the problems below.
+
+    Args:
+        findings: what `examine` returns.
+    """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -247,7 +260,11 @@ def print_report(findings: dict[str, Any]) -> None:
 
 
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
-    """The findings as (name, text)."""
+    """The findings as (name, text), in the order in which they are printed.
+
+    Args:
+        findings: what `examine` returns.
+    """
     f = findings
     arena = f["arena"]
     water = f["water"]

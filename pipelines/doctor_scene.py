@@ -1,4 +1,9 @@
-"""What `liex doctor` sees in the pictures: floor, noise, arena, water, and the animal."""
+"""What `liex doctor` sees in the pictures: floor plane, noise, arena, water, and the animal.
+
+The floor is a plane fitted to the learned background, noise the 68.3 % quantile of differences
+between frames over sqrt(2), which holds whatever walks through; the animal is found by background
+subtraction as in a run, or else among objects up to 20 times smaller or larger.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,7 @@ from .build import build_zones
 
 if TYPE_CHECKING:
     from liex_lab.arena.floor import Floor
-    from liex_lab.foreground.background_segmenter import Scene
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
     from liex_lab.optics.refraction import Water
     from liex_lab.recordings.recording import Recording
 
@@ -26,9 +31,8 @@ _LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over i
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
 _MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
 _STILL_SHARE = 0.4  # of the animal's area was in the background
-_WIDER = (
-    20.0  # an animal whose size the plan does not allow is looked for down to and up to this factor
-)
+# an animal whose size the plan does not allow is looked for down to and up to this factor
+_WIDER = 20.0
 
 KEYS = (
     "floor_unread_share",
@@ -46,8 +50,16 @@ KEYS = (
 
 @dataclass
 class SceneLook:
-    """The scene and the animal in a sample (n, H, W) mm of every `stride`-th pixel; fills facts and
-    problems.
+    """Facts and problems of the still background and the animal in a sample of frames.
+
+    Attributes:
+        seen: the recording, rectified.
+        plan: expected sizes, thresholds, zones.
+        water: the water surface; None without.
+        sample: (n, H, W) float32 depth, mm, of every `stride`-th pixel.
+        stride: pixels of the picture for one of the sample, along an axis.
+        facts: numbers by the names of `KEYS`; None where they cannot be told.
+        problems: sentences that say what is wrong and what to do.
     """
 
     seen: Recording
@@ -59,7 +71,7 @@ class SceneLook:
     problems: list[str] = field(default_factory=list)
 
     def at_scene(self) -> None:
-        """Floor, noise, arena, water; and then the animal."""
+        """Look at floor, noise, arena, water and animal; fills facts and problems."""
         from liex_lab.arena.floor import Floor, find_floor, floor_patch, floor_region
         from liex_lab.arena.outline import find_arena
         from liex_lab.foreground.background import learn_background
@@ -146,7 +158,7 @@ class SceneLook:
         size.
         """
         from liex_lab.body.skeleton import Skeleton
-        from liex_lab.foreground.background_segmenter import Scene
+        from liex_lab.foreground.background_segmenter import BackgroundSubtraction
         from liex_lab.recordings.recording import Recording
 
         animal = self.plan.animal
@@ -163,7 +175,7 @@ class SceneLook:
         for factor in (1.0, _WIDER):
             sizes = (expected[0] / factor, expected[1] * factor)
             try:
-                scene, sample = Scene.learn(
+                scene, sample = BackgroundSubtraction.learn(
                     memory, sizes, len(self.sample), foreground.min_height_mm, view
                 )
             except EstimationError as error:
@@ -179,7 +191,11 @@ class SceneLook:
         self.problems.append(str(missing))
 
     def _tell_animal(
-        self, scene: Scene, background: NDArray[np.float32], length: float, share: float
+        self,
+        scene: BackgroundSubtraction,
+        background: NDArray[np.float32],
+        length: float,
+        share: float,
     ) -> None:
         raised = scene.background - background[:: scene.stride, :: scene.stride]
         covered = (
@@ -220,8 +236,7 @@ class SceneLook:
 
 
 def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:
-    """Standard deviation mm of pixels over time, from frame to frame of the sample (n, H, W) mm;
-    None if not known.
+    """Standard deviation, mm, of pixels over the sample (n, H, W) mm; None if not known.
 
     Two thirds of the differences are smaller than one standard deviation of theirs, whatever walks
     through the others.

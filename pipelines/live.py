@@ -1,5 +1,8 @@
-"""The job `liex live`: skeletons of a recording that goes on, frame by frame, and the whole track
-when it is over.
+"""Live tracking: skeletons of a recording that goes on, and its smoothed track in the end.
+
+`liex live` learns background, floor and size from the first frames that arrive, then measures each
+frame and passes it to the online tracker, which has no lag; frames that have waited are measured in
+batches. When the recording is over, the offline tracker makes the track of the whole.
 """
 
 from __future__ import annotations
@@ -23,9 +26,8 @@ if TYPE_CHECKING:
     from liex_lab.tracking.track import Track, Tracked
     from liex_lab.tracking.tracker import FrameTracker
 
-LEARN_FRAMES = (
-    90  # that are waited for: the background, the floor and the animal's size are learned from them
-)
+# that are waited for: the background, the floor and the animal's size are learned from them
+LEARN_FRAMES = 90
 _AT_ONCE = 16
 _LONG_S = 0.2
 Viewer = Callable[["FrameTracker", "Arriving"], Any]
@@ -34,8 +36,13 @@ Viewer = Callable[["FrameTracker", "Arriving"], Any]
 def open_live(
     source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0
 ) -> Arriving:
-    """What arrives at a source: a file or folder that is being written, HOST:PORT, or (replay) a
-    recording sent at its own pace.
+    """What arrives at a source: a growing file, a network address, or a replayed recording.
+
+    Args:
+        source: path of a file or folder that is being written, or HOST:PORT.
+        plan: how recordings are opened; one that is cut short is accepted.
+        replay: send the recording at `source` at its own pace instead.
+        patience_s: a growing file is over when nothing has come for so long, s.
     """
     from liex_lab.recordings.streaming import growing, received, replayed
 
@@ -56,12 +63,26 @@ def follow_live(
     viewer: Viewer | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], Tracked]:
-    """Skeletons as frames come, shown in a viewer; returns latencies and the track of the whole,
-    smoothed.
+    """Latencies and the smoothed track of a recording whose skeletons are shown as its frames come.
 
-    Latency: from when a frame was there to when its skeleton was told, of every frame from the
-    first on that came when all before it had been told: until then what was missed while learning
-    is made up for.
+    Latency is from when a frame was there to when its skeleton was known, of every frame from the
+    first on that came when all before it had been answered: until then what was missed while
+    learning is made up for.
+
+    Args:
+        arriving: name, camera and frames as they come.
+        plan: how the recording is measured.
+        learn_frames: frames that background, floor and size are learned from.
+        viewer: makes a viewer from tracker and source, which is shown each frame with its row.
+        progress: told frame by frame.
+
+    Returns:
+        `name`, `n_frames`, `n_live`, `latency_median_ms`, `latency_p95_ms` (None without live
+        frames), `n_measured` and `n_bridged`; and the track with its head-tail flips.
+
+    Raises:
+        RecordingError: the recording was over before it had a frame.
+        EstimationError: no animal is found in the frames that are learned from.
     """
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.online import OnlineTracker
@@ -117,8 +138,9 @@ def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival
 
 
 def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
-    """Frames that have waited for long some at a time, for together each costs half; the others one
-    by one.
+    """Frames in batches of up to 16 where they have waited, each alone where they are fresh.
+
+    Together each costs half.
     """
     some: list[Arrival] = []
     for arrival in arrivals:

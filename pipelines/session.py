@@ -1,4 +1,10 @@
-"""The job `liex run`: a depth recording in, a session folder out. The whole line on one page."""
+"""Measurement of a recording, `liex run`: a depth recording in, a session folder out.
+
+The whole line on one page: recording -> foreground -> candidate poses of single frames -> track
+(association, smoothing) -> actions -> behaviour tables. Single frames are measured in chunks and
+written as they come, so an interrupted run goes on where it was; the track and all that follows is
+made of all frames at once.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +31,16 @@ from .build import (
     build_surroundings,
     build_tracker,
 )
-from .shards import CHUNK, LENGTH, MEASURING, Stretch, look_side_by_side
-from .workers import Crew
+from .shards import CHUNK, LENGTH, MEASURING, Shard, look_side_by_side
+from .workers import WorkerPool
 
 if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
     from liex_lab.behaviour.summary import Behaviour
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Provenance, Session
-    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker, SessionWriter
+    from liex_lab.sessions import Provenance, Session, SessionWriter
+    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
     from liex_lab.tables.rows import Rows
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -52,16 +58,37 @@ def measure_session(
     notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
-    crew: Crew | None = None,
+    crew: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording; returns the session folder `out/<recording's name>.liex`,
-    or `folder`.
+    """Measure every frame of a recording and write the session folder.
 
-    notes: what session.json is to hold besides, see `SessionWriter.note`; blueprint and report make
-    the views that lie in the folder, see `SessionWriter`. crew: looks at stretches of a long
-    recording side by side, where the recording is given by its path; the tables are the same.
+    An unfinished session of the same recording and plan is continued. Where a pool of workers is
+    given and the recording is long (more than two shards) and stated by its path, its shards are
+    measured side by side; the tables are the same.
+
+    Args:
+        recording: a path or address, or a recording that is open already.
+        plan: everything that the run depends on.
+        out: folder of the session, which is named after the plan's session or the recording.
+        folder: the session folder itself, instead of `out/NAME.liex`.
+        overwrite: replace a session that is there already, once the new one is whole.
+        notes: what session.json is to hold besides, see `SessionWriter.note`.
+        blueprint: makes the layout of the replay, see `SessionWriter`.
+        report: makes the report in the folder, see `SessionWriter`.
+        crew: pool of workers for the shards of a long recording.
+        progress: told frame by frame.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        SessionError: a session is there already, or another process writes it.
+        RecordingError: the recording cannot be opened or read.
+        PlanError: the plan, or a file that it names, cannot be used.
+        EstimationError: no animal is found.
     """
+    from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.place import check_place, part_folder
 
@@ -82,7 +109,7 @@ def measure_session(
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
         if crew is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
-            whole = Stretch(str(recording), plan, tracker, provenance, folder, 0, len(opened))
+            whole = Shard(str(recording), plan, tracker, provenance, folder, 0, len(opened))
             look_side_by_side(crew, whole, folder, progress)
         with SessionWriter(
             folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report
@@ -104,15 +131,21 @@ def measure_session(
 
 
 def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
-    """The frames from `first` on in chunks; while one is looked at the next is read, but for those
-    that are rendered, which takes all cores.
+    """Chunks of frames from `first` on, the next read while one is measured.
+
+    Rendered recordings are not read ahead, as rendering takes all cores.
     """
     chunks = opened.chunks(CHUNK, first)
     yield from chunks if opened.format == "synthetic" else ahead(chunks)
 
 
 def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
-    """The track of a session whose frames have all been looked at."""
+    """Make the track of a session whose frames have all been measured, and hand it to the writer.
+
+    Args:
+        writer: holds the observations, and allocates the track's arrays.
+        tracker: the tracker that measured the frames.
+    """
     from liex_lab.tracking.observations import Observations
 
     whole = writer.seen(Observations)
@@ -120,7 +153,13 @@ def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
-    """Measure the behaviour of a session whose track is known, and put the session in its place."""
+    """The finished session: its behaviour is measured and the session put in its place.
+
+    Args:
+        writer: holds the track as rows.
+        plan: rules and action model.
+        timings: seconds of `prepare` and `track`, for session.json.
+    """
     rows = writer.rows
     behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.room)
     writer.note(**notes)
@@ -132,8 +171,13 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
 def measure_behaviour(
     rows: Rows, plan: Plan, origin: Provenance, room: Room = np.empty
 ) -> tuple[Behaviour, dict[str, Any]]:
-    """The behaviour of a track as the plan names it, and what session.json is to hold of the
-    recogniser. room: for what takes much of it on the way.
+    """The behaviour of a track as the plan names it, and notes on the recogniser for session.json.
+
+    Args:
+        rows: the track as table rows.
+        plan: rules and action model.
+        origin: skeleton, arena, zones and water.
+        room: allocator of large arrays, such as one of files on disk.
     """
     from liex_lab.behaviour.summary import measure_rows
 
@@ -149,8 +193,16 @@ def measure_behaviour(
 def name_actions(
     recogniser: TimelineModel, rows: Rows, room: Room = np.empty
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The ethogram of a track by a recogniser, as `behaviour.measure` takes it, and notes: which
-    recogniser it was, and what the frame rate cannot tell.
+    """The ethogram of a track by a recogniser, and notes for session.json.
+
+    Args:
+        recogniser: names the frames.
+        rows: the track as table rows, with the distance of the animal from the nearest wall, mm.
+        room: allocator of large arrays.
+
+    Returns:
+        `bouts` and the definitions of `actions`, as `behaviour.measure` takes them; and notes:
+        which recogniser it was, and which actions the frame rate cannot tell.
     """
     from liex_lab.tables.rows import bout_rows
 

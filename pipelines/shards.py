@@ -1,8 +1,9 @@
-"""A long recording looked at in stretches, side by side: what single frames say does not depend on
-their neighbours.
+"""Sharded measurement of one long recording: spans of frames, measured side by side.
 
-The track is made of all frames at once afterwards, so there is no seam: the tables are those of one
-process.
+What single frames say does not depend on their neighbours, and the track is made of all frames at
+once afterwards; so there is no seam, and the tables are those of one process. Shards begin at
+multiples of `LENGTH` frames and lie in folders of their own until they are taken over in order, so
+an interruption costs no more than the shards under way.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress
 
 from .build import build_estimator, build_recording
-from .workers import Crew
+from .workers import WorkerPool
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
@@ -31,11 +32,17 @@ MEASURING = "measuring poses"
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Frames start to stop (exclusive) of a recording, and all that a worker elsewhere has to know
-    to look at them.
+class Shard:
+    """A span of frames of a recording, and all that a worker elsewhere has to know to measure it.
 
-    folder: where the result will be.
+    Attributes:
+        recording: path or address of the recording.
+        plan: how it is measured.
+        tracker: the prepared tracker; a pickle leaves out its estimator, which is large.
+        origin: provenance of the session.
+        folder: where the result will be.
+        start: first frame.
+        stop: frame after the last one.
     """
 
     recording: str
@@ -47,9 +54,7 @@ class Stretch:
     stop: int
 
     def __getstate__(self) -> dict[str, Any]:
-        """To a worker goes all but the model, which is large: it has the file, and keeps what it
-        loaded.
-        """
+        """State without the large model: a worker has the file, and keeps what it loaded."""
         return {**vars(self), "tracker": replace(self.tracker, estimator=None)}  # type: ignore[arg-type]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -57,8 +62,15 @@ class Stretch:
         vars(self).update({**state, "tracker": tracker})
 
 
-def look_at(stretch: Stretch) -> Stretch:
-    """Measure a stretch and write it; the task of a worker. Done twice it does the same."""
+def look_at(stretch: Shard) -> Shard:
+    """Measure a shard and write it: the task of a worker. Done twice it does the same.
+
+    Args:
+        stretch: the span of frames.
+
+    Returns:
+        The same shard, when its folder is whole.
+    """
     from liex_lab.sessions.stretches import StretchWriter
 
     opened = _opened(stretch.recording, stretch.plan.to_toml(), stretch.origin.input_sha256)
@@ -72,17 +84,24 @@ def look_at(stretch: Stretch) -> Stretch:
 
 @lru_cache(maxsize=1)
 def _opened(recording: str, plan_toml: str, input_sha256: str) -> Recording:
-    """The recording, open for this process's next stretches too. input_sha256: another content is
-    another recording.
-    """
+    """The recording, kept open for this process's next shards; another hash is another one."""
     return build_recording(recording, Plan.from_toml(plan_toml))
 
 
-def look_side_by_side(crew: Crew, whole: Stretch, path: Path, progress: Progress) -> None:
-    """Look at all frames of a recording that the unfinished session of `path` does not have yet.
+def look_side_by_side(crew: WorkerPool, whole: Shard, path: Path, progress: Progress) -> None:
+    """Measure all frames of a recording that its unfinished session does not have yet.
 
-    whole: the recording as one stretch, its folder does not matter. Afterwards the session goes on
-    as one that was interrupted after its last frame. Whatever happens, what is whole is kept.
+    Afterwards the session goes on as one that was interrupted after its last frame. Whatever
+    happens, shards that are whole are kept.
+
+    Args:
+        crew: the pool of workers.
+        whole: the recording as one shard; its folder does not matter.
+        path: the session folder that is to be; what is unfinished lies beside it.
+        progress: told shard by shard.
+
+    Raises:
+        SessionError: a worker ended without a word, or another process writes the session.
     """
     from liex_lab.sessions.stretches import is_whole, stretch_folder, take_over
     from liex_lab.sessions.writer import unfinished
@@ -110,15 +129,14 @@ def look_side_by_side(crew: Crew, whole: Stretch, path: Path, progress: Progress
         held.leave(keep=True)
 
 
-def _all_of(there: list[Stretch], crew: Crew, others: list[Stretch]) -> Iterator[Stretch]:
+def _all_of(there: list[Shard], crew: WorkerPool, others: list[Shard]) -> Iterator[Shard]:
+    """Shards that are there already, and then the others as workers finish them."""
     yield from there
     yield from crew.each(look_at, others)
 
 
 def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
-    """Frames first to stop cut at multiples of `LENGTH`, so that a run that goes on finds the
-    stretches of the last.
-    """
+    """Frames first to stop cut at multiples of `LENGTH`, so that every run cuts them alike."""
     while first < stop:
         last = min(stop, (first // LENGTH + 1) * LENGTH)
         yield first, last

@@ -1,5 +1,8 @@
-"""The job `liex verify`: is a session what it was when it was written, and does its recording give
-it again?
+"""Verification of a session, `liex verify`: its hashes, logs, model, plan, and reproducibility.
+
+Every file is held against its size and SHA-256 in session.json, replay and messages against their
+own check sums and lengths. With the recording given, it is measured again and the tables compared,
+byte by byte or else row by row.
 """
 
 from __future__ import annotations
@@ -37,8 +40,11 @@ _TABLES = (".parquet", ".csv")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at. state: ok; wrong: the session is not what it says; note: worth
-    knowing.
+    """One thing that was looked at.
+
+    Attributes:
+        state: `ok`; `wrong`: the session is not what it says; `note`: worth knowing.
+        sentence: what was found.
     """
 
     state: str
@@ -48,10 +54,16 @@ class Finding:
 def verify_session(
     path: str | Path, run: RunAgain, recording: str | None = None, progress: Progress = silent
 ) -> list[Finding]:
-    """Look at everything a session says about itself. recording: it is measured again, which takes
-    as long as then.
+    """Findings on everything that a session says about itself.
 
-    Raises SessionError where there is no session at all.
+    Args:
+        path: the session folder; what was measured is looked at, and the log of corrections.
+        run: measures a recording, `liex_lab.api.run_session`.
+        recording: it is measured again, which takes as long as the first time; None leaves it out.
+        progress: told while the recording is measured.
+
+    Raises:
+        SessionError: there is no session at all.
     """
     from liex_lab.sessions import Session
 

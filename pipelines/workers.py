@@ -1,5 +1,7 @@
-"""Workers for the stretches of one recording: processes of this machine. Those of a study are
-Dask's, see `cohort`.
+"""Worker pool of processes of this machine, for the shards of one recording.
+
+Processes are spawned, as numba's threads do not survive a fork, and share the cores. The workers of
+a study are Dask's, see `study.dask_cluster`.
 """
 
 from __future__ import annotations
@@ -19,22 +21,40 @@ Work = TypeVar("Work")
 Done = TypeVar("Done")
 
 
-class Crew(Protocol):
-    """Whoever can do several things at once."""
+class WorkerPool(Protocol):
+    """Whoever can do several tasks at once, such as processes or the workers of a cluster."""
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """What `do` makes of each of the works, as soon as it is there, in any order."""
+        """What `do` makes of each of the tasks, as soon as it is there, in any order.
+
+        Args:
+            do: the task; it and its argument can be pickled.
+            works: the arguments, one a task.
+        """
 
 
 @dataclass(frozen=True)
 class Processes:
-    """n processes of this machine; threads: cores for each, 0 an equal share."""
+    """A pool of processes of this machine.
+
+    Attributes:
+        n: how many, at most one for each task.
+        threads: cores of each; 0 takes an equal share.
+    """
 
     n: int
     threads: int = 0
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """See `Crew`. Raises SessionError where a process ends without a word."""
+        """What `do` makes of each of the tasks, as soon as it is there, in any order.
+
+        Args:
+            do: the task; it and its argument can be pickled.
+            works: the arguments, one a task; without any, no process is started.
+
+        Raises:
+            SessionError: a process ended without a word, perhaps for want of memory.
+        """
         if not works:
             return
         count = min(self.n, len(works))
@@ -54,12 +74,16 @@ class Processes:
 
 
 def n_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_environment(n_threads: int) -> dict[str, str]:
-    """So that workers share the cores instead of each taking all of them."""
+    """Environment variables by which workers share the cores instead of each taking all of them.
+
+    Args:
+        n_threads: threads of numba, OpenMP and OpenBLAS in each worker.
+    """
     return {
         name: str(n_threads)
         for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -68,7 +92,7 @@ def worker_environment(n_threads: int) -> dict[str, str]:
 
 @contextmanager
 def _cores_for_each(n_threads: int) -> Iterator[None]:
-    """Processes that are started in the block use so many cores."""
+    """Within the block, processes that are started use so many cores."""
     before = dict(os.environ)
     os.environ.update(worker_environment(n_threads))
     try:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
 from liex_lab.behaviour.kinematics import kinematics
-from liex_lab.foreground.background_segmenter import Scene, Windows
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.foreground.height_maps import Patches
 from liex_lab.optics import camera as cameras
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera, Distortion
 from liex_lab.optics.refraction import Water
@@ -73,7 +74,7 @@ def measured(
         [] if water is None else [f"water.{key}={value}" for key, value in water.to_dict().items()]
     )
     with build_recording(path, Plan().with_settings(told)) as recording:
-        scene, sample = Scene.learn(recording, (40.0, 115.0))
+        scene, sample = BackgroundSubtraction.learn(recording, (40.0, 115.0))
         crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     T_camera_arena = scene.floor.T_arena_camera.inverse()
@@ -255,12 +256,12 @@ def test_14_the_model_sees_in_use_what_it_saw_in_training() -> None:
     picture = np.rint(plate.depth(PRIMESENSE_QVGA)).astype(np.uint16)
     bare = np.full_like(picture, 600)
     floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 600.0, PRIMESENSE_QVGA)
-    scene = replace(Scene.from_floor(PRIMESENSE_QVGA, floor), area_mm2=3600.0)
+    scene = replace(BackgroundSubtraction.from_floor(PRIMESENSE_QVGA, floor), area_mm2=3600.0)
     used = scene.extract(picture[None].astype(np.float32), 1.0)
     lens = np.array(
         [[PRIMESENSE_QVGA.fx, PRIMESENSE_QVGA.fy, PRIMESENSE_QVGA.cx, PRIMESENSE_QVGA.cy]]
     )
-    windows = Windows(picture[None], bare[None], lens, np.zeros((1, 2)), floor.inverse_depth[None])
+    windows = Patches(picture[None], bare[None], lens, np.zeros((1, 2)), floor.inverse_depth[None])
     trained, _ = windows.extract(np.ones(1), np.array([3600.0]))
     assert used.found.all()
     np.testing.assert_array_equal(used.heights, trained.heights)

@@ -1,5 +1,7 @@
-"""What the dashboard shows of a study: looked up in the session folders when asked for, and kept
-until those change.
+"""Model of the dashboard: what is shown of a study, read lazily from session folders and cached.
+
+What was read is kept until a session's files change (their time, size and inode). Comparisons of
+groups are those of `liex_lab.behaviour.cohort`.
 """
 
 from __future__ import annotations
@@ -36,11 +38,15 @@ _HELD = 6  # sessions whose tables stay in memory
 
 @dataclass(frozen=True)
 class Ethogram:
-    """A session's bouts as spans (n, 2) s with their words, the spans without a pose (m, 2) s, and
-    how long it is.
+    """A session's bouts.
 
-    vocabulary: all words that its ethogram could have, in the order of which report and replay
-    colour them.
+    Attributes:
+        spans_s: (n, 2) start and stop of each bout, s.
+        words: the n actions.
+        lost_s: (m, 2) start and stop of the spans without a pose, s.
+        duration_s: length of the session, s.
+        vocabulary: all words that its ethogram could have, in the order in which report and replay
+            colour them.
     """
 
     spans_s: np.ndarray
@@ -51,8 +57,11 @@ class Ethogram:
 
 
 class StudyData:
-    """The study that `look` lists, read lazily. Every public method may be called from several
-    threads at once.
+    """A study, read lazily; every public method may be called from several threads at once.
+
+    Attributes:
+        name: name of the study.
+        entries: the key of each session and where it stands, as the study lists them.
     """
 
     def __init__(self, name: str, look: Callable[[], Sequence[Entry]]) -> None:
@@ -73,8 +82,10 @@ class StudyData:
             self._stats.clear()
 
     def warm(self, progress: Progress = silent) -> None:
-        """Read what the first page shows; what the others show is read meanwhile, by a thread of
-        its own.
+        """Read what the first page shows; a thread reads what the others show meanwhile.
+
+        Args:
+            progress: hears how many sessions were read.
         """
         entries = self.done
         for k, entry in enumerate(entries):
@@ -83,6 +94,7 @@ class StudyData:
         threading.Thread(target=self._read_ahead, daemon=True).start()
 
     def _read_ahead(self) -> None:
+        """Read what the pages of ethograms and groups show."""
         self.ethograms([entry.key for entry in self.done])
         self.collected()
 
@@ -96,8 +108,13 @@ class StudyData:
         ]
 
     def session(self, key: str) -> Session:
-        """An opened session; the same object until its folder changes. Raises SessionError where
-        there is none.
+        """An opened session; the same object until its folder changes.
+
+        Args:
+            key: its name in the study.
+
+        Raises:
+            SessionError: the study has no measured session of this name.
         """
         entry = self.entries.get(key)
         if entry is None or entry.folder is None or entry.state not in DONE:
@@ -115,7 +132,7 @@ class StudyData:
             return known[1]
 
     def overview(self) -> pd.DataFrame:
-        """One row per session: who, state, and how good it is."""
+        """One row per session: who, state, and how good it is (the columns `QUALITY`)."""
         import pandas as pd
 
         measured = dict(
@@ -135,7 +152,11 @@ class StudyData:
         return pd.DataFrame(rows, columns=["session", *WHO, "state", "reason", "remedy", *QUALITY])
 
     def ethograms(self, keys: Iterable[str]) -> dict[str, Ethogram]:
-        """The ethograms of some sessions, those that cannot be read left out."""
+        """The ethograms of some sessions by key, those that cannot be read left out.
+
+        Args:
+            keys: names of measured sessions.
+        """
         entries = [self.entries[key] for key in keys if key in self.entries]
         found = self._of_all(
             "ethogram", _ethogram, [entry for entry in entries if entry in self.done]
@@ -147,8 +168,9 @@ class StudyData:
         }
 
     def collected(self) -> pd.DataFrame:
-        """One row per measured session, as the comparison of groups takes it; the study's groups
-        overrule theirs.
+        """One row per measured session, as `cohort.compare` takes it, with its `key`.
+
+        Animals and groups that the study states overrule those of the session.
         """
         import pandas as pd
 
@@ -165,8 +187,11 @@ class StudyData:
         )
 
     def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
-        """The comparison of the groups: the usual measures and this one, with p corrected for all
-        of them.
+        """The table `stats` of the usual measures and this one, with p corrected for all of them.
+
+        Args:
+            measure: a column of the summaries.
+            reference: compare each group with this one only; None takes every pair.
         """
         table = self.collected()
         measures = cohort.usual_measures(table)
@@ -178,8 +203,13 @@ class StudyData:
             return self._stats[asked]
 
     def described(self, measure: str) -> tuple[str, str]:
-        """The unit of a measure and what it means, from the column dictionary of the first session
-        that has it.
+        """Unit and meaning of a measure, from the columns of the first session that has it.
+
+        Args:
+            measure: a column of the summaries.
+
+        Returns:
+            Two empty texts where no session has it.
         """
         for entry in self.done:
             columns = self._of_one("columns", lambda session: session.columns, entry)
@@ -227,7 +257,11 @@ QUALITY = (
 
 
 def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
-    """The actions of some ethograms, those with the most time first."""
+    """The actions of some ethograms, those with the most time first.
+
+    Args:
+        ethograms: the ethograms.
+    """
     seconds: dict[str, float] = {}
     for one in ethograms:
         for word, (start, stop) in zip(one.words, one.spans_s, strict=True):
@@ -236,8 +270,13 @@ def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
 
 
 def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str, str]:
-    """A colour for each word, where it is free its own of report and replay; words beyond the last
-    share a grey.
+    """A colour for each word: where it is free its own of report and replay.
+
+    Words beyond the last colour share a grey.
+
+    Args:
+        words: the words, those that matter most first.
+        vocabulary: all words in the order in which report and replay colour them.
     """
     own = {word: action_colour(k) for k, word in reversed(list(enumerate(vocabulary)))}
     chosen: dict[str, str] = {}
@@ -249,15 +288,28 @@ def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str
 
 
 def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
-    """The words of several vocabularies, in the order of the first that has them."""
+    """The words of several vocabularies, in the order of the first that has them.
+
+    Args:
+        ethograms: the ethograms.
+    """
     return list(dict.fromkeys(word for one in ethograms for word in one.vocabulary))
 
 
 def raster(
     one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int
 ) -> np.ndarray:
-    """(n,) for each of n equal parts of a span: the place of the word with the most time in it, -1
-    for none, -2 where there is mostly no pose.
+    """(n,) for each of n equal parts of a span: index of the word with the most time in it.
+
+    Args:
+        one: the ethogram.
+        words: the words to look for.
+        start_s: beginning of the span, s.
+        stop_s: its end, s.
+        n: number of parts.
+
+    Returns:
+        Index into `words`, -1 where none of them occurs, -2 where there is mostly no pose.
     """
     place = {word: k for k, word in enumerate(words)}
     seconds = np.zeros((len(words) + 1, n))
@@ -279,7 +331,7 @@ def raster(
 
 
 def _stamp(folder: Path) -> Any:
-    """Changes whenever the session is written again or corrected."""
+    """Times, sizes and inodes; they change whenever the session is written again or corrected."""
     stamps: list[tuple[int, int, int] | None] = []
     for path in (folder / "session.json", corrected_folder(folder) / LOG):
         try:

@@ -1,6 +1,4 @@
-"""The depth picture of any frame of a session, out of its own replay file, with the skeleton over
-it.
-"""
+"""Depth picture of any frame of a session, from its own replay file, with the skeleton over it."""
 
 from __future__ import annotations
 
@@ -24,14 +22,25 @@ _LEAST_PX = 16
 
 
 class Frames:
-    """Depth pictures by session and row; the files that they come from stay open for a while."""
+    """Depth pictures by session and row; the files that they come from stay open for a while.
+
+    It may be used from several threads at once.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: dict[str, tuple[Any, ExitStack, Recording]] = {}
 
     def depth(self, key: str, session: Session, row: int) -> NDArray[np.uint16] | None:
-        """(H, W) mm, 0 unread; None where the session keeps no depth of this frame."""
+        """(H, W) uint16 mm, 0 where unread; None where the session keeps no depth of this frame.
+
+        Without a replay file that can be read, a thumbnail of this very frame does.
+
+        Args:
+            key: the session's name in the study.
+            session: the opened session.
+            row: the frame's row in the table `frames`.
+        """
         from liex_lab.recordings import open_recording
 
         path = session.path / "session.mcap"
@@ -53,7 +62,14 @@ class Frames:
                 return _kept(session, row)
 
     def figure(self, key: str, session: Session, row: int, *, whole: bool) -> dict[str, Any]:
-        """The picture of a frame with its skeleton, cut out around the animal or whole."""
+        """The picture of a frame with its skeleton, as plotly takes it.
+
+        Args:
+            key: the session's name in the study.
+            session: the opened session.
+            row: the frame's row in the table `frames`.
+            whole: the whole picture, else what is around the animal.
+        """
         depth = self.depth(key, session, row)
         index = int(session.frames["frame_index"].iloc[row])
         joints = session.table("poses", ["frame_index", "joint", "u_px", "v_px"], [index])
@@ -86,9 +102,7 @@ class Frames:
 
 
 def _around(depth: NDArray[np.uint16], uv: np.ndarray) -> tuple[int, int, NDArray[np.uint16]]:
-    """The square of the picture around a skeleton (J, 2) px: its left and top, and the part of it
-    that is there.
-    """
+    """The square around a skeleton (J, 2) px: left, top, and what of it is in the picture."""
     centre = uv.mean(axis=0)
     half = max(1.6 * float(np.linalg.norm(uv - centre, axis=1).max()), _LEAST_PX)
     height, width = depth.shape

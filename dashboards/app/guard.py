@@ -1,5 +1,7 @@
-"""Who may ask the dashboard for anything, and what its pages may load: this machine alone, unless
-told otherwise.
+"""Access control of the dashboard: host and origin check, token cookie, content security policy.
+
+It answers this machine alone, unless started with a token, and its pages load nothing from
+elsewhere.
 """
 
 from __future__ import annotations
@@ -26,15 +28,21 @@ _REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
-    """Refuse requests of others: with a token those that do not know it, without one those of any
-    other name.
+    """Refuse requests of others, and set the security headers of every answer.
 
-    A name that is not this machine's would be another site's whose address was bent to us (DNS
-    rebinding); an origin that is not ours another site's page that sends forms here.
+    With a token those are refused that do not know it, without one those to any name but this
+    machine's. A name that is not this machine's would be another site's whose address was bent to
+    us (DNS rebinding); an origin that is not ours another site's page that sends forms here (CSRF).
+
+    Args:
+        server: the Flask server of the dashboard.
+        token: what every visitor has to know; empty on this machine alone.
+        page_policy: makes the content security policy of the pages.
     """
 
     @server.before_request
     def allowed() -> Any:
+        """Let a request through, or answer it with 401, 403 or the cookie that holds the token."""
         name = urlsplit(f"//{request.host}").hostname or ""
         if not token and name not in LOOPBACK:
             abort(Response("This dashboard answers on 127.0.0.1 only.", 403, mimetype="text/plain"))
@@ -59,6 +67,7 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
 
     @server.after_request
     def policies(response: Response) -> Response:
+        """Set the security headers of a `response`; a content policy of its own stays."""
         response.headers.setdefault("Content-Security-Policy", page_policy())
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "no-referrer"
@@ -66,18 +75,26 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
 
 
 def add_downloads(server: Flask, data: StudyData) -> None:
-    """Addresses of tables as CSV, and of sessions' reports."""
+    """Add the addresses of tables as CSV, and of sessions' reports.
+
+    Args:
+        server: the Flask server of the dashboard.
+        data: the study.
+    """
 
     @server.get("/csv/<path:name>.csv")
     def table_csv(name: str) -> Response:
+        """A table as shown, by its `name`, see `tables.find`."""
         return _csv(lambda: tables.find(data, name).rows, name.replace("/", "_").strip("_"))
 
     @server.get("/session-csv/<path:key>/<name>.csv")
     def session_csv(key: str, name: str) -> Response:
+        """The whole table `name` of the session `key`."""
         return _csv(lambda: tables.session_table(data, key, name), f"{key}_{name}")
 
     @server.get("/report/<path:key>")
     def report(key: str) -> Response:
+        """The report of the session `key`; a report needs no script, so it may have none."""
         try:
             page = (data.session(key).path / "report.html").read_text(encoding="utf-8")
         except (LiexError, OSError):

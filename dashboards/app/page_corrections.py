@@ -1,5 +1,6 @@
-"""What a person corrects from a session's page: head and tail of a span, a joint of a frame, a bout
-of the ethogram.
+"""The dashboard's form for manual corrections: flip of a span, joint of a frame, bout.
+
+Corrections lie beside the session, never over it; `liex_lab.sessions.correcting` makes them.
 """
 
 from __future__ import annotations
@@ -32,20 +33,28 @@ _PLACE = ("u", "v", "x", "y", "z")
 
 
 def panel(session: Session, opened: bool) -> html.Details:
-    """The form, closed until it is wanted, and the corrections that were made."""
+    """The form, closed until it is wanted, and the corrections that were made.
+
+    Args:
+        session: the opened session.
+        opened: whether the form is open.
+    """
     titles = dict(_DEEDS)
 
     def do(what: str) -> html.Button:
+        """The button of the correction `what`."""
         return html.Button(
             titles[what], id={"part": "correct", "what": what}, n_clicks=0, type="button"
         )
 
     def field(name: str, title: str) -> html.Label:
+        """A field for the number `name`, headed `title`."""
         return html.Label(
             [html.Span(title), dcc.Input(id=f"correct-{name}", type="number", step="any")]
         )
 
     def choice(name: str, title: str, words: list[str]) -> html.Label:
+        """A list of `words` for the entry `name`, headed `title`."""
         options = [{"label": word.replace("_", " "), "value": word} for word in words]
         chooser = dcc.Dropdown(id=f"correct-{name}", options=options, placeholder="choose")
         return html.Label([html.Span(title), chooser])
@@ -145,11 +154,19 @@ def _made(session: Session) -> html.Div:
 def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) -> Correction:
     """The correction that a button asks for, with what stands in the form.
 
-    told: from, to (s), action, new (an action that the ethogram has no word for), joint, u, v (px),
-    x, y, z (mm). Raises SessionError where it is not enough, or too much.
+    Args:
+        session: the opened session.
+        what: flip, rename, recut, delete, add, pixel or place.
+        at_s: the moment that the page shows, s since the first frame.
+        told: from, to (s), action, new (an action that the ethogram has no word for), joint, u, v
+            (px), x, y, z (mm, arena frame).
+
+    Raises:
+        SessionError: what stands in the form is not enough, or too much.
     """
 
     def number(*names: str) -> list[float]:
+        """Numbers of the fields `names`; raises SessionError where one is missing."""
         missing = [name for name in names if not isinstance(told.get(name), int | float)]
         if missing:
             raise SessionError(
@@ -158,11 +175,13 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
         return [float(told[name]) for name in names]
 
     def word(name: str) -> str:
+        """Text of the field `name`; raises SessionError where it is empty."""
         if not told.get(name):
             raise SessionError(f"this needs the {name}; choose one")
         return str(told[name])
 
     def action() -> tuple[str, bool]:
+        """The action, and whether its word is new; raises SessionError where both are filled in."""
         new = str(told.get("new") or "").strip()
         if new and told.get("action"):
             raise SessionError(
@@ -192,7 +211,13 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
 
 
 def register(app: Dash, data: StudyData, correct: Correct) -> None:
-    """What happens in the form."""
+    """Register what happens in the form.
+
+    Args:
+        app: the dashboard.
+        data: the study.
+        correct: adds corrections to the session in a folder, or takes some back, by whom.
+    """
     names = ("from", "to", "action", "new", "joint", *_PLACE)
 
     @app.callback(
@@ -211,6 +236,16 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
     def do(
         _deeds: Any, _undone: Any, at_s: float | None, key: str, by: str | None, *values: Any
     ) -> Any:
+        """Make or take back a correction, and load the page anew; or say what is wrong.
+
+        Args:
+            _deeds: numbers of clicks on the buttons of corrections.
+            _undone: numbers of clicks on the buttons that take one back.
+            at_s: the moment that the page shows, s.
+            key: the session's name in the study.
+            by: who corrects.
+            *values: what stands in the form's fields.
+        """
         asked = ctx.triggered_id
         if not isinstance(asked, dict) or not ctx.triggered[0]["value"]:
             return no_update, no_update, no_update
@@ -238,6 +273,7 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
         prevent_initial_call=True,
     )
     def point(click: dict[str, Any] | None) -> Any:
+        """Pixel (u, v) of plotly's `click` on the picture, px."""
         if not click:
             return no_update, no_update
         return tuple(round(float(click["points"][0][axis]), 2) for axis in ("x", "y"))

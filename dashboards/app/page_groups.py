@@ -1,4 +1,8 @@
-"""The page that compares groups of animals: one measure drawn, every comparison in a table."""
+"""The dashboard's page that compares groups of animals: one measure drawn, all comparisons listed.
+
+The statistics (Hedges' g, permutation test or mixed model, Benjamini-Hochberg) are those of
+`liex_lab.behaviour.cohort`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,13 @@ ALL = "every pair"
 
 
 def groups_page(data: StudyData) -> list[Any]:
-    """Choose a measure; see the animals, the differences, and the test that the design allows."""
+    """Content of the page: choose a measure; see the animals, the differences, and the test.
+
+    Where there are no two groups, a sentence says what to state.
+
+    Args:
+        data: the study.
+    """
     table = data.collected()
     measures = list(columns_of(data))
     usual = [name for name in cohort.usual_measures(table) if name in measures]
@@ -113,7 +123,12 @@ def groups_page(data: StudyData) -> list[Any]:
 
 
 def verdict(row: dict[str, Any], unit: str) -> html.Div:
-    """One contrast in words: what was found, how sure, of how many."""
+    """One contrast in words: what was found, how sure, of how many.
+
+    Args:
+        row: a row of the table `stats`, see `cohort.compare`.
+        unit: the measure's unit; empty where it has none.
+    """
     sized = (
         f"{number(row['estimate'])}{f' {unit}' if unit else ''}, 95 % interval "
         f"{number(row['ci_low'])} to "
@@ -150,7 +165,12 @@ def verdict(row: dict[str, Any], unit: str) -> html.Div:
 
 
 def register(app: Dash, data: StudyData) -> None:
-    """What happens when a measure is chosen or an animal clicked."""
+    """Register what happens when a measure is chosen or an animal clicked.
+
+    Args:
+        app: the dashboard.
+        data: the study.
+    """
 
     @app.callback(
         Output("group-points", "figure"),
@@ -163,6 +183,7 @@ def register(app: Dash, data: StudyData) -> None:
         Input("reference", "value"),
     )
     def compare(measure: str, reference: str) -> tuple[Any, ...]:
+        """Figures, verdicts, table and text of `measure`, against the group `reference`."""
         against = None if reference == ALL else reference
         unit, meaning = data.described(measure)
         try:
@@ -185,4 +206,5 @@ def register(app: Dash, data: StudyData) -> None:
         prevent_initial_call=True,
     )
     def open_session(click: dict[str, Any] | None) -> Any:
+        """Address of the session whose mark was clicked, from plotly's `click`."""
         return session_address(str(click["points"][0]["customdata"])) if click else no_update

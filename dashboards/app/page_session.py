@@ -1,6 +1,4 @@
-"""The page of one session at one moment: the frame's picture, its numbers, the curves around it,
-and its replay.
-"""
+"""The dashboard's page of one session at one moment: picture, numbers, curves and replay."""
 
 from __future__ import annotations
 
@@ -65,8 +63,18 @@ def session_page(
     may_correct: bool,
     correcting: bool = False,
 ) -> list[Any]:
-    """A session at a moment (s since its first frame). correcting: the form for corrections is
-    open.
+    """Content of a session's page at a moment.
+
+    Args:
+        data: the study.
+        key: the session's name in the study.
+        at_s: the moment, s since its first frame.
+        may_show: whether a button opens the replay.
+        may_correct: whether there is a form for corrections.
+        correcting: whether that form is open.
+
+    Raises:
+        SessionError: the session cannot be opened.
     """
     session = data.session(key)
     one = data.ethograms([key])[key]
@@ -150,7 +158,12 @@ def session_page(
 
 
 def failed_page(data: StudyData, key: str) -> list[Any]:
-    """What there is to say of a session that was not measured."""
+    """What there is to say of a session that was not measured.
+
+    Args:
+        data: the study.
+        key: the session's name in the study; one that the study does not have is named so.
+    """
     entry = data.entries.get(key)
     if entry is None:
         return [
@@ -260,13 +273,23 @@ def _more(data: StudyData, key: str, session: Session) -> list[Any]:
 
 
 def nearest_row(session: Session, at_s: float) -> int:
-    """The row of the frame whose time is nearest."""
+    """Row of the frame whose time is nearest.
+
+    Args:
+        session: the opened session.
+        at_s: the moment, s since its first frame.
+    """
     return int(np.abs(session.frames["time_s"].to_numpy(float) - at_s).argmin())
 
 
 def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
-    """The next or previous frame, bout's onset, or frame with a flag; the same moment where there
-    is none.
+    """Time of the next or previous frame, bout or flagged frame, s; `at_s` where there is none.
+
+    Args:
+        session: the opened session.
+        at_s: the moment, s since its first frame.
+        by: frame, bout or flag.
+        to: 1 for the next, -1 for the previous.
     """
     time_s = session.frames["time_s"].to_numpy(float)
     row = nearest_row(session, at_s)
@@ -282,7 +305,12 @@ def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
 
 
 def facts(session: Session, row: int) -> list[Any]:
-    """The numbers of one frame, as a list of what and how much."""
+    """The numbers of one frame, as a list of what and how much.
+
+    Args:
+        session: the opened session.
+        row: the frame's row in the table `frames`.
+    """
     frame = session.frames.iloc[row]
     known = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
     if session.has("kinematics.parquet"):
@@ -300,7 +328,15 @@ def facts(session: Session, row: int) -> list[Any]:
 
 
 def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay | None) -> None:
-    """What happens on a session's page."""
+    """Register what happens on a session's page.
+
+    Args:
+        app: the dashboard.
+        data: the study.
+        frames: the depth pictures.
+        show_replay: opens the replay of a .rrd at a time (s); None where it cannot be opened from
+            here.
+    """
 
     @app.callback(
         Output("moment", "value"),
@@ -315,6 +351,16 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
     def move(
         whole: Any, around: Any, _steps: Any, at_s: float | None, key: str, unit_s: float
     ) -> Any:
+        """The new moment, s, after a click on a figure or a button.
+
+        Args:
+            whole: plotly's click on the curves of the whole session.
+            around: plotly's click on the curves around the moment.
+            _steps: numbers of clicks on the buttons.
+            at_s: the present moment, s.
+            key: the session's name in the study.
+            unit_s: seconds per unit of the whole session's axis.
+        """
         asked = ctx.triggered_id
         if not ctx.triggered[0]["value"]:
             return no_update
@@ -335,6 +381,13 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         State("session-unit-s", "data"),
     )
     def follow(at_s: float | None, key: str, unit_s: float) -> tuple[Any, ...]:
+        """All that shows the moment.
+
+        Args:
+            at_s: the moment, s.
+            key: the session's name in the study.
+            unit_s: seconds per unit of the whole session's axis.
+        """
         session = data.session(key)
         moment = float(at_s or 0.0)
         row = nearest_row(session, moment)
@@ -357,6 +410,7 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         State("session-key", "data"),
     )
     def show(at_s: float | None, of: str, key: str) -> Any:
+        """Picture of the frame nearest to `at_s` in the session `key`; `of`: animal or frame."""
         session = data.session(key)
         return frames.figure(
             key, session, nearest_row(session, float(at_s or 0.0)), whole=of == "frame"
@@ -370,6 +424,7 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         prevent_initial_call=True,
     )
     def replay(n_clicks: int, at_s: float | None, key: str) -> Any:
+        """Open the replay of the session `key` at `at_s` after a click (`n_clicks`)."""
         if not n_clicks or show_replay is None:
             return no_update
         try:

@@ -1,6 +1,4 @@
-"""Pages of the whole study: the list of its sessions, and their ethograms and time budgets side by
-side.
-"""
+"""The dashboard's pages of the whole study: list of its sessions, ethograms and time budgets."""
 
 from __future__ import annotations
 
@@ -19,7 +17,11 @@ MOST_COLOURS = len(ACTION_COLOURS)
 
 
 def sessions_page(data: StudyData) -> list[Any]:
-    """Every session of the study with its state and quality."""
+    """Content of the page that lists every session of the study with its state and quality.
+
+    Args:
+        data: the study.
+    """
     counts: dict[str, int] = {}
     for entry in data.entries.values():
         counts[entry.state] = counts.get(entry.state, 0) + 1
@@ -60,7 +62,11 @@ def sessions_page(data: StudyData) -> list[Any]:
 
 
 def ethograms_page(data: StudyData) -> list[Any]:
-    """What the animals of several sessions did, one below the other."""
+    """Content of the page on what the animals of several sessions did, one below the other.
+
+    Args:
+        data: the study.
+    """
     keys = [entry.key for entry in data.done]
     names = sorted({entry.who.get("group", "") for entry in data.done} - {""})
     return [
@@ -121,8 +127,15 @@ def ethograms_page(data: StudyData) -> list[Any]:
 def chosen_keys(
     data: StudyData, names: Sequence[str] | None, sessions: Sequence[str] | None
 ) -> list[str]:
-    """The sessions that are named, or those of the groups, or all; by group, then as in the
-    study.
+    """The sessions that are named, or those of the groups, or all.
+
+    Args:
+        data: the study.
+        names: names of groups; empty takes all.
+        sessions: names of sessions, which go before groups.
+
+    Returns:
+        Keys, by group and then in the study's order (named sessions in the study's order).
     """
     done = data.done
     if sessions:
@@ -132,7 +145,12 @@ def chosen_keys(
 
 
 def register(app: Dash, data: StudyData) -> None:
-    """What happens when something is chosen or clicked on these pages."""
+    """Register what happens when something is chosen or clicked on these pages.
+
+    Args:
+        app: the dashboard.
+        data: the study.
+    """
 
     @app.callback(
         Output("ethograms", "figure"),
@@ -143,6 +161,7 @@ def register(app: Dash, data: StudyData) -> None:
         Input("ethogram-sessions", "value"),
     )
     def draw(names: list[str] | None, sessions: list[str] | None) -> tuple[Any, Any, Any, float]:
+        """Figures, colour key and time unit (s) of the chosen groups (`names`) and `sessions`."""
         ones = data.ethograms(chosen_keys(data, names, sessions))
         words = shown_words(ones.values())
         coloured = colours_of(words[:MOST_COLOURS], vocabulary_of(ones.values()))
@@ -167,6 +186,7 @@ def register(app: Dash, data: StudyData) -> None:
         prevent_initial_call=True,
     )
     def open_moment(click: dict[str, Any] | None, unit_s: float) -> Any:
+        """Address of the moment of a `click` in an ethogram, whose axis has `unit_s` s per unit."""
         if not click:
             return no_update
         point = click["points"][0]
@@ -180,6 +200,7 @@ def register(app: Dash, data: StudyData) -> None:
         prevent_initial_call=True,
     )
     def open_session(click: dict[str, Any] | None) -> Any:
+        """Address of the session whose bar was clicked, from plotly's `click`."""
         return session_address(str(click["points"][0]["customdata"])) if click else no_update
 
     @app.callback(
@@ -189,6 +210,7 @@ def register(app: Dash, data: StudyData) -> None:
         prevent_initial_call=True,
     )
     def look_again(n_clicks: int, href: str) -> Any:
+        """Read the folders again after a click (`n_clicks`); the page's `href` is not used."""
         if not n_clicks:
             return no_update
         data.refresh()

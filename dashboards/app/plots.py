@@ -1,7 +1,8 @@
-"""The dashboard's figures, as plotly takes them: what is drawn, and what a click on it means.
+"""The dashboard's figures as plotly dicts: ethograms, time budgets, groups, curves, depth pictures.
 
-Plotly reads markup in every text it is given, so all names are escaped. A click is told by
-`customdata`: the key of a session and, where there is one, a time.
+Each function returns a figure as a dict (data and layout). Plotly reads markup in every text it is
+given, so all names are escaped. A click is told by `customdata` (the key of a session) or by the
+point's coordinates. No science is computed here.
 """
 
 from __future__ import annotations
@@ -42,12 +43,21 @@ _FONT = {
 
 
 def text(name: str) -> str:
-    """A name as plotly may show it."""
+    """A name as plotly may show it: escaped, with spaces for underscores.
+
+    Args:
+        name: the name.
+    """
     return escape(str(name).replace("_", " "))
 
 
 def empty(sentence: str, height: int = 160) -> dict[str, Any]:
-    """A figure that says why there is none."""
+    """A figure that says why there is none.
+
+    Args:
+        sentence: why.
+        height: height of the figure, px.
+    """
     note = {
         "text": escape(sentence),
         "showarrow": False,
@@ -61,7 +71,12 @@ def empty(sentence: str, height: int = 160) -> dict[str, Any]:
 
 
 def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict[str, Any]:
-    """A row per session, coloured by what the animal did; actions without a colour share a grey."""
+    """A row per session, coloured by what the animal did; actions without a colour share a grey.
+
+    Args:
+        ones: the key of each session and its ethogram, the first on top.
+        coloured: word -> colour.
+    """
     if not ones:
         return empty("No session is chosen, or none of those has an ethogram.")
     stop_s = max(max(one.duration_s for one in ones.values()), 1e-3)
@@ -99,8 +114,11 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
 
 
 def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str, Any]:
-    """A bar per session; shares: one row per session, `key`, a column `WORD_share` for each
-    action.
+    """A stacked bar per session: shares of the observed time in %, uncoloured actions in one grey.
+
+    Args:
+        shares: one row per session: `key`, and the columns WORD_share and WORD_s for each action.
+        coloured: word -> colour.
     """
     if shares.empty:
         return empty("No session is chosen, or none of those has a summary.")
@@ -142,8 +160,13 @@ def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str,
 
 
 def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
-    """Every animal's mean in its group, its sessions as small dots beside it, and the mean of the
-    animals.
+    """Strip plot of a measure by group: each animal's mean, its sessions, the mean of the animals.
+
+    Args:
+        table: one row per session: key, subject_id, group and the measure, see
+            `StudyData.collected`.
+        measure: the column to draw.
+        unit: its unit; empty where it has none.
     """
     known = table[np.isfinite(table[measure].astype(float))] if measure in table else table.iloc[:0]
     if known.empty:
@@ -234,8 +257,11 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
 
 
 def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
-    """Each contrast's difference with its 95 % interval; a hollow mark where the design allows no
-    test.
+    """Each contrast's difference with its 95 % interval; a hollow mark where there is no test.
+
+    Args:
+        stats: rows of the table `stats` of one measure, see `cohort.compare`.
+        unit: the measure's unit; empty where it has none.
     """
     known = stats[np.isfinite(stats["estimate"].astype(float))]
     if known.empty:
@@ -286,8 +312,12 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
 def whole_session(
     one: Ethogram, coloured: Mapping[str, str], traces: Sequence[tuple[str, Array, Array, str]]
 ) -> dict[str, Any]:
-    """A lane per action over a whole session, and curves below: (name with unit, time s (n,),
-    values (n,), colour).
+    """A lane per action over a whole session, and curves below them.
+
+    Args:
+        one: the session's ethogram.
+        coloured: word -> colour; each word has a lane.
+        traces: the curves: (name with unit, time s (n,), values (n,), colour).
     """
     n = 1200
     stop_s = max(one.duration_s, 1e-3)
@@ -370,8 +400,12 @@ def _only(one: Ethogram, word: str) -> Ethogram:
 def around(
     traces: Sequence[tuple[str, Array, Array, str]], moment_s: float, half_s: float
 ) -> dict[str, Any]:
-    """The curves near a moment, every frame a point: (name with unit, time s (n,), values (n,),
-    colour).
+    """The curves near a moment, every frame a point.
+
+    Args:
+        traces: the curves: (name with unit, time s (n,), values (n,), colour).
+        moment_s: the moment, s since the first frame.
+        half_s: how much before and after it is shown, s.
     """
     if not traces:
         return empty("This session has no kinematics.")
@@ -408,7 +442,11 @@ def around(
 
 
 def cursor(at: float) -> dict[str, Any]:
-    """The line that marks the moment, through all curves; `at` in the axis' own unit."""
+    """The vertical line that marks the moment, through all curves.
+
+    Args:
+        at: the moment, in the axis' own unit.
+    """
     return {
         "type": "line",
         "x0": at,
@@ -429,10 +467,19 @@ def frame_picture(
     top: int,
     reach_mm: float,
 ) -> dict[str, Any]:
-    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2) px
-    over it.
+    """A depth picture with the skeleton over it.
 
-    The axes count the whole frame's pixels, (0, 0) the centre of the first.
+    The axes count the whole frame's pixels, (0, 0) the centre of the first. Every pixel can be
+    clicked.
+
+    Args:
+        depth: (h, w) uint16 mm, 0 where unread, cut out of the frame.
+        uv: (J, 2) joints, px of the whole frame; (0, 2) draws none.
+        names: names of the J joints.
+        bones: pairs of joints.
+        left: column of the frame at which the picture begins, px.
+        top: row of the frame at which the picture begins, px.
+        reach_mm: height above the floor around the animal from which on everything is light, mm.
     """
     h, w = depth.shape
     picture = {
@@ -503,21 +550,26 @@ def frame_picture(
 
 
 def time_unit(stop_s: float) -> tuple[str, float]:
-    """The unit of a time axis that ends there, and how many seconds it has."""
+    """The unit of a time axis, and how many seconds it has.
+
+    Args:
+        stop_s: where the axis ends, s; beyond three minutes it counts minutes.
+    """
     return ("min", 60.0) if stop_s > 180.0 else ("s", 1.0)
 
 
 def _plain(name: str) -> str:
-    """A name within a template of plotly's, which would read %{...} in it."""
+    """A name for one of plotly's templates, which would read %{...} in it."""
     return text(name).replace("%{", "% {")
 
 
 def _rows_height(n: int) -> int:
+    """Height of a figure with n rows of sessions, px."""
     return 80 + n * (24 if n <= FEW else 12)
 
 
 def _session_axis(n: int) -> dict[str, Any]:
-    """An upward axis with a session in each row, the first on top."""
+    """A vertical axis with a session in each row, the first on top."""
     return {
         "type": "category",
         "autorange": "reversed",
@@ -529,7 +581,7 @@ def _session_axis(n: int) -> dict[str, Any]:
 
 
 def _domains(heights: Sequence[int]) -> list[list[float]]:
-    """Where figures of these heights stand above each other, the first on top."""
+    """Where figures of these heights stand, the first on top, as shares of the paper."""
     # room for a title
     total = float(sum(heights))
     apart = 24.0
@@ -543,7 +595,7 @@ def _domains(heights: Sequence[int]) -> list[list[float]]:
 
 
 def _curve_axis(domain: list[float], values: Array) -> dict[str, Any]:
-    """The upward axis of one of several curves; from zero where nothing is below it."""
+    """The vertical axis of one of several curves; from zero where nothing is below it."""
     positive = not (values[np.isfinite(values)] < 0).any()
     return {
         "domain": domain,

@@ -1,5 +1,6 @@
-"""`liex dashboard`: a study in the browser, served from this machine, with nothing loaded from
-anywhere else.
+"""`liex dashboard`: a study in the browser, a Dash app served from this machine.
+
+Nothing is loaded from anywhere else: the content security policy allows this server alone.
 """
 
 from __future__ import annotations
@@ -48,12 +49,15 @@ def make_app(
     show_replay: ShowReplay | None = None,
     correct: Correct | None = None,
 ) -> Dash:
-    """The dashboard of a study, not yet served. token: what every visitor has to know; empty on
-    this machine alone.
+    """The dashboard of a study, not yet served.
 
-    show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the
-    command is shown. correct: adds corrections to the session in a folder, or takes some back;
-    None: the pages only show.
+    Args:
+        data: the study.
+        token: what every visitor has to know; empty on this machine alone.
+        show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the
+            command is shown.
+        correct: adds corrections to the session in a folder, or takes some back; None: the pages
+            only show.
     """
     app = Dash(
         "liex_lab_dashboard",
@@ -86,8 +90,16 @@ def make_app(
 
 
 def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
-    """Serve until interrupted; `told` hears the port once it listens. Raises LiexError where it
-    cannot.
+    """Serve until interrupted.
+
+    Args:
+        app: the dashboard.
+        host: the address to listen on.
+        port: the port; 0 takes any that is free.
+        told: hears the port once the server listens.
+
+    Raises:
+        LiexError: the server cannot listen there.
     """
     from werkzeug.serving import make_server
 
@@ -110,7 +122,13 @@ def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
 
 
 def address(host: str, port: int, token: str) -> str:
-    """What to type into a browser."""
+    """What to type into a browser.
+
+    Args:
+        host: the address the server listens on.
+        port: its port.
+        token: what every visitor has to know; may be empty.
+    """
     shown = "127.0.0.1" if host in (*LOOPBACK, "") else host
     return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
         f"?token={token}" if token else ""

@@ -1,4 +1,7 @@
-"""The dashboard's tables: found by name, sorted, filtered, shown as HTML and handed out as CSV."""
+"""The dashboard's tables: found by name, sorted, filtered, shown as HTML and handed out as CSV.
+
+Cells of a CSV that a spreadsheet would take for a formula are made harmless.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +29,13 @@ _BATCH = 20_000  # rows of a long table that are in memory at once
 
 @dataclass(frozen=True)
 class Table:
-    """A table as it is asked for: rows, the columns to show with their headings, and the column
-    that links onwards.
+    """A table as it is asked for.
+
+    Attributes:
+        rows: the whole table.
+        shown: the columns to show -> their headings.
+        link: the column whose cells link onwards: to a session, or with start_s to a moment; may be
+            empty.
     """
 
     rows: pd.DataFrame
@@ -104,8 +112,15 @@ _OF_SESSION = {"bouts": BOUTS, "gaps": GAPS, "flips": FLIPS}
 
 
 def find(data: StudyData, name: str) -> Table:
-    """A table by its name: sessions, summaries, stats?MEASURE?REFERENCE, or bouts, gaps, flips of a
-    session (bouts/KEY). Raises SessionError where there is none.
+    """A table by its name.
+
+    Args:
+        data: the study.
+        name: sessions, summaries, stats/MEASURE/REFERENCE (the reference may be empty), or
+            bouts/KEY, gaps/KEY, flips/KEY of a session.
+
+    Raises:
+        SessionError: there is no such table, or no such session.
     """
     what, _, rest = name.partition("/")
     if name == "sessions":
@@ -124,7 +139,16 @@ def find(data: StudyData, name: str) -> Table:
 
 
 def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
-    """The rows in which every one of the words occurs, in order of a column; empty ones last."""
+    """The rows in which every one of the words occurs, in order of a column.
+
+    Args:
+        table: the table.
+        words: words, parted by spaces, each of which must occur in a shown cell; case does not
+            matter.
+        column: the column to sort by, rows without a value last; one that is not there sorts
+            nothing.
+        down: whether the largest comes first.
+    """
     rows = table.rows
     wanted = words.lower().split()
     if wanted and len(rows):
@@ -146,7 +170,13 @@ def _searched(value: Any) -> str:
 
 
 def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
-    """A table with its filter and its download; `fill` is what comes into it."""
+    """A table with its filter and its download; `fill` makes what comes into it.
+
+    Args:
+        name: the table's name, see `find`.
+        caption: what it holds, for a screen reader.
+        searched: whether there is a field to filter by.
+    """
     tools: list[Any] = []
     if searched:
         tools.append(
@@ -185,13 +215,26 @@ def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
 
 
 def csv_address(name: str) -> str:
-    """Where a table is had as CSV."""
+    """Address at which a table is had as CSV.
+
+    Args:
+        name: the table's name, see `find`.
+    """
     return f"/csv/{quote(name, safe='')}.csv"
 
 
 def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str, Any]:
-    """What the page's script draws: headings that sort, cells as texts with what they are, and how
-    many rows.
+    """What the page's script draws: headings that sort, cells as texts, and the number of rows.
+
+    Args:
+        name: the table's name, see `find`.
+        table: the table itself.
+        words: what every shown row must hold, see `arranged`.
+        order: column, the column to sort by, and down, whether the largest comes first.
+
+    Returns:
+        JSON: name, place (the element's id), heads, said (a sentence on the number of rows), and
+        rows, at most `MOST_ROWS`.
     """
     rows = arranged(table, words, order["column"], order["down"])
     heads = [
@@ -220,7 +263,12 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
 
 
 def sentence(name: str, text: str) -> dict[str, Any]:
-    """In place of a table, why there is none."""
+    """In place of a table, why there is none; JSON as of `fill`.
+
+    Args:
+        name: the table's name, see `find`.
+        text: why.
+    """
     return {"name": name, "place": _place(name), "heads": [], "rows": [], "said": text}
 
 
@@ -232,7 +280,14 @@ def _place(name: str) -> str:
 
 
 def as_csv(table: pd.DataFrame) -> Iterator[str]:
-    """A table as CSV, piece by piece; no cell is taken for a formula by a spreadsheet."""
+    """Yield a table as CSV, piece by piece; no cell is taken for a formula by a spreadsheet.
+
+    Args:
+        table: the table.
+
+    Yields:
+        Text of some thousand rows, the first with the header.
+    """
     for start in range(0, max(len(table), 1), _BATCH):
         part = table.iloc[start : start + _BATCH]
         texts = part.select_dtypes(include=["object", "string"]).columns
@@ -242,7 +297,16 @@ def as_csv(table: pd.DataFrame) -> Iterator[str]:
 
 
 def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
-    """A whole table of a session, every column."""
+    """A whole table of a session, every column.
+
+    Args:
+        data: the study.
+        key: the session's name in the study.
+        name: the table's name, see `session_tables`.
+
+    Raises:
+        SessionError: there is no such session or table.
+    """
     session = data.session(key)
     if name not in session_tables(data, key):
         raise SessionError(f"the session '{key}' has no table '{name}'")
@@ -250,19 +314,34 @@ def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
 
 
 def session_tables(data: StudyData, key: str) -> list[str]:
-    """The names of a session's tables."""
+    """Names of a session's tables.
+
+    Args:
+        data: the study.
+        key: the session's name in the study.
+    """
     session = data.session(key)
     names = sorted(path.stem for path in session.path.glob("*.parquet"))
     return [*(["summary"] if session.has("summary.csv") else []), *names]
 
 
 def session_address(key: str, at_s: float | None = None) -> str:
-    """The page of a session, at a moment."""
+    """Address of a session's page.
+
+    Args:
+        key: the session's name in the study.
+        at_s: the moment to show, s since its first frame; None names none.
+    """
     return f"/session/{quote(key, safe='')}" + ("" if at_s is None else f"?t={at_s:.3f}")
 
 
 def number(value: Any) -> str:
-    """A number as a person would write it."""
+    """A number as a person would write it.
+
+    Args:
+        value: a bool is yes or no, a whole number has its thousands parted, another three digits
+            (none after the point from 1000 on), and NaN is a dash; anything else is taken as text.
+    """
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
@@ -278,7 +357,11 @@ def number(value: Any) -> str:
 
 
 def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows as dicts."""
+    """The rows of a table as dicts.
+
+    Args:
+        rows: the table.
+    """
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
@@ -318,7 +401,11 @@ def _sorted(column: str, order: dict[str, Any]) -> str:
 
 
 def columns_of(data: StudyData) -> Sequence[str]:
-    """The measures that groups can be compared by: the numbers of the summaries."""
+    """The measures that groups can be compared by: numeric columns of the summaries with any value.
+
+    Args:
+        data: the study.
+    """
     rows = data.collected()
     left_out = {"n_frames", "n_frames_observed", "fps_median", "n_bouts", "n_frames_summary"}
     return [

@@ -1,1 +1,1 @@
-"""Figures of the paper, drawn from what the evaluation measured."""
+"""Figures of the Lie-X paper, drawn from what the evaluation measured."""

@@ -1,4 +1,4 @@
-"""Fig. 20 of the Lie-X paper: what cut-out actions were taken for, by recogniser; PNG."""
+"""Confusion matrices of action recognition by recogniser (Fig. 20 of the Lie-X paper), as PNG."""
 
 from __future__ import annotations
 
@@ -20,8 +20,14 @@ _DPI = 110
 
 
 def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
-    """Write the matrices of what `evaluate_actions` found, rows what it was, each row's shares in
-    per cent.
+    """Write the confusion matrices of cut-out actions, rows what it was, shares in per cent.
+
+    Args:
+        result: what `evaluate_actions` found: confusion, accuracies and their 95 % intervals.
+        path: the PNG to write; its folder is made.
+
+    Returns:
+        `path`.
     """
     from matplotlib.figure import Figure
 

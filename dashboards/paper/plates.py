@@ -1,5 +1,7 @@
-"""The figures of `liex evaluate tables`, numbered as in the Lie-X paper; PNG. Nothing is computed
-here.
+"""Figures 7, 8 and 13 to 16 of the Lie-X paper, from what `liex evaluate tables` measured; PNG.
+
+Sensitivity, cumulative error, error per joint, ranked pose candidates, convergence. Nothing is
+computed here.
 """
 
 from __future__ import annotations
@@ -34,8 +36,14 @@ _MOST_STAGES = 8
 
 
 def draw_figures(results: Mapping[str, Mapping[str, Any]], folder: Path) -> list[Path]:
-    """All figures of some animals (`vars` of their `Results`) into the folder; returns
-    their paths.
+    """Write all figures of some animals.
+
+    Args:
+        results: animal -> `vars` of its `Results`.
+        folder: where the PNG files are written.
+
+    Returns:
+        Paths of the figures.
     """
     written = [
         _save(_sensitivity(results), folder / "fig07_sensitivity.png"),
@@ -68,9 +76,7 @@ def _sheet(
 
 
 def _cumulative(results: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Fig. 8: the share of the frames whose mean joint error is within so many mm; lost frames
-    never are.
-    """
+    """Fig. 8: share of frames with a mean joint error within so many mm; lost ones never are."""
     n_splits = max(len(one["splits"]) for one in results.values())
     figure, grid = _sheet(len(results), n_splits, 4.2, 3.2)
     for line, (animal, one) in zip(grid, results.items(), strict=True):
@@ -125,7 +131,7 @@ def _joint_errors(results: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def _sensitivity(results: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Fig. 7: the error over each of the five numbers; a red dot marks the value in use."""
+    """Fig. 7: the error over each of the five parameters; a red dot marks the value in use."""
     all_curves = [curve for one in results.values() for curve in one["sensitivity"].values()]
     numbers = list(dict.fromkeys(number for curve in all_curves for number in curve["curves"]))
     figure, grid = _sheet(max(len(numbers), 1), len(results), 3.8, 2.4)
@@ -195,9 +201,7 @@ def _view(illustration: Mapping[str, Any]) -> tuple[float, float, float, float]:
 
 
 def _candidates(illustration: Mapping[str, Any]) -> Figure:
-    """Fig. 13-15: candidates in the order of the learned metric, with predicted and true error and
-    rank.
-    """
+    """Fig. 13-15: candidates as the learned metric ranks them, estimated and true error."""
     ranked = illustration["ranked"]
     n = min(len(ranked["score_mm"]), _MOST_CANDIDATES)
     columns = min(n, 10 if n > 10 else 5)
@@ -224,9 +228,7 @@ def _candidates(illustration: Mapping[str, Any]) -> Figure:
 
 
 def _convergence(illustration: Mapping[str, Any]) -> Figure:
-    """Fig. 16: one candidate from start to end, and the error after every joint and round over all
-    candidates.
-    """
+    """Fig. 16: one candidate from start to end, and all errors after every joint and round."""
     from matplotlib.figure import Figure
 
     steps = illustration["steps"]

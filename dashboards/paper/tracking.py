@@ -1,5 +1,6 @@
-"""Fig. 18 of the Lie-X paper: the error of single frames and of the track over time, and the worst
-moments; PNG.
+"""Tracking against single frames, Fig. 18 of the Lie-X paper: error over time, worst moments.
+
+Written as a PNG with matplotlib.
 """
 
 from __future__ import annotations
@@ -32,7 +33,17 @@ _DPI = 110
 
 
 def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Path) -> Path:
-    """Write the figure of a sequence and what was made of it."""
+    """Write the figure of a test sequence and what was made of it.
+
+    Args:
+        sequence: the sequence with its truth.
+        rows: what was made of it: single (frames by themselves), and where there are algorithm3 and
+            smoothed.
+        path: the PNG to write; its folder is made.
+
+    Returns:
+        `path`.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 6.4), layout="constrained")
@@ -46,7 +57,14 @@ def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Pa
 
 
 def worst_moments(error: Array) -> list[int]:
-    """The frames with the largest errors (n,), none near another, in order of time."""
+    """The frames with the largest errors, none near another, in order of time.
+
+    Args:
+        error: (n,) error of each frame, mm; NaN where there is none.
+
+    Returns:
+        At most six frames, none within twelve frames of another.
+    """
     left = np.nan_to_num(error, nan=-1.0)
     chosen = []
     for _ in range(_MOMENTS):
@@ -84,7 +102,7 @@ def _over_time(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed]
 
 
 def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], frame: int) -> None:
-    """The depth around the animal with the true and the measured skeletons."""
+    """The depth around the animal with the true and the estimated skeletons."""
     camera = sequence.camera
     depth = sequence.depths(frame, frame + 1)[0]
     T_camera_arena = sequence.T_arena_camera.inverse()

@@ -1,4 +1,4 @@
-"""The layout in which a session's MCAP file opens in Foxglove: import it there as a layout."""
+"""Foxglove layout (JSON) of a session's MCAP file, to be imported there as a layout."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ _JOINTS = "/skeleton/joints"
 
 
 def write_layout(session: Session) -> Path:
-    """Write foxglove.json into a session's folder, and return its path."""
+    """Write foxglove.json into a session's folder.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        Path of the file.
+    """
     from liex_lab.sessions.failure import write_whole
 
     path = session.path / FILE
@@ -28,8 +35,10 @@ def write_layout(session: Session) -> Path:
 
 
 def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
-    """The layout from the content of session.json: scene and depth above, actions, heights and
-    notes below.
+    """The layout: scene and depth above, actions, heights and notes below.
+
+    Args:
+        about: the content of session.json.
     """
     far_mm = float(about["camera"]["floor_distance_mm"])
     joints = list(about["animal"]["joints"])

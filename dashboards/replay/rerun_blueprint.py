@@ -1,6 +1,4 @@
-"""The layout in which a session's replay opens in Rerun: 3D scene and depth picture above, lanes
-and curves below.
-"""
+"""Rerun blueprint of a session's replay: 3D scene and picture above, lanes and curves below."""
 
 from __future__ import annotations
 
@@ -22,8 +20,15 @@ _NAMES = {
 
 
 def write_blueprint(session: Session) -> Path:
-    """Write the layout as a file of its own, replay.rbl, into a session's folder: dragged into a
-    viewer, it lays out any replay of ours. Returns its path.
+    """Write the blueprint as a file of its own, replay.rbl, into a session's folder.
+
+    Dragged into a viewer, it lays out any replay of ours.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        Path of the file.
     """
     path = session.path / FILE
     beside = path.with_name(f".{FILE}")
@@ -33,8 +38,13 @@ def write_blueprint(session: Session) -> Path:
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
-    """A Rerun blueprint from the content of session.json; handed to `Session.create` as
-    `blueprint`.
+    """A Rerun blueprint; handed to `SessionWriter` as `blueprint`.
+
+    With corrections the corrected entities are shown; what they are made of is left out of the
+    views, but is still in the replay.
+
+    Args:
+        session: the content of session.json.
     """
     import rerun.blueprint as rrb
 

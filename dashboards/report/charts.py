@@ -40,7 +40,14 @@ _CERTAIN = 0.05  # of p, corrected
 
 
 def charts(session: Session, words: list[str]) -> dict[str, str]:
-    """All single figures, by name; empty where the session has no numbers for one."""
+    """All single figures as SVG, by name; empty where the session has no numbers for one.
+
+    Names: lanes, way (path over the floor), error, errors, budget, matrix, activity.
+
+    Args:
+        session: the opened session.
+        words: the actions, in the order in which they are coloured.
+    """
     frames = session.frames
     bouts = session.bouts
     time_s = frames["time_s"].to_numpy(float)
@@ -76,7 +83,11 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
 
 
 def curves(session: Session) -> list[tuple[str, str, str]]:
-    """What the body did over time: (title, what it is, SVG)."""
+    """What the body did over time: (title, what it is, SVG).
+
+    Args:
+        session: the opened session.
+    """
     if not session.has("kinematics.parquet"):
         return []
     frames = session.frames
@@ -98,8 +109,13 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
 
 
 def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
-    """What can be looked at over time: (name with its unit, time s (n,), values (n,), colour),
-    broken at gaps.
+    """Curves to look at over time, broken at gaps of the camera; the last is the predicted error.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        (name with its unit, time s (n,), values (n,), colour) of each.
     """
     frames = session.frames
     time_s = frames["time_s"].to_numpy(float)
@@ -119,8 +135,11 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
 
 
 def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
-    """A measure around the onsets of the actions: (title, SVG), all of a measure on the
-    same scale.
+    """Peri-event curves of the actions: (title, SVG), all of a measure on the same scale.
+
+    Args:
+        session: the opened session.
+        words: the actions.
     """
     if not session.has("kinematics.parquet"):
         return []
@@ -147,7 +166,11 @@ def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
 def pictures(session: Session) -> list[tuple[str, str, str, str]]:
     """The contact sheet: the kept depth pictures with the skeleton over them, in order of time.
 
-    (SVG, when, the action that the ethogram names there or an empty text, its colour).
+    Args:
+        session: the opened session.
+
+    Returns:
+        (SVG, when, the action that the ethogram names there or an empty text, its colour) of each.
     """
     import cv2
 
@@ -187,14 +210,18 @@ def _word_at(bouts: pd.DataFrame, time_s: float) -> str:
 
 
 def outlines(session: Session) -> list[tuple[str, Array]]:
-    """The arena's walls and the zones, by name: corners (n, 2) mm."""
+    """The arena's walls, where known, and the zones, by name: corners (n, 2) mm in the arena frame.
+
+    Args:
+        session: the opened session.
+    """
     walls = session.arena.outline_mm()
     known = [(figures.ARENA, walls)] if len(walls) else []
     return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
 
 
 def _matrix(table: pd.DataFrame, words: list[str]) -> str:
-    """The transitions as a matrix of the words that occur."""
+    """The transitions as a matrix of the words that occur; empty with fewer than two."""
     seen = [
         word
         for word in words
@@ -230,7 +257,8 @@ def _activity(table: pd.DataFrame, words: list[str]) -> str:
 
 
 def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:
-    """Values (n,) with the first one after a gap of the camera taken out, so that no line is drawn
-    across it.
+    """Values (n,) with the first one after a gap of the camera taken out.
+
+    No line is then drawn across the gap.
     """
     return np.asarray(values.where(frames["gap_before"] == 0), float)

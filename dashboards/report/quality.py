@@ -1,5 +1,8 @@
-"""What a reader has to know before believing a session: warnings in order of weight, and the
-frames' account.
+"""Quality control of a session: warnings by weight, account of all frames, suspected flips.
+
+What a reader has to know before believing a session. Thresholds: 2 % of the frames lost, 5 %
+doubtful, a predicted joint error of 10 % of the length, a speed noise as large as the pause
+threshold.
 """
 
 from __future__ import annotations
@@ -15,7 +18,11 @@ _NOISE_SHARE = 1.0
 
 
 def warnings(session: Session) -> list[str]:
-    """Sentences, the recording's own problems first; empty where there is nothing to warn of."""
+    """Sentences, the recording's own problems first; empty where there is nothing to warn of.
+
+    Args:
+        session: the opened session.
+    """
     return [
         *session.metadata["problems"],
         *_of_frames(session),
@@ -92,8 +99,14 @@ def _of_measures(session: Session) -> list[str]:
 
 
 def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
-    """What became of all frames that the camera should have taken: (what, share, number, class for
-    its colour).
+    """What became of all frames that the camera should have taken.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        (what, share, number, CSS class for its colour) of trusted, doubtful, lost and undelivered
+        frames.
     """
     frames = session.metadata["frames"]
     doubtful = int(frames["flags"].get("doubtful", 0))
@@ -109,8 +122,13 @@ def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
 
 
 def flip_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The stretches in which head and tail may have been exchanged, at most twelve: (from, to,
-    probability, what).
+    """Stretches in which head and tail may have been exchanged, at most the twelve most probable.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        (from, to, probability, what was done) in order of time, times in s.
     """
     shown = (
         session.flips.nlargest(12, "p_flip").sort_values("start_s")

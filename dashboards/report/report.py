@@ -1,4 +1,8 @@
-"""report.html: one file that needs no network, made from a session folder alone."""
+"""report.html: one self-contained HTML file, made by a Jinja template from a session folder alone.
+
+It needs no network and no script. Glue: every number comes from the session's tables and
+session.json.
+"""
 
 from __future__ import annotations
 
@@ -33,14 +37,25 @@ _TABLES = {
 
 
 def write_report(folder: str | Path) -> Path:
-    """Make report.html in a session's folder from what lies in it, and return its path."""
+    """Make report.html in a session's folder from what lies in it.
+
+    Args:
+        folder: the session's folder.
+
+    Returns:
+        Path of the report.
+    """
     path = Path(folder) / "report.html"
     write_whole(path, render(Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS)))
     return path
 
 
 def render(session: Session) -> str:
-    """The report of a session as one HTML text."""
+    """The report of a session as one HTML text.
+
+    Args:
+        session: the opened session.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     pages = Environment(
@@ -79,8 +94,11 @@ def render(session: Session) -> str:
 
 
 def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The vocabulary: word, colour, meaning, and what the recording's frame rate cannot
-    tell of it.
+    """The vocabulary: (word, colour, meaning, what the recording's frame rate cannot tell of it).
+
+    Args:
+        session: the opened session.
+        words: the actions, in the order in which they are coloured.
     """
     unresolved = session.metadata.get("unresolved_actions") or {}
     return [
@@ -95,7 +113,11 @@ def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str,
 
 
 def headline(session: Session) -> str:
-    """What was recorded, in one line."""
+    """What was recorded, in one line.
+
+    Args:
+        session: the opened session.
+    """
     frames = session.metadata["frames"]
     parts = [f"{frames['n_frames']:,} frames", _clock(frames["duration_s"])]
     if frames["fps_median"]:
@@ -106,7 +128,11 @@ def headline(session: Session) -> str:
 
 
 def cards(session: Session) -> list[tuple[str, str, str]]:
-    """The few numbers to see first: (value, unit, what)."""
+    """The few numbers to see first: (value, unit, what).
+
+    Args:
+        session: the opened session.
+    """
     frames = session.metadata["frames"]
     good = [(f"{frames['n_observed'] / frames['n_frames']:.1%}", "", "of the frames with a pose")]
     error = session.frames["predicted_error_mm"].median()
@@ -127,8 +153,11 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
 
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The summary as (column, value, unit, meaning), but for the columns of the actions and
-    zones.
+    """The summary as (column, value, unit, meaning), but for the columns of the actions and zones.
+
+    Args:
+        session: the opened session.
+        words: the actions.
     """
     if not session.has("summary.csv"):
         return []
@@ -163,7 +192,12 @@ _BUDGET = (
 
 
 def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
-    """A row per action: name, colour, and the numbers that `_BUDGET` names."""
+    """Time budget, a row per action: word, colour, and the numbers that `_BUDGET` names.
+
+    Args:
+        session: the opened session.
+        words: the actions, in the order in which they are coloured.
+    """
     if not session.has("summary.csv"):
         return []
     row = session.summary.iloc[0]
@@ -180,7 +214,11 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
 
 
 def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
-    """A row per zone: name; time, share, visits, first after, mean visit, distance."""
+    """A row per zone: name; time, share, visits, first after, mean visit, distance.
+
+    Args:
+        session: the opened session.
+    """
     if not session.has("zones.parquet"):
         return []
     table = session.table("zones")
@@ -202,7 +240,11 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
 
 
 def facts(session: Session) -> list[tuple[str, str]]:
-    """Where the numbers come from: recording, camera, animal, software, cost."""
+    """Where the numbers come from: recording, camera, animal, software, cost, as (what, value).
+
+    Args:
+        session: the opened session.
+    """
     about = session.metadata
     camera = about["camera"]
     frames = about["frames"]
@@ -254,8 +296,9 @@ def facts(session: Session) -> list[tuple[str, str]]:
 
 
 def _optics(session: Session) -> str:
-    """What was undone between the real camera and the ideal one, as a sentence without its full
-    stop; or nothing.
+    """What was undone between the real camera and the ideal one; empty where nothing was.
+
+    A sentence without its full stop.
     """
     optics = session.metadata["camera"].get("optics", {})
     undone = []
@@ -278,7 +321,11 @@ def _optics(session: Session) -> str:
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The longest gaps, at most twelve, in order of time: (from, to, frames, reason)."""
+    """The longest gaps, at most twelve, in order of time: (from, to, frames, reason); times in s.
+
+    Args:
+        session: the opened session.
+    """
     shown = session.gaps.nlargest(12, "n_frames_missing").sort_values("start_s")
     return [
         (
@@ -292,7 +339,11 @@ def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
 
 
 def methods(session: Session) -> list[str]:
-    """Paragraphs for a methods section, from the run's own record."""
+    """Paragraphs for a methods section, from the run's own record.
+
+    Args:
+        session: the opened session.
+    """
     about = session.metadata
     camera = about["camera"]
     frames = about["frames"]
@@ -332,7 +383,7 @@ def methods(session: Session) -> list[str]:
 
 
 def _by_hand(session: Session) -> list[str]:
-    """What people corrected, as a methods section has to say it."""
+    """What people corrected, as a methods section has to say it; empty where nothing was."""
     told = session.metadata.get("corrections")
     if not told:
         return []
@@ -365,7 +416,11 @@ def _behaviour_methods(session: Session) -> list[str]:
 
 
 def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
-    """The columns of every table that the session holds: (file, columns)."""
+    """The columns of every table that the session holds: (file, columns).
+
+    Args:
+        session: the opened session.
+    """
     columns = session.columns.astype(object).where(session.columns.notna(), "")
     return [
         (file, columns[columns["table"] == table].to_dict("records"))
@@ -375,7 +430,7 @@ def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
 
 
 def _number(value: Any) -> str:
-    """A number as a person would write it: counts whole, the rest with four digits."""
+    """A number as a person would write it: counts whole, the rest of four digits, NaN a dash."""
     if isinstance(value, int | np.integer):
         return f"{value:,}"
     if not np.isfinite(value):

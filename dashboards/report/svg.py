@@ -1,7 +1,10 @@
-"""Small figures as SVG text: they take the page's colours, print sharply and weigh a few kilobytes.
+"""Small figures as SVG text: curves, ethogram, trajectory, histogram, time budget, depth picture.
 
-Numbers come in as arrays, text goes out; nothing is computed here but where a mark stands on the
-paper. Colours that belong to the page (ink, grid) are CSS classes of the report's template.
+They take the page's colours, print sharply and weigh a few kilobytes. Numbers come in as arrays,
+text goes out; nothing is computed here but where a mark stands on the paper. Long curves are
+thinned to the lowest and highest value per column (min-max decimation). Colours that belong to the
+page (ink, grid) are CSS classes of the report's template. Lengths on the paper are in units of the
+SVG's viewBox.
 """
 
 from __future__ import annotations
@@ -56,7 +59,14 @@ _VIRIDIS = np.array(
 
 @dataclass(frozen=True)
 class Scale:
-    """A straight map from numbers to places on the paper."""
+    """A linear map from numbers to positions on the paper.
+
+    Attributes:
+        low: the number at `start`.
+        high: the number at `stop`.
+        start: position of `low` on the paper.
+        stop: position of `high` on the paper; below `start` for an axis that points up.
+    """
 
     low: float
     high: float
@@ -64,12 +74,20 @@ class Scale:
     stop: float
 
     def __call__(self, value: Array | float) -> Array:
-        """Places of values."""
+        """Positions on the paper of values of any shape.
+
+        Args:
+            value: the values.
+        """
         share = (np.asarray(value, float) - self.low) / (self.high - self.low)
         return np.asarray(self.start + share * (self.stop - self.start))
 
     def ticks(self, about: int) -> list[float]:
-        """Round numbers inside the scale."""
+        """Round numbers inside the scale: multiples of 1, 2, 2.5 or 5 times a power of ten.
+
+        Args:
+            about: how many are wanted; there may be somewhat fewer or one more.
+        """
         step = (self.high - self.low) / max(about, 1)
         power = 10.0 ** np.floor(np.log10(step))
         step = power * next(m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= 0.999 * step)
@@ -80,7 +98,11 @@ class Scale:
 
 
 def time_scale(duration_s: float) -> Scale:
-    """The axis that all figures over time share, s."""
+    """The axis that all figures over time share, s.
+
+    Args:
+        duration_s: length of the session, s.
+    """
     return Scale(0.0, max(duration_s, 1e-3), LEFT, WIDTH - RIGHT)
 
 
@@ -94,8 +116,17 @@ def curve(
     from_zero: bool = True,
     last: bool = False,
 ) -> str:
-    """Values over time, broken where they are unknown; `shaded` spans (start, stop) in s; `last`
-    writes the times.
+    """Values over time, broken where they are unknown.
+
+    Args:
+        time_s: (n,) times, s.
+        values: (n,) values; NaN where unknown.
+        time: the time axis.
+        unit: unit of the values.
+        colour: colour of the line.
+        shaded: spans (start, stop) behind the curve, s.
+        from_zero: whether the axis begins at zero, or below it where values do.
+        last: whether the times are written below, as under the last of several figures.
     """
     top = 10.0
     bottom = 110.0
@@ -126,8 +157,13 @@ def lanes(
     lost: Sequence[tuple[float, float]],
     time: Scale,
 ) -> str:
-    """One row per word of the ethogram, its bouts as bars (start, stop, word) in s; times without a
-    pose hatched.
+    """Ethogram: one row per word with its bouts as bars; times without a pose hatched.
+
+    Args:
+        spans: bouts (start, stop, word), s.
+        words: the vocabulary, in the order in which it is coloured.
+        lost: spans (start, stop) without a pose, s.
+        time: the time axis.
     """
     row = 18.0
     top = 6.0
@@ -158,8 +194,9 @@ def lanes(
 
 
 def _merged(spans: Sequence[tuple[float, float]], time: Scale) -> list[tuple[float, float]]:
-    """Spans in order, those joined that would be nearer than a hair on the paper: an hour has
-    thousands.
+    """Spans in order, those joined that would be nearer than a hair on the paper.
+
+    An hour has thousands.
     """
     least = 0.25 * (time.high - time.low) / (time.stop - time.start)
     out: list[tuple[float, float]] = []
@@ -178,10 +215,14 @@ def trajectory(
     outlines: Sequence[tuple[str, Array]] = (),
     size: int = 420,
 ) -> str:
-    """The way over the floor seen from above, coloured by time from dark to light; y points up in
-    the picture.
+    """The path over the floor seen from above, coloured by time from dark to light; y points up.
 
-    outlines: the arena and zones in it, each a name and its corners (n, 2) mm.
+    Args:
+        x_mm: (n,) x in the arena frame, mm; NaN where unknown.
+        y_mm: (n,) y in the arena frame, mm; NaN where unknown.
+        time_s: (n,) times, s.
+        outlines: the arena and zones in it, each a name and its corners (k, 2) mm.
+        size: width and height of the figure.
     """
     known = np.isfinite(x_mm) & np.isfinite(y_mm)
     if not known.any():
@@ -236,7 +277,16 @@ def trajectory(
 
 
 def histogram(values: Array, unit: str, colour: str, width: int = 420, height: int = 200) -> str:
-    """How often values occur, over the range that holds 99 % of them; a line marks the median."""
+    """How often values occur, over the range that holds 99 % of them; a line marks the median.
+
+    Args:
+        values: values of any shape, not negative; NaN is left out, and larger ones than the 99 %
+            quantile count in the last bin.
+        unit: their unit.
+        colour: colour of the bars.
+        width: width of the figure.
+        height: height of the figure.
+    """
     known = values[np.isfinite(values)]
     if len(known) == 0:
         return svg(width, 40, ['<text class="label" x="10" y="24">no value is known</text>'])
@@ -263,7 +313,11 @@ def histogram(values: Array, unit: str, colour: str, width: int = 420, height: i
 
 
 def budget(shares: Sequence[tuple[str, float, str]]) -> str:
-    """One bar of shares (word, share, colour) that fills the width of the page."""
+    """One bar of shares that fills the width of the page.
+
+    Args:
+        shares: (word, share from 0 to 1, colour).
+    """
     parts = []
     at = 0.0
     for word, share, colour in shares:
@@ -285,11 +339,18 @@ def picture(
     top: int,
     reach_mm: float,
 ) -> str:
-    """A depth picture (h, w) mm cut out at (left, top) of the frame, with the skeleton uv (J, 2)
-    over it.
+    """A depth picture cut out of a frame, with the skeleton over it.
 
     Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not
     take all the colours.
+
+    Args:
+        depth: (h, w) uint16 mm, 0 where unread.
+        uv: (J, 2) joints, px of the whole frame, counted from the centre of its first pixel.
+        bones: pairs of joints.
+        left: column of the frame at which the picture begins, px.
+        top: row of the frame at which the picture begins, px.
+        reach_mm: height above the floor from which on everything is light, mm.
     """
     h, w = depth.shape
     points = (
@@ -313,8 +374,11 @@ def picture(
 
 
 def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
-    """Colours (h, w, 3) RGB of depth (h, w) mm: far dark, `reach_mm` nearer and beyond light,
-    unread grey.
+    """Colours (h, w, 3) RGB uint8 of a depth picture: far dark, near light, unread grey (viridis).
+
+    Args:
+        depth: (h, w) uint16 mm, 0 where unread; the floor is taken at its 95 % quantile.
+        reach_mm: how much nearer than the floor is the lightest colour, mm.
     """
     read = depth > 0
     if not read.any():
@@ -329,7 +393,11 @@ def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
 
 
 def png_uri(rgb: NDArray[np.uint8]) -> str:
-    """A picture (h, w, 3) as a data URI."""
+    """A picture as a data URI of a PNG.
+
+    Args:
+        rgb: (h, w, 3) uint8 RGB.
+    """
     import cv2
 
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
@@ -337,7 +405,11 @@ def png_uri(rgb: NDArray[np.uint8]) -> str:
 
 
 def viridis(share: float) -> str:
-    """A colour from dark (0) to light (1)."""
+    """A colour of the map viridis, as #rrggbb.
+
+    Args:
+        share: from 0 (dark) to 1 (light).
+    """
     at = min(max(share, 0.0), 1.0) * (len(_VIRIDIS) - 1)
     low = min(int(at), len(_VIRIDIS) - 2)
     r, g, b = _VIRIDIS[low] + (at - low) * (_VIRIDIS[low + 1] - _VIRIDIS[low])
@@ -345,7 +417,11 @@ def viridis(share: float) -> str:
 
 
 def action_colour(place: int) -> str:
-    """The colour of the word at this place of the vocabulary, as in the replay."""
+    """The colour of a word of the vocabulary, as in the replay.
+
+    Args:
+        place: index of the word in the vocabulary.
+    """
     return ACTION_COLOURS[place % len(ACTION_COLOURS)]
 
 
@@ -357,7 +433,13 @@ _HATCH = (
 
 
 def svg(width: float, height: float, parts: Sequence[str]) -> str:
-    """A figure of this size, which scales with the page."""
+    """A figure of this size, which scales with the page, as an SVG element.
+
+    Args:
+        width: width of its viewBox.
+        height: height of its viewBox.
+        parts: its elements, as SVG text.
+    """
     return f'<svg viewBox="0 0 {width:g} {height:g}" role="img">{"".join(parts)}</svg>'
 
 
@@ -383,7 +465,15 @@ def _bar(
 
 
 def y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WIDTH - RIGHT) -> str:
-    """Ticks and lines of the upward axis, with its unit."""
+    """Ticks and lines of the vertical axis, with its unit.
+
+    Args:
+        scale: the axis.
+        unit: its unit.
+        about: how many ticks are wanted.
+        x0: left end of the lines.
+        x1: right end of the lines.
+    """
     marks = []
     for tick in scale.ticks(about):
         y = float(scale(tick))
@@ -401,7 +491,14 @@ def y_axis(scale: Scale, unit: str, about: int, x0: float = LEFT, x1: float = WI
 
 
 def x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
-    """Times below the last of several figures; thin lines in the others."""
+    """The time axis: times below the last of several figures, thin lines in the others.
+
+    Args:
+        time: the time axis, s; beyond three minutes it is written in minutes.
+        bottom: lower end of the lines.
+        top: upper end of the lines.
+        last: whether the times are written.
+    """
     unit, size = ("min", 60.0) if time.high > 180 else ("s", 1.0)
     shown = Scale(time.low / size, time.high / size, time.start, time.stop)
     marks = [f'<line class="axis" x1="{time.start}" x2="{time.stop}" y1="{bottom}" y2="{bottom}"/>']
@@ -418,7 +515,14 @@ def x_axis(time: Scale, bottom: float, top: float, last: bool) -> str:
 
 
 def x_ticks(scale: Scale, bottom: float, unit: str, about: int) -> str:
-    """Ticks below a figure, with their unit."""
+    """Ticks below a figure, with their unit.
+
+    Args:
+        scale: the axis.
+        bottom: where the axis stands.
+        unit: its unit.
+        about: how many ticks are wanted.
+    """
     marks = [
         f'<line class="axis" x1="{scale.start}" x2="{scale.stop}" y1="{bottom}" y2="{bottom}"/>'
     ]
@@ -453,8 +557,14 @@ def _paths(x: Array, y: Array) -> list[str]:
 
 
 def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
-    """The rows of a curve (n,) to draw: all of a short one, of a long one each column's lowest and
-    highest.
+    """(k,) int64 rows of a curve to draw: all, or each column's lowest and highest.
+
+    Of a short curve all rows are kept. A column with an unknown value keeps that one, so that the
+    hole is seen (min-max decimation).
+
+    Args:
+        y: (n,) the curve; NaN where unknown.
+        n_columns: columns of the paper; a curve of more than twice as many values is long.
     """
     if len(y) <= 2 * n_columns:
         return np.arange(len(y))
@@ -470,9 +580,7 @@ def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
 
 
 def _broken(x: Array, y: Array) -> list[str]:
-    """Path data of a line that is interrupted where a point is unknown; a lone point
-    becomes a dot.
-    """
+    """Path data of a line, interrupted where a point is unknown; a lone point becomes a dot."""
     known = np.isfinite(x) & np.isfinite(y)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     paths = []

@@ -1,6 +1,4 @@
-"""Figures of what the actions sum up to: a matrix of transitions, a measure around onsets, activity
-by the minute.
-"""
+"""SVG figures of what actions sum up to: transition matrix, peri-event curves, activity."""
 
 from __future__ import annotations
 
@@ -17,10 +15,17 @@ _WIDTH = 300.0
 def matrix(
     words: Sequence[str], probability: Array, chance: Array, significant: Array, counts: Array
 ) -> str:
-    """From a row's action to a column's: the darker, the more probable; ▲ above and ▼ below chance
-    where certain.
+    """Transition matrix, from a row's action to a column's: the darker, the more probable.
 
-    All (k, k), NaN on the diagonal and where nothing followed.
+    ▲ marks pairs above and ▼ pairs below chance where that is certain.
+
+    Args:
+        words: the k actions.
+        probability: (k, k) share of the row's successors; NaN on the diagonal and where nothing
+            followed.
+        chance: (k, k) the same by chance.
+        significant: (k, k) bool, whether the two differ for certain.
+        counts: (k, k) number of transitions.
     """
     # room for words as long as 'rear unsupported'
     cell = 58.0
@@ -74,7 +79,17 @@ def around(
     colour: str,
     limits: tuple[float, float],
 ) -> str:
-    """Median and quartiles of a measure around the onset of an action, at 0 s."""
+    """Median and quartiles of a measure around the onset of an action, at 0 s.
+
+    Args:
+        time_s: (k,) time relative to the onset, s.
+        low: (k,) lower quartile.
+        median: (k,) median; NaN where unknown.
+        high: (k,) upper quartile.
+        unit: unit of the measure.
+        colour: colour of curve and band.
+        limits: lower and upper end of the vertical axis.
+    """
     width = _WIDTH
     bottom = 110.0
     across = Scale(float(time_s[0]), float(time_s[-1]), 52.0, width - 8.0)
@@ -102,7 +117,14 @@ def around(
 def activity(
     start_s: Array, stop_s: Array, parts_s: Sequence[tuple[str, Array, str]], observed_s: Array
 ) -> str:
-    """Stacked shares of the observed time per interval: (word, seconds (k,), colour)."""
+    """Stacked shares of the observed time in each action per interval.
+
+    Args:
+        start_s: (k,) beginnings of the intervals, s.
+        stop_s: (k,) their ends, s.
+        parts_s: the actions: (word, time in it (k,) s, colour).
+        observed_s: (k,) time with a pose, s.
+    """
     time = time_scale(float(stop_s[-1]))
     top = 8.0
     bottom = 96.0

@@ -1,6 +1,4 @@
-"""Everything that is there to look at in a session's folder and can be made again from what lies in
-it.
-"""
+"""All views of a session that its folder alone can give: report and layouts of both replays."""
 
 from __future__ import annotations
 
@@ -14,8 +12,13 @@ from .report import write_report
 
 
 def write_views(folder: str | Path) -> Path:
-    """The report, and the layouts of both replays as files of their own; returns the
-    report's path.
+    """Write the report, and the layouts of both replays as files of their own.
+
+    Args:
+        folder: the session's folder.
+
+    Returns:
+        Path of the report.
     """
     session = Session.open(folder)
     write_blueprint(session)

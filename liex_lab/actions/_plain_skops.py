@@ -1,8 +1,8 @@
-"""A skops file that holds nothing but tables, lists, words, numbers and arrays, read without
-scikit-learn, and written so that equal contents are equal bytes.
+"""The skops format (zip of schema.json and .npy files) for plain data, byte-reproducible.
 
-Importing skops asks scikit-learn and Dask for everything they have, which takes as long as a short
-recording.
+Holds nothing but tables, lists, words, numbers and arrays; read without scikit-learn, and written
+so that equal contents are equal bytes. Importing skops asks scikit-learn and Dask for everything
+they have, which takes as long as a short recording.
 """
 
 from __future__ import annotations
@@ -23,8 +23,14 @@ _ADDRESS = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_plain(document: Any, path: str | Path) -> None:
-    """Write a skops file: skops names what it holds by addresses in memory, and dates it; here it
-    is by numbers from 1 on in their order in the file, on one day.
+    """Write a skops file of equal bytes for equal content.
+
+    skops names what it holds by addresses in memory, and dates it; here names are numbers from 1 on
+    in their order in the file, and the date is one day, 1980-01-01.
+
+    Args:
+        document: tables, lists, words, numbers and numpy arrays.
+        path: the file to write.
     """
     from skops import io
 
@@ -47,8 +53,17 @@ def write_plain(document: Any, path: str | Path) -> None:
 
 
 def read_plain(path: str | Path) -> Any:
-    """The content of a skops file. Raises ValueError where it holds anything else, or more than its
-    size allows.
+    """The content of a skops file of plain data.
+
+    Args:
+        path: the file.
+
+    Returns:
+        What `write_plain` was given.
+
+    Raises:
+        ValueError: the file holds anything but plain data, is nested more than 20 deep, or unpacks
+            to more than 256 MB.
     """
     with zipfile.ZipFile(path) as packed:
         if sum(entry.file_size for entry in packed.infolist()) > _MOST_BYTES:
@@ -57,7 +72,7 @@ def read_plain(path: str | Path) -> Any:
 
 
 def _value(node: Any, packed: zipfile.ZipFile, depth: int) -> Any:
-    """What a node of the schema stands for."""
+    """What a node of the schema stands for; raises ValueError where that is not plain data."""
     if depth > _DEEPEST:
         raise ValueError("its tables are nested too deeply")
     kind = node["__loader__"]

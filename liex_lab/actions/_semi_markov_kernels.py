@@ -1,10 +1,14 @@
-"""Kernels of a semi-Markov chain of actions: each lasts at least so many ticks, then ends with a
-constant chance.
+"""Viterbi and forward-backward algorithms of a hidden semi-Markov model, expanded to Markov states.
 
-An action k is a row of D_k states that are passed one by one; in the last one it may stay. scores
-(m, K): logarithms of how well each tick fits each action; first (K,): index of each action's first
-state, with the total as one more; stay, leave (K,): log chances of the last state; switch (K, K):
-log chances of what follows, -inf for itself.
+Action k is a row of D_k states that are passed one by one, so a bout lasts at least D_k ticks; in
+the last state it may stay, so the rest of its length is geometric (expanded-state hidden
+semi-Markov model; Yu 2010, Rabiner 1989). With emission scores e_t(k), in the first state of k: v_t
+= e_t(k) + max_j [v_{t-1}(last of j) + leave_j + switch_jk]; within a row v moves on by one state;
+in the last also v_{t-1} + stay_k. Any state may begin or end a recording.
+
+Arrays: scores (m, K) log score of each tick for each action; first (K + 1,) index of each action's
+first state, with the total at the end; stay, leave (K,) log chances of the last state; switch (K,
+K) log chances of what follows, about -inf for itself.
 """
 
 from __future__ import annotations
@@ -17,11 +21,20 @@ _NEVER = -1e30
 
 @njit(cache=True)
 def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, stayed):
-    """The ways that end in each state at tick stop - 1, from those at tick start - 1.
+    """Viterbi recursion from tick `start` to `stop`, piece by piece; fills the back-pointers.
 
-    value (states,): the log score of the best way to each, brought on; came_from (m, n): the action
-    before, where one begins at a tick; stayed (m, n): whether the best way was in an action's last
-    state before.
+    Args:
+        start: first tick of the piece; 0 initialises `value`.
+        stop: tick after the last.
+        scores: (m, K) log scores.
+        first: (K + 1,) index of each action's first state, and the total.
+        stay: (K,) log chance of staying in the last state.
+        leave: (K,) log chance of leaving it.
+        switch: (K, K) log chance of what follows.
+        value: (states,) log score of the best path to each state at tick start - 1; brought on to
+            stop - 1.
+        came_from: (m, K) output, the action before, where one begins at a tick.
+        stayed: (m, K) bool output, whether the best path was in the action's last state before.
     """
     n = scores.shape[1]
     total = first[n]
@@ -59,7 +72,15 @@ def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, sta
 
 @njit(cache=True)
 def trace_back(first, value, came_from, stayed, label):
-    """The most probable actions, into label (m,)."""
+    """Viterbi backtracking: the most probable actions.
+
+    Args:
+        first: (K + 1,) index of each action's first state, and the total.
+        value: (states,) log scores at the last tick.
+        came_from: (m, K) back-pointers of `go_on`.
+        stayed: (m, K) back-pointers of `go_on`.
+        label: (m,) output, action of each tick.
+    """
     state = int(np.argmax(value))
     k = 0
     while first[k + 1] <= state:
@@ -79,7 +100,16 @@ def trace_back(first, value, came_from, stayed, label):
 
 @njit(cache=True)
 def probabilities(scores, first, stay, leave, switch, out):
-    """The probability (m, K) of each action at every tick, by sums forward and backward in time."""
+    """Forward-backward algorithm: posteriors of the actions, normalised tick by tick.
+
+    Args:
+        scores: (m, K) log scores.
+        first: (K + 1,) index of each action's first state, and the total.
+        stay: (K,) log chance of staying in the last state.
+        leave: (K,) log chance of leaving it.
+        switch: (K, K) log chance of what follows.
+        out: (m, K) output, probabilities.
+    """
     m, n = scores.shape
     total = first[n]
     go = np.exp(stay)
@@ -134,6 +164,7 @@ def probabilities(scores, first, stay, leave, switch, out):
 
 @njit(cache=True)
 def _likelihood(scores, t, like):
+    """Likelihoods (K,) of tick t up to a factor: exp(scores less their largest) into `like`."""
     top = scores[t, 0]
     for k in range(1, len(like)):
         top = max(top, scores[t, k])

@@ -1,9 +1,12 @@
-"""What a body does from moment to moment, in seconds and body lengths, on a steady clock of its
-own.
+"""Egocentric kinematic features of a track on a fixed clock, in seconds and body lengths.
 
 A track of any frame rate becomes channels of one rate, so that a recogniser sees the same movement
-whatever the camera. A faster camera is averaged, a slower one interpolated; poses that cannot be
-true and short gaps are bridged, long gaps part the track into stretches.
+whatever the camera: a faster camera is averaged over each tick, a slower one interpolated linearly.
+Channels: velocity along and across the heading, yaw rate, pitch, straightness, bends of three parts
+of the chain and their rates, height above the floor, nearness of a wall, predicted error. Rates are
+central differences of values smoothed by the binomial filter (1/4, 1/2, 1/4).
+Frames whose trunk points against those within 0.15 s to either side are left out (head and tail
+were exchanged); gaps up to 0.4 s are bridged, longer ones part the track into segments.
 """
 
 from __future__ import annotations
@@ -29,9 +32,12 @@ _PIECE = 4096  # ticks whose channels are made at once
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Channels (m, C) on a steady clock: times_s (m,) since the track's first frame, from one
-    unbroken stretch.
+class Segment:
+    """Channels on a steady clock, from one unbroken segment of a track.
+
+    Attributes:
+        times_s: (m,) s since the track's first frame.
+        values: (m, C) channels, see `channel_names`.
     """
 
     times_s: Array
@@ -39,8 +45,14 @@ class Stretch:
 
 
 def channel_names(skeleton: Skeleton) -> list[str]:
-    """What the columns of a stretch are, see `stretches_of`; those that end in ~ change sign in a
-    mirror.
+    """The names of the channels; those that end in ~ change sign in a mirror.
+
+    Args:
+        skeleton: kinematic tree of the animal; pitches only of joints that have such an axis,
+            heights only of animals that stand on the floor.
+
+    Returns:
+        C names, the columns of `stretches_of`'s values.
     """
     pitches = [f"pitch_{k}" for k in range(_GROUPS)] if skeleton.axes[1:, 1].any() else []
     floor = (
@@ -69,9 +81,20 @@ def channel_names(skeleton: Skeleton) -> list[str]:
 
 def stretches_of(
     track: Track, rate_hz: float, wall_mm: Array | None = None, room: Room = np.empty
-) -> list[Stretch]:
-    """The channels of a track, one stretch after the other. wall_mm (n,): distance of the animal
-    from a wall; room: where the channels are to lie.
+) -> list[Segment]:
+    """The channels of a track, one unbroken segment after the other.
+
+    Lengths are over the animal's median length in the track, predicted errors over their median:
+    how large errors are depends on camera and animal, and says nothing of actions.
+
+    Args:
+        track: one animal's track.
+        rate_hz: ticks a second.
+        wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+        room: allocator of the channels.
+
+    Returns:
+        The segments in order of time; none where no pose was measured.
     """
     time_s = (track.times_ns - track.times_ns[:1]).astype(np.float64) * 1e-9
     good = np.flatnonzero(track.observed)
@@ -80,8 +103,7 @@ def stretches_of(
     good = good[~_reversed(track, good, time_s)]
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
     # a doubt is one beside the recording's usual errors: how large these are depends on camera and
-    # animal, and on how
-    # errors are predicted, and says nothing of actions
+    # animal, and on how errors are predicted, and says nothing of actions
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
@@ -116,9 +138,7 @@ def _forward(skeleton: Skeleton) -> tuple[int, int]:
 
 
 def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[np.bool_]:
-    """Which of the good frames point against what lies around them: head and tail were
-    exchanged.
-    """
+    """Which good frames point against those within 0.15 s: head and tail were exchanged."""
     rear, front = _forward(track.skeleton)
     axis = np.empty((len(good), 3))
     total = np.zeros((len(good) + 1, 3))
@@ -138,8 +158,7 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
 
 
 class _OnClock:
-    """What the channels are made of, at any of a clock's times (m,) s, from frames `rows` of a
-    track.
+    """Resamples joints, angles, wall distance and error of frames `rows` to a clock's times (m,) s.
 
     A faster camera is averaged over what falls to each tick, a slower one interpolated, linearly;
     ends are held.
@@ -167,8 +186,14 @@ class _OnClock:
             self._share = np.clip(passed, 0.0, 1.0)[:, None]
 
     def at(self, ticks: slice) -> tuple[Array, Array, Array, Array]:
-        """Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, predicted
-        error (m,) mm.
+        """The resampled measurements of some ticks.
+
+        Args:
+            ticks: consecutive ticks of the clock.
+
+        Returns:
+            Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, 1e6 where
+            nobody knows it, and predicted error (m,) mm.
         """
         if self._n == 1:
             out = np.repeat(self._measured(0, 1), ticks.stop - ticks.start, axis=0)
@@ -220,9 +245,10 @@ def _stretch(
     units_mm: tuple[float, float],
     clock: Array,
     room: Room,
-) -> Stretch:
-    """The channels of an unbroken stretch, a piece after the other. units_mm: the length and the
-    usual error.
+) -> Segment:
+    """The channels of an unbroken segment, one piece after the other.
+
+    units_mm: the animal's length and the usual error.
     """
     found = _OnClock(track, rows, time_s, wall, clock)
     m = len(clock)
@@ -243,7 +269,7 @@ def _stretch(
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
         track.rest()
         let_go(values)
-    return Stretch(clock, values)
+    return Segment(clock, values)
 
 
 def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -320,9 +346,7 @@ def _twist(joints: Array, length_mm: float, step: float) -> Array:
 
 
 def _softened(rows: Array) -> Array:
-    """Rows (m, ...) with a quarter of each neighbour: jitter from frame to frame is not
-    movement.
-    """
+    """Binomial filter (1/4, 1/2, 1/4) over rows (m, ...): jitter is not movement."""
     if len(rows) < 3:
         return rows
     inner = 0.25 * rows[:-2] + 0.5 * rows[1:-1] + 0.25 * rows[2:]
@@ -330,5 +354,5 @@ def _softened(rows: Array) -> Array:
 
 
 def _rate(rows: Array, step: float) -> Array:
-    """Change a second of rows (m, ...)."""
+    """Change a second of rows (m, ...), by central differences."""
     return np.asarray(np.gradient(rows, step, axis=0))

@@ -1,13 +1,16 @@
-"""The descriptors of the paper: a cut-out sequence, resampled to 32 frames, as one row of numbers
-(Lie-X section 6).
+"""Temporal-pyramid descriptors of cut-out sequences from tangent vectors (Lie-X section 4.3).
 
-Per frame, tangent vectors: of the base, the twist from this frame to the next, in its own frame
-(6); of the front half and of the hind half of the chain, the rotation of a joint against the one
-before it and its change to the next frame, averaged over the half's joints (3 + 3 each). The paper
-states 252 = 7 x 2 x 18 and three sub-vectors of equal length; that each half holds three rotation
-numbers of either kind is our reading, as bones are rigid and a joint's twist has no other. Joint
-positions: all joints in the arena frame (63 for the fish), and the base's mean position and
-orientation.
+A sequence is resampled to 32 frames by linear interpolation (the base along geodesics of SE(3));
+mean and standard deviation of the frame's features over 4 quarters, 2 halves and the whole are one
+row of numbers.
+
+Tangent vectors per frame: of the base, the twist from this frame to the next, in its own frame (6);
+of the front half and of the hind half of the chain, the rotation of a joint against the one before
+it and its change to the next frame, averaged over the half's joints (3 + 3 each). The paper states
+252 = 7 x 2 x 18 and three sub-vectors of equal length; that each half holds three rotation numbers
+of either kind is our reading, as bones are rigid and a joint's twist has no other. Joint positions,
+the paper's baseline: all joints in the arena frame (63 for the fish), and the base's mean position
+and orientation.
 """
 
 from __future__ import annotations
@@ -26,8 +29,16 @@ _PYRAMID = (4, 2, 1)  # equal parts, each described by its mean and standard dev
 
 
 def tangent_descriptor(track: Track) -> Array:
-    """(252,) of a sequence: the temporal pyramid over its tangent vectors. Frames without a pose
-    are left out.
+    """The temporal pyramid over a sequence's tangent vectors.
+
+    Frames without a measured pose are left out; of fewer than two the sequence stands still. The
+    end-effector carries no rotation and is left out of the hind half.
+
+    Args:
+        track: the sequence, of a skeleton that is one chain.
+
+    Returns:
+        (252,), rad and mm.
     """
     root, angles = _resampled(track)
     now, following = (
@@ -48,8 +59,14 @@ def tangent_descriptor(track: Track) -> Array:
 
 
 def position_descriptor(track: Track) -> Array:
-    """(888,) of a fish's sequence: the temporal pyramid over its joint positions, and the base's
-    mean place.
+    """The temporal pyramid over a sequence's joint positions, and the base's mean pose.
+
+    Args:
+        track: the sequence.
+
+    Returns:
+        (42 J + 6,), 888 for a fish's 21 joints: mm, arena frame, then the base's mean position, mm,
+        and mean rotation vector, rad; zeros where fewer than two poses were measured.
     """
     seen = track.observed
     if seen.sum() < 2:
@@ -61,7 +78,14 @@ def position_descriptor(track: Track) -> Array:
 
 
 def pyramid(rows: Array) -> Array:
-    """Mean and standard deviation of rows (32, k) over quarters, halves and the whole: (14 k,)."""
+    """Mean and standard deviation over quarters, halves and the whole.
+
+    Args:
+        rows: (32, k) features of each frame.
+
+    Returns:
+        (14 k,) for each of the 7 parts, k means and k standard deviations.
+    """
     parts = [part for n in _PYRAMID for part in np.split(rows, n)]
     return np.concatenate([np.concatenate([part.mean(axis=0), part.std(axis=0)]) for part in parts])
 

@@ -1,4 +1,4 @@
-"""What an animal did and when: named stretches of a recording."""
+"""Ethogram: what an animal did and when, as half-open labelled intervals (bouts) in nanoseconds."""
 
 from __future__ import annotations
 
@@ -15,8 +15,13 @@ UNLABELLED = ""  # the word of a frame that no action names
 
 
 def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]:
-    """Where the runs of equal values (m,), of which there are some, start and stop, and their
-    values.
+    """Run-length encoding: where the runs of equal values start and stop, and their values.
+
+    Args:
+        values: (m,) with m at least 1.
+
+    Returns:
+        Starts (r,), stops (r,), exclusive, and values (r,) of the runs.
     """
     starts = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
     return starts, np.append(starts[1:], len(values)), values[starts]
@@ -24,8 +29,13 @@ def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64],
 
 @dataclass(frozen=True)
 class Bout:
-    """One stretch with a name, half open: the frame at stop_ns is the first outside. score:
-    probability of its name.
+    """One interval with a name, half open: the frame at stop_ns is the first outside.
+
+    Attributes:
+        start_ns: onset, time stamp of the first frame inside.
+        stop_ns: time of the first frame outside.
+        action: a word of the vocabulary.
+        score: probability of its name, mean over its frames.
     """
 
     start_ns: int
@@ -36,8 +46,15 @@ class Bout:
 
 @dataclass(frozen=True)
 class Ethogram:
-    """One animal's bouts, in order and without overlap; vocabulary: word -> definition. source:
-    model or human.
+    """One animal's bouts, in order and without overlap.
+
+    Attributes:
+        bouts: in order of time.
+        vocabulary: word -> definition.
+        source: model or human.
+
+    Raises:
+        LiexError: a bout stops before it starts, or two overlap.
     """
 
     bouts: tuple[Bout, ...]
@@ -68,7 +85,14 @@ class Ethogram:
         return len(self.bouts)
 
     def words(self, times_ns: NDArray[np.int64]) -> NDArray[np.str_]:
-        """(n,) the word of every frame, UNLABELLED outside all bouts."""
+        """The word of every frame.
+
+        Args:
+            times_ns: (n,) time stamps, increasing.
+
+        Returns:
+            (n,) words, `UNLABELLED` outside all bouts.
+        """
         longest = max((len(bout.action) for bout in self.bouts), default=1)
         out = np.full(len(times_ns), UNLABELLED, dtype=f"<U{max(longest, 1)}")
         for bout in self.bouts:
@@ -86,9 +110,20 @@ class Ethogram:
         source: str = "model",
         names: Sequence[str] | None = None,
     ) -> Ethogram:
-        """The bouts of frames (n,) with these words; score (n,) of each frame's word; a bout never
-        leaves its `part` (n,), the unbroken stretch of the recording that it lies in; names:
-        `words` are places in it.
+        """The bouts of frames with these words; frames that are `UNLABELLED` are in none.
+
+        Args:
+            words: (n,) word of each frame, or its index in `names`.
+            times_ns: (n,) time stamps, increasing.
+            vocabulary: word -> definition; None for none.
+            score: (n,) probability of each frame's word; None counts as 1.
+            part: (n,) the unbroken segment of the recording that a frame lies in; no bout leaves
+                its part.
+            source: model or human.
+            names: the words, where `words` are indices.
+
+        Returns:
+            The ethogram, each bout scored by the mean over its frames.
         """
         label = np.asarray(words, np.str_ if names is None else np.int64)
         n = len(label)
@@ -110,8 +145,15 @@ class Ethogram:
 
 
 def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median
-    step later.
+    """When each frame's validity ends.
+
+    At the next frame; before a gap (1.5 median steps) or at the end, one median step later.
+
+    Args:
+        times_ns: (n,) time stamps, increasing.
+
+    Returns:
+        (n,) ns.
     """
     if len(times_ns) < 2:
         return times_ns + 1

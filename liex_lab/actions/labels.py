@@ -1,5 +1,7 @@
-"""Labels that people made: tables of bouts, ours or anybody's, and their place on a track; a track
-with them is what recognisers learn from and are judged by.
+"""Human labels: tables of bouts (CSV or parquet; action, start_s, stop_s) as words of frames.
+
+Tables are ours or anybody's. A track with its labels (`LabelledTrack`) is what recognisers learn
+from and are judged by.
 """
 
 from __future__ import annotations
@@ -23,8 +25,18 @@ _NEEDED = ("action", "start_s", "stop_s")
 
 
 def read_labels(path: str | Path) -> pd.DataFrame:
-    """Bouts from a table: our bouts.parquet, or a CSV with the columns action, start_s, stop_s and,
-    where it tells of several recordings, session_id. Raises LiexError where it is not such a table.
+    """Bouts from a table, checked and in order of time.
+
+    Args:
+        path: our bouts.parquet, or a CSV with the columns action, start_s, stop_s and, where it
+            tells of several recordings, session_id.
+
+    Returns:
+        The table, with the column source set to human.
+
+    Raises:
+        LiexError: the file cannot be read, lacks a column, or has a bout that does not stop after
+            it starts.
     """
     source = Path(path)
     try:
@@ -43,7 +55,18 @@ def read_labels(path: str | Path) -> pd.DataFrame:
 
 
 def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
-    """A table of bouts that can be used, in order of time."""
+    """A table of bouts in order of time, its times as numbers and its actions as text.
+
+    Args:
+        table: columns action, start_s and stop_s at least.
+        origin: the table's name in errors.
+
+    Returns:
+        A copy, sorted by start_s.
+
+    Raises:
+        LiexError: the first bout that does not start before it stops, in seconds.
+    """
     times = pd.DataFrame({name: _numbers(table[name]) for name in ("start_s", "stop_s")})
     start, stop = (times[name].to_numpy() for name in ("start_s", "stop_s"))
     wrong = np.flatnonzero(~np.isfinite(start) | ~np.isfinite(stop) | (stop <= start))
@@ -70,7 +93,16 @@ def _numbers(column: pd.Series) -> NDArray[np.float64]:
 def words_of(
     table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str = ""
 ) -> NDArray[np.str_]:
-    """(n,) the word of each frame at time_s (n,), UNLABELLED outside all bouts of that session."""
+    """The word of each frame, by the bouts of a session.
+
+    Args:
+        table: bouts, checked.
+        time_s: (n,) s since the first frame, increasing.
+        session_id: only bouts of this session; '' or a table without that column takes all.
+
+    Returns:
+        (n,) words, `UNLABELLED` outside all bouts; where bouts overlap, the later one.
+    """
     if "session_id" in table and session_id:
         table = table[table["session_id"].astype(str) == session_id]
     longest = max([len(word) for word in table["action"]], default=1)
@@ -84,15 +116,27 @@ def words_of(
 
 
 def vocabulary(table: pd.DataFrame) -> Mapping[str, str]:
-    """The words of a table, without definitions."""
+    """The words of a table, sorted, each without a definition.
+
+    Args:
+        table: bouts.
+
+    Returns:
+        Word -> ''.
+    """
     return dict.fromkeys(sorted(set(table["action"])), "")
 
 
 @dataclass(frozen=True)
 class LabelledTrack:
-    """A track and the word (n,) of each of its frames, '' where it has none; animal: whose it is;
-    wall_mm (n,): how far its middle is from the nearest wall, NaN where nobody knows; truth (n, J,
-    3) mm: true joints, of rendered animals.
+    """A track and the word of each of its frames.
+
+    Attributes:
+        track: one animal's track.
+        words: (n,) '' where a frame has none.
+        animal: whose it is.
+        wall_mm: (n,) how far its middle is from the nearest wall, mm, NaN where nobody knows.
+        truth: (n, J, 3) mm, true joints, of rendered animals; None otherwise.
     """
 
     track: Track
@@ -106,7 +150,7 @@ class LabelledTrack:
             object.__setattr__(self, "wall_mm", np.full(len(self.words), np.nan))
 
     def __len__(self) -> int:
-        """Frames."""
+        """The number of frames."""
         return len(self.words)
 
     def __getitem__(self, rows: slice | NDArray[np.int64]) -> LabelledTrack:
@@ -119,6 +163,14 @@ class LabelledTrack:
 
 
 def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:
-    """Some frames of a track."""
+    """Some frames of a track.
+
+    Args:
+        track: n rows.
+        rows: a slice, indices, or a mask (n,).
+
+    Returns:
+        A track of those rows.
+    """
     columns = [getattr(track, f.name)[rows] for f in fields(Track) if f.name != "skeleton"]
     return Track(track.skeleton, *columns)

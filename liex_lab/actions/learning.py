@@ -1,5 +1,8 @@
-"""Training the default recogniser from labelled tracks, and validating it on animals that it has
-not seen.
+"""Training of the default recogniser: multilayer perceptrons and a semi-Markov model.
+
+Two networks with one hidden layer of 64 rectified units on standardised window features, trained by
+Adam on cross-entropy (`mlp.descend`); durations and transitions by counting bouts. Validation is
+leave-one-animal-out.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.actions.ethogram import UNLABELLED, runs_of
 from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.scores import timeline_scores
-from liex_lab.actions.semi_markov import ActionChain
+from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.timeline import Examples, TimelineModel, clock_of, gather
 from liex_lab.errors import LiexError
 from liex_lab.mlp import LIMIT, Network, descend
@@ -49,8 +52,21 @@ def learn(
     sequences: Sequence[LabelledTrack] = (),
     progress: Progress = silent,
 ) -> TimelineModel:
-    """A recogniser from labelled tracks; sequences: single actions cut out of somewhere, without
-    their surroundings.
+    """A recogniser from labelled tracks.
+
+    Args:
+        tracks: labelled recordings of one kind of animal, at least one.
+        seed: of the first network; the second takes the next.
+        definitions: word -> definition, to be kept in the model.
+        sequences: single actions cut out of somewhere, without their surroundings: they teach the
+            networks, not the order and length of actions.
+        progress: told of three pieces of work.
+
+    Returns:
+        The model, without a card.
+
+    Raises:
+        LiexError: the labels name too few actions, see `vocabulary_of`.
     """
     words = vocabulary_of([*tracks, *sequences])
     clock_hz = clock_of(tracks[0].track.skeleton)
@@ -61,7 +77,7 @@ def learn(
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
     speeds = speeds_of(examples, len(words))
     peaks = peaks_of(examples, len(words))
-    chain = ActionChain.learn(examples.runs[: len(tracks)], len(words))
+    chain = SemiMarkovModel.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
         tracks[0].track.skeleton.name,
         clock_hz,
@@ -77,7 +93,17 @@ def learn(
 
 
 def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
-    """The words of labelled tracks, what has no name among them."""
+    """The words of labelled tracks, `UNLABELLED` first, then sorted.
+
+    Args:
+        tracks: labelled tracks.
+
+    Returns:
+        K words.
+
+    Raises:
+        LiexError: fewer than two actions, and no frame without one.
+    """
     found = sorted({str(word) for one in tracks for word in np.unique(one.words)} - {UNLABELLED})
     if len(found) < 2 and not any((one.words == UNLABELLED).any() for one in tracks):
         raise LiexError(
@@ -88,8 +114,14 @@ def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
 
 
 def speeds_of(examples: Examples, n_words: int) -> Array:
-    """(K, 2) lengths a second: between which speeds nearly all ticks of each word lie; what has no
-    name has any.
+    """Between which speeds nearly all ticks of each word lie: their 0.5 % and 99 % quantiles.
+
+    Args:
+        examples: what the recogniser learns from.
+        n_words: size K of the vocabulary, `UNLABELLED` first.
+
+    Returns:
+        (K, 2) body lengths a second; 0 to infinity for `UNLABELLED` and words without ticks.
     """
     limits = np.tile([0.0, np.inf], (n_words, 1))
     for k in range(1, n_words):  # 0 is UNLABELLED
@@ -100,9 +132,18 @@ def speeds_of(examples: Examples, n_words: int) -> Array:
 
 
 def peaks_of(examples: Examples, n_words: int) -> Array:
-    """(K,) lengths a second: the highest speed that nearly all bouts of each fast word reached; 0
-    of others, for another animal may well be stiller than all that were seen, and not run just
-    before or after.
+    """The highest speed that nearly all bouts (99 %) of each fast word reached at some time.
+
+    A word is fast where its bouts' mean speed has a median above one length a second. Others have
+    0, for another animal may well be stiller than all that were seen, and not run just before or
+    after.
+
+    Args:
+        examples: what the recogniser learns from.
+        n_words: size K of the vocabulary, `UNLABELLED` first.
+
+    Returns:
+        (K,) body lengths a second.
     """
     least = np.zeros(n_words)
     starts, stops, codes = runs_of(examples.code + n_words * examples.recording)
@@ -116,7 +157,18 @@ def peaks_of(examples: Examples, n_words: int) -> Array:
 
 
 def train_network(examples: Examples, n_words: int, seed: int) -> Network:
-    """A network with one hidden layer, see `descend`."""
+    """A multilayer perceptron with one hidden layer, trained by Adam, see `descend`.
+
+    Of more than 120 000 ticks every so many-th is taken. Words without ticks get a logit of -30.
+
+    Args:
+        examples: what the recogniser learns from.
+        n_words: size K of the vocabulary.
+        seed: of the weights and of the ticks taken.
+
+    Returns:
+        The network, float32, with the standardisation of its features.
+    """
     step = max(1, -(-len(examples.code) // _MOST_TICKS))
     rows = np.arange(seed % step, len(examples.code), step)
     features = examples.features[rows]
@@ -155,7 +207,17 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
 def leave_one_animal_out(
     tracks: Sequence[LabelledTrack], *, seed: int = 0, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Scores on each animal of a recogniser that learned from the others."""
+    """Cross-validation: scores on each animal of a recogniser that learned from the others.
+
+    Args:
+        tracks: labelled recordings.
+        seed: of the networks.
+        progress: told before every animal.
+
+    Returns:
+        Number of animals, macro F1 by animal, and `timeline_scores` over all; of one animal alone,
+        a note instead.
+    """
     animals = sorted({one.animal for one in tracks})
     if len(animals) < 2:
         return {
@@ -183,5 +245,13 @@ def leave_one_animal_out(
 
 
 def with_card(model: TimelineModel, **facts: Any) -> TimelineModel:
-    """The model with more facts on its card."""
+    """The model with more facts on its card.
+
+    Args:
+        model: a trained recogniser.
+        **facts: name -> value, replacing those of the same name.
+
+    Returns:
+        A copy.
+    """
     return replace(model, card={**model.card, **facts})

@@ -1,4 +1,9 @@
-"""How well actions were recognised: frame by frame, bout by bout, and as a confusion matrix."""
+"""Scores of recognised actions: frame-wise F1, segmental F1@50, confusion matrix.
+
+F1 = 2 TP / (found + true), by frames or by bouts; a bout is right where its intersection over union
+with a true bout of its action is at least 0.5 (segmental F1@50, Lea et al. 2017). The 95 % interval
+of a share is Wilson's (1927).
+"""
 
 from __future__ import annotations
 
@@ -18,11 +23,17 @@ Words = NDArray[np.str_]
 def timeline_scores(
     pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequence[str]
 ) -> dict[str, Any]:
-    """Scores of recognised words (n,) beside the labels of their tracks.
+    """Scores of recognised words beside the labels of their tracks.
 
-    macro_f1: mean over the actions of their frame-wise F1; segment_f1_50: F1 of bouts, of which one
-    is right where it and a true bout of its action share at least half of what either covers;
-    per_action: F1, precision and recall of frames, segment F1, and how many bouts there were.
+    Args:
+        pairs: labelled tracks, each with its recognised words (n,).
+        words: the vocabulary, with or without `UNLABELLED`.
+
+    Returns:
+        macro_f1: mean over the labelled actions of their frame-wise F1; segment_f1_50: F1 of bouts,
+        of which one is right where it and a true bout of its action share at least half of what
+        either covers; per_action: F1, precision and recall of frames, segment F1, and how many
+        bouts there were. NaN where there is nothing to divide by.
     """
     named = [word for word in words if word != UNLABELLED]
     hits, found, true = (dict.fromkeys(named, 0) for _ in range(3))
@@ -62,8 +73,15 @@ def timeline_scores(
 def match_bouts(
     true: NDArray[np.bool_], found: NDArray[np.bool_], overlap: float = 0.5
 ) -> tuple[int, int, int]:
-    """How many runs of `found` (n,) match a run of `true` (n,), how many were found, and how many
-    there are.
+    """How many found bouts match a true one, each of which counts once.
+
+    Args:
+        true: (n,) bool, frames of the action by the labels.
+        found: (n,) bool, frames of the action as recognised.
+        overlap: least intersection over union of a match.
+
+    Returns:
+        Matches, bouts found, true bouts.
     """
     spans = _spans(true)
     guesses = _spans(found)
@@ -97,7 +115,16 @@ def _f1(hits: int, found: int, true: int) -> float:
 
 
 def confusion(true: Sequence[str], found: Sequence[str], words: Sequence[str]) -> list[list[int]]:
-    """Rows: what it was; columns: what it was taken for."""
+    """Confusion matrix; rows: what it was; columns: what it was taken for.
+
+    Args:
+        true: (n) true word of each, all of them in `words`.
+        found: (n) recognised words; those not in `words` are left out.
+        words: the K words, in the order of rows and columns.
+
+    Returns:
+        (K, K) counts as lists.
+    """
     place = {word: k for k, word in enumerate(words)}
     out = np.zeros((len(words), len(words)), int)
     for a, b in zip(true, found, strict=True):
@@ -107,7 +134,15 @@ def confusion(true: Sequence[str], found: Sequence[str], words: Sequence[str]) -
 
 
 def interval95(hits: float, n: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share of hits out of n."""
+    """Wilson's 95 % interval of a share of hits out of n.
+
+    Args:
+        hits: how many were right, or a sum of shares.
+        n: how many there were, at least 1.
+
+    Returns:
+        Lower and upper limit, 0 to 1.
+    """
     z = 1.959964
     p = hits / n
     middle = p + z * z / (2 * n)

@@ -1,5 +1,9 @@
-"""The order and the length of actions: a chain in which each lasts a least time, learned from
-labelled bouts.
+"""Hidden semi-Markov model of actions: durations and transitions from bouts, and decoding.
+
+A bout of action k lasts d_k + Geometric ticks: at least the shortest usual length (8 % quantile of
+the labelled bouts), on average the mean length; then action j follows with probability follow[k,
+j], counted with half a pseudo-count. Decoding is by Viterbi, posteriors by forward-backward over
+the expanded states (`_semi_markov_kernels`; Yu 2010).
 """
 
 from __future__ import annotations
@@ -22,9 +26,13 @@ _MARGIN = 512  # ... with so many more on either side
 
 
 @dataclass(frozen=True)
-class ActionChain:
-    """shortest_s, mean_s (K,): how long each action lasts at least and on average; follow (K, K):
-    the chance that one follows another, 0 on the diagonal.
+class SemiMarkovModel:
+    """Durations and transitions of K actions.
+
+    Attributes:
+        shortest_s: (K,) how long each action lasts at least, s.
+        mean_s: (K,) how long it lasts on average, s.
+        follow: (K, K) probability that one follows another, 0 on the diagonal, rows sum to 1.
     """
 
     shortest_s: Array
@@ -32,9 +40,15 @@ class ActionChain:
     follow: Array
 
     @staticmethod
-    def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> ActionChain:
-        """From the bouts (word, length in s) of recordings, in order. Words that never occur get
-        usual values.
+    def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> SemiMarkovModel:
+        """The model of labelled bouts; words that never occur get usual values (0.1 s and 0.5 s).
+
+        Args:
+            runs: of each recording, the bouts (word, length in s) in order.
+            n_words: size K of the vocabulary, at least 2.
+
+        Returns:
+            The model.
         """
         lengths: list[list[float]] = [[] for _ in range(n_words)]
         counts = np.full((n_words, n_words), 0.5)
@@ -46,12 +60,12 @@ class ActionChain:
         np.fill_diagonal(counts, 0.0)
         shortest = np.array([np.quantile(some, _SHORT) if some else 0.1 for some in lengths])
         mean = np.array([np.mean(some) if some else 0.5 for some in lengths])
-        return ActionChain(
+        return SemiMarkovModel(
             shortest, np.maximum(mean, shortest), counts / counts.sum(axis=1, keepdims=True)
         )
 
     def _terms(self, step_s: float) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """What the kernels want to know, on a clock with this step."""
+        """The kernels' `first`, `stay`, `leave` and `switch` on a clock with this step."""
         least = np.maximum(np.round(self.shortest_s / step_s).astype(np.int64), 1)
         more = np.maximum(
             self.mean_s / step_s - least, 0.5
@@ -62,8 +76,15 @@ class ActionChain:
         return np.concatenate([[0], np.cumsum(least)]), np.log(go), np.log1p(-go), switch
 
     def decode(self, scores: Array, step_s: float, room: Room = np.empty) -> NDArray[np.int64]:
-        """The most probable word (m,) of every tick, from log scores (m, K). room: for what takes
-        much of it on the way.
+        """The most probable sequence of words (Viterbi).
+
+        Args:
+            scores: (m, K) log scores of each tick.
+            step_s: step of the clock, s.
+            room: allocator of the back-pointers, (m, K) twice.
+
+        Returns:
+            (m,) int64 index of the word of every tick.
         """
         scores = np.ascontiguousarray(scores)
         terms = self._terms(step_s)
@@ -78,8 +99,18 @@ class ActionChain:
         return label
 
     def probabilities(self, scores: Array, step_s: float, room: Room = np.empty) -> Array:
-        """The probability (m, K) of each word at every tick, given all of them; room: where they
-        are to lie.
+        """The posterior of each word at every tick (forward-backward).
+
+        Ticks are worked out 8192 at a time, each piece given 512 more on either side instead of all
+        of them.
+
+        Args:
+            scores: (m, K) log scores of each tick.
+            step_s: step of the clock, s.
+            room: allocator of the result.
+
+        Returns:
+            (m, K) probabilities, rows sum to 1.
         """
         out = room(scores.shape, float)
         terms = self._terms(step_s)

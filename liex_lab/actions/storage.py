@@ -1,5 +1,6 @@
-"""Action models on disk: skops files, which hold numbers and words and no code, and where the
-bundled ones are.
+"""Action models on disk: skops files, which hold numbers and words and no code; the bundled ones.
+
+Format 2; format 1 had no peaks and is still read.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions._plain_skops import read_plain, write_plain
-from liex_lab.actions.semi_markov import ActionChain
+from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.catalog import MODELS, sha256
 from liex_lab.errors import ModelError
@@ -23,7 +24,17 @@ _WITHOUT_PEAKS = 1
 
 
 def save_action_model(model: TimelineModel, path: str | Path) -> Path:
-    """Write a model; returns the path. Equal models give files of equal content."""
+    """Write a model; equal models give files of equal content.
+
+    The file is written beside and then put in place, so that it is whole or not there.
+
+    Args:
+        model: a trained recogniser.
+        path: the file; its suffix becomes .skops.
+
+    Returns:
+        The path written.
+    """
     target = Path(path).with_suffix(SUFFIX)
     target.parent.mkdir(parents=True, exist_ok=True)
     document: dict[str, Any] = {
@@ -37,7 +48,9 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
         "peaks": model.peaks,
         "definitions": dict(model.definitions),
         "card": dict(model.card),
-        "chain": {name: getattr(model.chain, name) for name in ActionChain.__dataclass_fields__},
+        "chain": {
+            name: getattr(model.chain, name) for name in SemiMarkovModel.__dataclass_fields__
+        },
         "networks": [
             {
                 "centre": n.centre,
@@ -54,8 +67,17 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
 
 
 def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
-    """A bundled model by its animal ('mouse'), or one from a file. Raises ModelError where it
-    cannot be used.
+    """A bundled model by its animal ('mouse'), or one from a file.
+
+    Args:
+        name: the animal, or a path.
+        folder: where bundled models are.
+
+    Returns:
+        The recogniser, with the file's sha256 on its card.
+
+    Raises:
+        ModelError: there is no such model, or the file cannot be used.
     """
     path = find_action_model(name, folder)
     try:
@@ -70,8 +92,8 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
             if document["format"] == _WITHOUT_PEAKS
             else document["peaks"]
         )
-        chain = ActionChain(
-            *(np.asarray(document["chain"][name]) for name in ActionChain.__dataclass_fields__)
+        chain = SemiMarkovModel(
+            *(np.asarray(document["chain"][name]) for name in SemiMarkovModel.__dataclass_fields__)
         )
         networks = tuple(
             Network(n["centre"], n["scale"], tuple((w, b) for w, b in n["layers"]))
@@ -100,7 +122,18 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
 
 
 def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
-    """The file of a bundled model or of a path."""
+    """The file of a bundled model or of a path.
+
+    Args:
+        name: the animal, or a path.
+        folder: where bundled models are.
+
+    Returns:
+        A path that is a file.
+
+    Raises:
+        ModelError: there is none; it names the nearest bundled one.
+    """
     bundled = folder / f"{name}{SUFFIX}"
     path = bundled if bundled.is_file() else Path(name)
     if not path.is_file():
@@ -115,5 +148,12 @@ def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
 
 
 def bundled_action_models(folder: Path = MODELS) -> list[str]:
-    """The animals that have a bundled action model."""
+    """The animals that have a bundled action model, sorted.
+
+    Args:
+        folder: where bundled models are.
+
+    Returns:
+        Their names.
+    """
     return sorted(path.stem for path in folder.glob(f"*{SUFFIX}"))

@@ -1,5 +1,7 @@
-"""Which stretches of a recording a person should label next: those that would teach the recogniser
-most.
+"""Active learning by uncertainty sampling: which segments of a recording to label next.
+
+Windows of a recording are ranked by the mean entropy of the recogniser's posterior, H = -sum p log
+p / log K (Settles 2009), and spread over the pairs of words that it confuses.
 """
 
 from __future__ import annotations
@@ -19,11 +21,19 @@ _STEP = 0.5  # of a window: how far apart windows begin
 def doubtful_stretches(
     found: Recognised, times_ns: NDArray[np.int64], n: int, least_s: float
 ) -> list[dict[str, Any]]:
-    """Up to n stretches of at least least_s, the least certain of every pair of confused words
-    first.
+    """The least certain segments, the first of every pair of confused words before any second.
 
-    uncertainty: entropy of the words' probabilities, of its largest value, on average over the
-    stretch.
+    Windows begin every half of their length; those taken do not overlap.
+
+    Args:
+        found: what the recogniser says of the recording.
+        times_ns: (n,) time stamps.
+        n: the most segments that are wanted.
+        least_s: length of a segment, s.
+
+    Returns:
+        At most n tables of start_s, stop_s, uncertainty (mean entropy of the words' probabilities
+        over its largest value, 0 to 1), guess and or_else (the two most probable words).
     """
     p = np.clip(np.nan_to_num(found.probability, nan=0.0), 1e-9, 1.0)
     known = np.isfinite(found.probability[:, 0])

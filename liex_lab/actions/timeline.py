@@ -1,9 +1,14 @@
-"""The default recogniser: names for every moment of an uncut recording, at any frame rate from 15
-to 120 per second.
+"""Default recogniser of uncut recordings: MLP on window features, then hidden semi-Markov decoding.
 
-Channels on a clock of its own (in seconds and body lengths), windows around each tick, a small
-network for what the tick looks like, and a semi-Markov chain for what can follow what and for how
-long.
+1. Channels on a clock of its own, in seconds and body lengths, so at any frame rate from 15 to 120
+   per second (`channels`).
+2. Features over windows around each tick (`window_features`).
+3. An ensemble of small networks gives p(word | tick); scores = sharpness (log p - log prior), a
+   scaled likelihood (hybrid of network and Markov model, Bourlard and Morgan 1994).
+4. A semi-Markov model of durations and transitions is decoded by Viterbi, with posteriors by
+   forward-backward (`semi_markov`).
+
+Ours; the recogniser of Lie-X section 4.3 names cut-out sequences alone (`recogniser`).
 """
 
 from __future__ import annotations
@@ -15,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.channels import Stretch, channel_names, stretches_of
+from liex_lab.actions.channels import Segment, channel_names, stretches_of
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
-from liex_lab.actions.semi_markov import ActionChain
+from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
@@ -47,11 +52,23 @@ _RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
 
 @dataclass(frozen=True)
 class TimelineModel:
-    """A trained recogniser. words (K): its vocabulary, UNLABELLED among them; share (K,): of the
-    training time; sharpness: how much one tick counts in the chain, as ticks beside each other tell
-    much the same; speeds (K, 2): between which speeds, lengths a second, each word was seen, for a
-    network says anything of what it has not seen; peaks (K,): the highest speed that bouts of a
-    fast word reached at least, for what is never fast is no dart.
+    """A trained recogniser.
+
+    Attributes:
+        skeleton: name of the animal's skeleton.
+        clock_hz: ticks a second.
+        words: (K) its vocabulary, `UNLABELLED` among them.
+        share: (K,) share of the training time of each word, the prior.
+        networks: the ensemble, whose probabilities are averaged.
+        chain: durations and transitions of the words.
+        sharpness: how much one tick counts in the chain, as ticks beside each other tell much the
+            same.
+        speeds: (K, 2) between which speeds, body lengths a second, each word was seen, for a
+            network says anything of what it has not seen.
+        peaks: (K,) the highest speed, body lengths a second, that bouts of a fast word reached at
+            least, for what is never fast is no dart.
+        definitions: word -> definition.
+        card: facts on the training, and the file's sha256.
     """
 
     skeleton: str
@@ -59,7 +76,7 @@ class TimelineModel:
     words: tuple[str, ...]
     share: Array
     networks: tuple[Network, ...]
-    chain: ActionChain
+    chain: SemiMarkovModel
     sharpness: float
     speeds: Array
     peaks: Array
@@ -67,10 +84,19 @@ class TimelineModel:
     card: dict[str, Any] = field(default_factory=dict)
 
     def log_probabilities(
-        self, stretch: Stretch, names: Sequence[str], speed: Array
+        self, stretch: Segment, names: Sequence[str], speed: Array
     ) -> Iterator[tuple[slice, Array]]:
-        """(some, K) of each word at each of some consecutive ticks by itself; speed (m,): the
-        `steady_speed`.
+        """The log probability of each word at each tick by itself, piece by piece.
+
+        Words whose speeds do not fit lose 6 nats.
+
+        Args:
+            stretch: channels of an unbroken segment of m ticks.
+            names: of its channels.
+            speed: (m,) `steady_speed` of the segment.
+
+        Yields:
+            A slice of consecutive ticks, and their log probabilities (ticks, K).
         """
         margin = round(_MARGIN_S * self.clock_hz)
         m = len(stretch.times_s)
@@ -78,7 +104,7 @@ class TimelineModel:
             low = max(0, ticks.start - margin)
             high = min(m, ticks.stop + margin)
             features = window_features(
-                Stretch(stretch.times_s[low:high], stretch.values[low:high]), names
+                Segment(stretch.times_s[low:high], stretch.values[low:high]), names
             )
             features = features[ticks.start - low : ticks.stop - low]
             let_go(stretch.values)
@@ -90,10 +116,18 @@ class TimelineModel:
             yield ticks, np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
 
     def scores(
-        self, stretch: Stretch, names: Sequence[str], speed: Array, room: Room = np.empty
+        self, stretch: Segment, names: Sequence[str], speed: Array, room: Room = np.empty
     ) -> Array:
-        """Log scores (m, K) for the chain: what a tick says beyond how frequent each word is; room:
-        where they are to lie.
+        """Log scores for the semi-Markov model: what a tick says beyond how frequent each word is.
+
+        Args:
+            stretch: channels of an unbroken segment of m ticks.
+            names: of its channels.
+            speed: (m,) `steady_speed` of the segment.
+            room: allocator of the result.
+
+        Returns:
+            (m, K) sharpness times (log probability less log prior).
         """
         scores = room((len(stretch.times_s), len(self.words)), float)
         for ticks, log_p in self.log_probabilities(stretch, names, speed):
@@ -104,8 +138,15 @@ class TimelineModel:
     def recognise(
         self, track: Track, wall_mm: Array | None = None, room: Room = np.empty
     ) -> Recognised:
-        """The ethogram of a track, and the probability of each word in each of its frames. room:
-        for what takes much of it on the way.
+        """The ethogram of a track, and the probability of each word in each of its frames.
+
+        Args:
+            track: one animal's track of n frames.
+            wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+            room: allocator of large intermediate arrays and of the probabilities.
+
+        Returns:
+            Ethogram, probabilities, and what the frame rate cannot resolve.
         """
         n = track.n_frames
         probability = room((n, len(self.words)), float)
@@ -142,8 +183,10 @@ class TimelineModel:
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
 
     def _decode(self, scores: Array, speed: Array, room: Room) -> NDArray[np.int64]:
-        """The most probable words (m,) of bouts that are all as fast at some time as their words
-        ask for; scores (m, K) of others are lowered in place.
+        """The most probable words (m,) of bouts that reach the speed their word asks for.
+
+        Scores (m, K) of bouts that never do are lowered in place and decoded again, at most six
+        times.
         """
         for _ in range(_MOST_DECODED):
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz, room)
@@ -157,8 +200,16 @@ class TimelineModel:
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
-        """Per word, what this frame rate cannot tell: bouts that hold fewer than four frames, and
-        parts of an action that are over before a camera can follow them (`vocabulary.FASTEST`).
+        """Per word, what this frame rate cannot tell.
+
+        Bouts that hold fewer than four frames, and parts of an action that are over before a camera
+        can follow them (`vocabulary.FASTEST`).
+
+        Args:
+            times_ns: (n,) time stamps.
+
+        Returns:
+            Word -> why, only words that are concerned.
         """
         if len(times_ns) < 2:
             return {}
@@ -184,8 +235,14 @@ class TimelineModel:
         return found
 
     def name(self, track: Track, wall_mm: Array | None = None) -> str:
-        """The one word that fits a cut-out sequence best; UNLABELLED only where nothing was
-        measured.
+        """The one word that fits a cut-out sequence best: the largest sum of log likelihood ratios.
+
+        Args:
+            track: the sequence, n frames.
+            wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+
+        Returns:
+            A word; `UNLABELLED` only where nothing was measured.
         """
         total = np.zeros(len(self.words))
         names = channel_names(track.skeleton)
@@ -200,8 +257,13 @@ class TimelineModel:
 
 @dataclass(frozen=True)
 class Recognised:
-    """An ethogram, the words and their probability (n, K) in every frame (NaN where there is no
-    pose), and what the frame rate cannot resolve, word -> why.
+    """What a recogniser says of a recording.
+
+    Attributes:
+        ethogram: the bouts.
+        words: (K) the vocabulary.
+        probability: (n, K) of each word in every frame, NaN where there is no pose.
+        unresolved: word -> what the frame rate cannot resolve of it, and why.
     """
 
     ethogram: Ethogram
@@ -212,9 +274,15 @@ class Recognised:
 
 @dataclass(frozen=True)
 class Examples:
-    """What a recogniser learns from: features (m, F), word codes (m,) and steady speeds (m,) of
-    ticks, the animal's number (m,) and which recording's (m,) they are; and the bouts (word, s) of
-    every recording.
+    """What a recogniser learns from: m ticks of all recordings, and their bouts.
+
+    Attributes:
+        features: (m, F) float32, see `window_features`.
+        code: (m,) index of each tick's word.
+        speed: (m,) `steady_speed`, body lengths a second.
+        animal: (m,) the animal's number.
+        recording: (m,) the recording's number.
+        runs: of every recording, its bouts (word, s) in order.
     """
 
     features: NDArray[np.float32]
@@ -225,8 +293,16 @@ class Examples:
     runs: list[list[tuple[int, float]]]
 
 
-def steady_speed(stretch: Stretch, names: Sequence[str]) -> Array:
-    """(m,) lengths a second around each tick of a stretch, without regard to the direction."""
+def steady_speed(stretch: Segment, names: Sequence[str]) -> Array:
+    """The speed around each tick, without regard to the direction: a moving average over 0.4 s.
+
+    Args:
+        stretch: channels of an unbroken segment of m ticks.
+        names: of its channels, 'speed' among them.
+
+    Returns:
+        (m,) body lengths a second.
+    """
     from scipy.ndimage import uniform_filter1d
 
     step = stretch.times_s[1] - stretch.times_s[0]
@@ -237,12 +313,28 @@ def steady_speed(stretch: Stretch, names: Sequence[str]) -> Array:
 
 
 def clock_of(skeleton: Skeleton) -> float:
-    """Ticks a second of an animal's recogniser."""
+    """Ticks a second of an animal's recogniser: 50 for the fish, else 30.
+
+    Args:
+        skeleton: kinematic tree of the animal.
+
+    Returns:
+        Hz.
+    """
     return CLOCKS_HZ.get(skeleton.name, _CLOCK_HZ)
 
 
 def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: float) -> Examples:
-    """The examples of labelled tracks."""
+    """The examples of labelled tracks, tick by tick.
+
+    Args:
+        tracks: labelled recordings, at least one with a pose.
+        words: the vocabulary; holds every word of the tracks.
+        clock_hz: ticks a second.
+
+    Returns:
+        Features, codes and speeds of all ticks, and the bouts of every recording.
+    """
     features = []
     codes = []
     speeds = []

@@ -1,5 +1,6 @@
-"""The words of the bundled ethograms and what they mean; thresholds are starting values, with the
-literature's.
+"""Vocabularies of the bundled ethograms: definitions of the words, and the fastest part of each.
+
+Thresholds in the definitions are starting values, with the literature's.
 """
 
 from __future__ import annotations
@@ -57,8 +58,12 @@ DEFINITIONS: dict[str, dict[str, str]] = {
 
 
 class Fastest(NamedTuple):
-    """The fastest part of an action: what it is, how long it takes, and from which frame rate on it
-    can be followed.
+    """The fastest part of an action, and from which frame rate on it can be followed.
+
+    Attributes:
+        what: what the part is.
+        seconds: how long it takes, s.
+        least_hz: the frame rate from which on it can be followed, 1/s.
     """
 
     what: str

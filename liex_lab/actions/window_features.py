@@ -1,4 +1,10 @@
-"""Features of every moment: what the channels do around it, over windows in seconds."""
+"""Window features of every tick: mean, spread and extreme of the channels over windows in seconds.
+
+Centred windows of half width 0.06, 0.2 and 0.6 s give mean and standard deviation, four windows
+beside the tick (out to 0.9 s) mean and root mean square, and one of half width 0.25 s the largest
+size; all by running sums or filters, in time linear in the ticks. Windows end where the segment
+does.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.channels import Stretch
+from liex_lab.actions.channels import Segment
 
 Array = NDArray[np.float64]
 
@@ -16,12 +22,18 @@ SIDE_WINDOWS_S = ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9))
 RANGE_S = 0.25
 
 
-def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float32]:
-    """Features (m, F) of every tick of a stretch: its channels now, and their mean and spread
-    around it.
+def window_features(stretch: Segment, names: Sequence[str]) -> NDArray[np.float32]:
+    """Features of every tick of a segment: its channels now, and their mean and spread around it.
 
-    Windows end where the stretch does. Of channels that change sign in a mirror (their names end in
-    ~) the sizes of the means count, and their signs in the shorter windows only.
+    Of channels that change sign in a mirror (their names end in ~) the sizes of the means count,
+    and their signs in the centred windows only.
+
+    Args:
+        stretch: channels (m, C) of an unbroken segment, m at least 2.
+        names: (C) names of the channels.
+
+    Returns:
+        (m, F) float32.
     """
     x = stretch.values
     step = stretch.times_s[1] - stretch.times_s[0]
@@ -35,6 +47,7 @@ def window_features(stretch: Stretch, names: Sequence[str]) -> NDArray[np.float3
     filled = 0
 
     def put(*parts: Array) -> None:  # one by one, for all of them in double precision are large
+        """Append columns (m, k) to the features, one part after the other."""
         nonlocal filled
         for part in parts:
             found[:, filled : filled + part.shape[1]] = part

@@ -1,3 +1,1 @@
-"""What the animal stands in: the floor's plane, the outline of the walls, zones that people
-drew.
-"""
+"""What the animal stands in: the floor plane, the outline of the walls, zones that people drew."""

@@ -1,4 +1,13 @@
-"""The arena: the floor plane a camera looks at, and the frame that stands on it."""
+"""Floor plane of a depth picture by RANSAC on inverse depth, and the arena frame that stands on it.
+
+A plane in a pinhole picture has 1 / z = a u + b v + c, linear in the pixel (u, v). `find_floor`
+tries 600 planes through three pixels each (RANSAC, Fischler and Bolles 1981), on few voters first
+and the best 20 on more, and fits the winner to its inliers (8 mm) by least squares, three rounds.
+`floor_region` says where in the picture the floor lies.
+
+Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along the
+camera's x.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +30,18 @@ _N_FITTED = 60_000  # pixels that the plane is fitted to
 _INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
 _MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
 _MAX_TILT_DEG = 60.0
-_FLAT_MM = (
-    15.0  # background this near to the plane is floor: flatness, noise and lens errors together
-)
+# background this near to the plane is floor: flatness, noise and lens errors together
+_FLAT_MM = 15.0
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The floor plane `normal . p = distance_mm` in the camera frame, its unit normal (3,) pointing
-    away from the lens.
+    """The floor plane normal . p = distance_mm in the camera frame.
 
-    In a pinhole picture 1 / z of a plane is linear in the pixel: `inverse_depth` (3,) gives 1 / z =
-    a u + b v + c.
+    Attributes:
+        normal: (3,) unit normal, pointing away from the lens.
+        distance_mm: of the plane from the camera, mm.
+        inverse_depth: (3,) a, b, c of 1 / z = a u + b v + c, 1/mm per pixel and 1/mm.
     """
 
     normal: Array
@@ -41,7 +50,15 @@ class Floor:
 
     @staticmethod
     def from_inverse_depth(coefficients: Array, camera: Camera) -> Floor:
-        """The plane with 1 / z = a u + b v + c, per mm and pixel."""
+        """The plane with 1 / z = a u + b v + c.
+
+        Args:
+            coefficients: (3,) a, b, c, 1/mm per pixel and 1/mm.
+            camera: whose pixels they count.
+
+        Returns:
+            The plane.
+        """
         a, b, c = coefficients
         toward = np.array([a * camera.fx, b * camera.fy, c + a * camera.cx + b * camera.cy])
         length = float(np.linalg.norm(toward))
@@ -49,7 +66,16 @@ class Floor:
 
     @staticmethod
     def from_plane(normal: Array, distance_mm: float, camera: Camera) -> Floor:
-        """The plane normal . p = distance_mm in the camera frame."""
+        """The plane normal . p = distance_mm in the camera frame.
+
+        Args:
+            normal: (3,) pointing away from the lens, of any length.
+            distance_mm: from the camera along the unit normal, mm.
+            camera: in whose pixels `inverse_depth` counts.
+
+        Returns:
+            The plane.
+        """
         n = np.asarray(normal, float) / np.linalg.norm(normal)
         a = n[0] / camera.fx / distance_mm
         b = n[1] / camera.fy / distance_mm
@@ -61,8 +87,10 @@ class Floor:
 
     @cached_property
     def T_arena_camera(self) -> SE3:
-        """Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x
-        along the camera's.
+        """Transform from the camera frame into the arena frame.
+
+        Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along
+        the camera's.
         """
         up = -self.normal
         x = np.array([1.0, 0.0, 0.0]) - up[0] * up
@@ -70,18 +98,35 @@ class Floor:
         return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, self.distance_mm]))
 
     def depth(self, width: int, height: int) -> NDArray[np.float32]:
-        """Depth (H, W) mm of the bare floor under every pixel; 0 above the horizon."""
+        """Depth of the bare floor under every pixel.
+
+        Args:
+            width: of the picture, px.
+            height: of the picture, px.
+
+        Returns:
+            (height, width) float32 mm; 0 above the horizon.
+        """
         a, b, c = self.inverse_depth
         inverse = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
         return np.where(inverse > 1e-6, 1.0 / np.maximum(inverse, 1e-6), 0.0).astype(np.float32)
 
 
 def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -> Floor:
-    """The largest plane of an empty scene (H, W) mm, by RANSAC on inverse depth and least squares
-    on its inliers.
+    """The largest plane of an empty scene, by RANSAC on inverse depth and least squares.
 
-    Raises EstimationError where less than a fifth of the readable pixels lie on one plane that
-    faces the camera.
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        camera: that took it, free of lens distortion.
+        seed: of the random pixels.
+
+    Returns:
+        The floor.
+
+    Raises:
+        EstimationError: less than a fifth of the readable pixels lie on one plane that faces the
+            camera (tilted by at most 60 degrees), fewer than 500 pixels are readable, or the
+            camera's distortion was not undone.
     """
     if camera.distortion is not None:
         raise EstimationError(
@@ -170,11 +215,17 @@ def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
 
 
 def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where (H, W) the floor lies: the convex hull of the largest connected part of the background
-    on the plane.
+    """Where the floor lies: the convex hull of the largest part of the background on the plane.
 
     Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the
-    hull closes.
+    hull closes. Where no connected part is left, all pixels near the plane are taken.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        bare: (H, W) float32 mm, depth of the bare floor, see `Floor.depth`.
+
+    Returns:
+        (H, W) bool.
     """
     import cv2
 
@@ -187,8 +238,16 @@ def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> 
 
 
 def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The largest connected part (H, W) of the background (H, W) mm that lies on the bare floor (H,
-    W) mm.
+    """The largest connected part of the background that lies on the bare floor.
+
+    Pixels near the plane are opened with a square of 5 px before their components are labelled.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        bare: (H, W) float32 mm, depth of the bare floor.
+
+    Returns:
+        (H, W) bool, all False where nothing lies on it.
     """
     import cv2
 
@@ -201,5 +260,13 @@ def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> N
 
 
 def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where (H, W) the background lies on the bare floor, or nearly."""
+    """Where the background lies within 15 mm of the bare floor.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        bare: (H, W) float32 mm, depth of the bare floor.
+
+    Returns:
+        (H, W) bool.
+    """
     return (background > 0) & (np.abs(background - bare) < _FLAT_MM)

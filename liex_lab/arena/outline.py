@@ -1,5 +1,11 @@
-"""The shape of the arena: where its floor ends, as a circle or a rectangle, and whether walls stand
-there.
+"""Shape of the arena: robust fits of a circle and a rectangle to the outline, and its walls.
+
+The circle is that of least median distance (least median of squares, Rousseeuw 1984) among those
+through three outline points each, refined by algebraic least squares (Kasa); the rectangle turns
+through a grid of angles about OpenCV's minimum-area one, its sides the medians of the points
+nearest to them. The better of the two stands if its median residual is at most the larger of 4 mm
+and 2.5 % of its size. Just beyond the outline the background says whether walls stand there or the
+floor ends in the air.
 """
 
 from __future__ import annotations
@@ -34,13 +40,20 @@ _MAX_POINTS = 720  # of the outline
 
 @dataclass(frozen=True)
 class Arena:
-    """What the floor's outline is, in the arena frame.
+    """The outline of the floor, in the arena frame.
 
-    kind: round, rectangular, irregular (no shape that is known), or open (the picture does not show
-    where the floor ends). centre_mm (x, y); radius_mm of a round one; half_mm, half the lengths of
-    a rectangular one's sides, turned by yaw_rad; residual_mm: median distance of the outline from
-    the shape; seen_share: of the outline, how much is in view; edge: wall, drop (the floor ends in
-    the air) or unknown. An irregular or open arena has no such numbers.
+    An irregular or open arena has no such numbers.
+
+    Attributes:
+        kind: 'round', 'rectangular', 'irregular' (no shape that is known), or 'open' (the picture
+            does not show where the floor ends).
+        centre_mm: x and y, mm.
+        radius_mm: of a round one, mm.
+        half_mm: half the lengths of a rectangular one's sides, mm.
+        yaw_rad: by which these are turned, rad.
+        residual_mm: median distance of the outline from the shape, mm.
+        seen_share: of the outline, how much is in view.
+        edge: 'wall', 'drop' (the floor ends in the air) or 'unknown'.
     """
 
     kind: str
@@ -53,8 +66,13 @@ class Arena:
     edge: str = "unknown"
 
     def wall_distance_mm(self, xy_mm: Array) -> Array:
-        """How far (...) points (..., 2) mm are from the nearest wall, negative beyond it; NaN for
-        an unknown shape.
+        """Signed distance of points from the nearest wall, negative beyond it.
+
+        Args:
+            xy_mm: (..., 2) points, mm, arena frame.
+
+        Returns:
+            (...) mm; NaN for an unknown shape.
         """
         xy = np.asarray(xy_mm, float)
         if self.centre_mm is None:
@@ -67,7 +85,7 @@ class Arena:
         return np.asarray(np.where(beyond > 0, -beyond, inside.min(axis=-1)))
 
     def outline_mm(self) -> Array:
-        """Corners (n, 2) mm of its outline, for drawing; (0, 2) for an unknown shape."""
+        """Corners of its outline, (n, 2) mm, for drawing; (0, 2) for an unknown shape."""
         if self.centre_mm is None:
             return np.empty((0, 2))
         if self.radius_mm is not None:
@@ -78,9 +96,7 @@ class Arena:
         return np.asarray(np.array(self.centre_mm) + corners @ _turn(self.yaw_rad or 0.0).T)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for session.json, rounded to what can be known; what is unknown is left
-        out.
-        """
+        """Plain numbers for session.json, rounded; what is unknown is left out."""
         numbers = {
             name: value
             if isinstance(value, str)
@@ -92,7 +108,14 @@ class Arena:
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Arena:
-        """The arena that `to_dict` wrote."""
+        """The arena that `to_dict` wrote.
+
+        Args:
+            numbers: fields by name.
+
+        Returns:
+            The arena.
+        """
         known: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in numbers.items()
@@ -100,6 +123,7 @@ class Arena:
         return Arena(**known)
 
     def __str__(self) -> str:
+        """The shape and its size in words, as in 'round, radius 210 mm'."""
         known = {
             ROUND: lambda: f"round, radius {self.radius_mm:.0f} mm",
             RECTANGULAR: lambda: (
@@ -115,7 +139,18 @@ UNKNOWN = Arena(OPEN)
 
 
 def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) -> Arena:
-    """The shape of the floor's outline in an empty scene (H, W) mm."""
+    """The shape of the floor's outline in an empty scene.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        floor: the floor's plane.
+        camera: that took it.
+
+    Returns:
+        The arena: 'open' where less than 60 % of the outline (of a rectangle: 30 % of any side) or
+        fewer than 40 points of it are in view, 'irregular' where neither a circle nor a rectangle
+        fits.
+    """
     points, pixels, share = _outline(background, floor, camera)
     if share < _SEEN_SHARE or len(points) < 40:
         return Arena(OPEN, seen_share=share)
@@ -179,11 +214,16 @@ def _share_in_view(hull: Array, width: int, height: int) -> float:
 
 
 def fit_circle(points: Array) -> tuple[Array, float, float]:
-    """Centre (2,), radius and median distance of the circle nearest to points (n, 2); a third of
-    them may be astray.
+    """The circle nearest to points, of which a third may be astray.
 
-    First, out of circles through three points each, the one with the least median distance; then
-    least squares.
+    First, out of 150 circles through three points each, the one with the least median distance;
+    then algebraic least squares on the points within three times that distance, in three rounds.
+
+    Args:
+        points: (n, 2) in any unit.
+
+    Returns:
+        Centre (2,), radius and median distance, in the unit of the points.
     """
     a, b, c = np.moveaxis(
         points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0
@@ -216,10 +256,17 @@ def fit_circle(points: Array) -> tuple[Array, float, float]:
 
 
 def fit_rectangle(points: Array) -> tuple[Array, Array, float, float]:
-    """Centre (2,), half sides (2,), yaw rad and median distance of the rectangle nearest to points
-    (n, 2).
+    """The rectangle nearest to points.
 
-    yaw is that of the first side, within 45 degrees of the x axis.
+    Its angle is searched about that of the rectangle of least area in steps of 1, 0.1 and 0.01
+    degrees.
+
+    Args:
+        points: (n, 2) in any unit.
+
+    Returns:
+        Centre (2,), half sides (2,), yaw rad and median distance. yaw is that of the first side,
+        within 45 degrees of the x axis.
     """
     import cv2
 
@@ -301,7 +348,14 @@ def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels:
 
 
 def circle_points(n: int) -> Array:
-    """Points (n, 2) of the unit circle."""
+    """Points of the unit circle, evenly spaced from (1, 0) on.
+
+    Args:
+        n: how many.
+
+    Returns:
+        (n, 2).
+    """
     angle = 2.0 * np.pi * np.arange(n) / n
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 

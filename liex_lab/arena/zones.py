@@ -1,4 +1,9 @@
-"""Zones of the arena that a person has drawn: circles and polygons on the floor, with names."""
+"""Zones of the arena that a person has drawn: named circles and polygons on the floor, from TOML.
+
+Whether a point lies in a polygon is decided by the even-odd rule: how many sides a ray along x
+crosses. Zones may be drawn in pixels; the view rays of their outline are then met with the floor, 1
+/ z = a u + b v + c.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +33,12 @@ _EXAMPLE = '[[zones]], name = "centre", circle = { centre = [0, 0], radius = 80 
 
 @dataclass(frozen=True)
 class Zone:
-    """A named part of the floor, in the arena frame: a circle (x, y, radius) mm or a polygon of
-    corners (x, y) mm.
+    """A named part of the floor, in the arena frame: a circle or a polygon.
+
+    Attributes:
+        name: of the zone; columns are named after it.
+        circle_mm: x, y and radius, mm; None for a polygon.
+        polygon_mm: corners (x, y), mm; None for a circle.
     """
 
     name: str
@@ -37,7 +46,14 @@ class Zone:
     polygon_mm: tuple[tuple[float, float], ...] | None = None
 
     def holds(self, xy_mm: ArrayLike) -> NDArray[np.bool_]:
-        """Whether points (n, 2) mm lie in the zone (n,); False for NaN."""
+        """Whether points lie in the zone.
+
+        Args:
+            xy_mm: (n, 2) points, mm, arena frame.
+
+        Returns:
+            (n,) bool; False for NaN.
+        """
         xy = np.asarray(xy_mm, float)
         if self.circle_mm is not None:
             x, y, radius = self.circle_mm
@@ -52,7 +68,7 @@ class Zone:
         return inside
 
     def outline_mm(self) -> Array:
-        """Corners (n, 2) mm of its outline, for drawing."""
+        """Corners of its outline, (n, 2) mm, for drawing."""
         if self.circle_mm is None:
             return np.array(self.polygon_mm)
         x, y, radius = self.circle_mm
@@ -64,7 +80,14 @@ class Zone:
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Zone:
-        """The zone that `to_dict` wrote."""
+        """The zone that `to_dict` wrote.
+
+        Args:
+            numbers: fields by name.
+
+        Returns:
+            The zone.
+        """
         circle = numbers.get("circle_mm")
         polygon = numbers.get("polygon_mm")
         return Zone(
@@ -75,8 +98,14 @@ class Zone:
 
 
 def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
-    """For each point (n, 2) mm the names of the zones that it lies in, joined by `SEPARATOR`; ""
-    for none.
+    """For each point the names of the zones that it lies in.
+
+    Args:
+        zones: the zones, which may overlap.
+        xy_mm: (n, 2) points, mm, arena frame.
+
+    Returns:
+        n strings, names joined by `SEPARATOR`; '' for none.
     """
     xy = np.asarray(xy_mm, float)
     inside = [(zone.name, zone.holds(xy)) for zone in zones]
@@ -85,8 +114,15 @@ def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
 
 @dataclass(frozen=True)
 class DrawnZone:
-    """A zone as it stands in a file: a circle about its only point, or a polygon. where: what
-    errors call it.
+    """A zone as it stands in a file: a circle about its only point, or a polygon.
+
+    Attributes:
+        name: of the zone.
+        points: the circle's centre, or the polygon's corners, in `unit`.
+        radius: of the circle, in `unit`; None for a polygon.
+        unit: 'mm' of the arena frame, or 'px' of the depth picture.
+        relative_to: 'centre' counts from the arena's centre, turned with it; None does not.
+        where: what errors call it.
     """
 
     name: str
@@ -97,8 +133,21 @@ class DrawnZone:
     where: str
 
     def placed(self, camera: Camera, floor: Floor, arena: Arena) -> Zone:
-        """The zone in the arena frame. Raises PlanError where the floor or the arena do not allow
-        it.
+        """The zone in the arena frame.
+
+        A circle in pixels becomes a polygon of 64 corners, for on a tilted floor it is no circle.
+
+        Args:
+            camera: whose pixels a zone in px counts.
+            floor: the floor's plane.
+            arena: the outline that was found, for zones relative to its centre.
+
+        Returns:
+            The zone, in mm.
+
+        Raises:
+            PlanError: the zone is drawn above the floor's horizon, or relative to the centre of an
+                arena whose walls were not found.
         """
         points = np.array(self.points)
         if self.unit == "px":
@@ -135,8 +184,17 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     Each [[zones]] has a name, and a circle = { centre = [x, y], radius = r } or a polygon = [[x,
     y], ...]. unit = "mm" (or left out) are millimetres of the arena frame, "px" pixels (u, v) of
     the depth picture, whose view rays are met with the floor. relative_to = "centre" counts
-    millimetres from the centre of the arena that was found, turned with it. Raises PlanError with
-    one sentence where a zone cannot be.
+    millimetres from the centre of the arena that was found, turned with it.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The zones in the order of the file, not yet placed on a floor.
+
+    Raises:
+        PlanError: the file cannot be read or is not one of zones, or a zone cannot be; one sentence
+            says what to correct.
     """
     file = Path(path)
     try:

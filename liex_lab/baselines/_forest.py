@@ -1,5 +1,7 @@
-"""Numba kernels of the regression forest: votes of an animal's pixels for its place, then
-candidates for its pose.
+"""Numba kernels of the RF baseline: Hough votes of an animal's pixels for its position and heading.
+
+F1's trees vote from pixels for the base's position and heading, F2's trees for the pose; the
+mean-shift mode of the votes is taken (Lie-X section 5.2).
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from numba import njit, prange
 
 from liex_lab.estimation._cascade_kernels import mode_of_votes
 from liex_lab.estimation._feature_kernels import correct_base, correct_joint, fill_view, place_joint
+from liex_lab.foreground._crop_camera_kernels import crop_camera
 from liex_lab.forests._kernels import VIEW, descend
 
 _BINS = 72  # of the circle in which headings are counted: 5 degrees each
@@ -17,12 +20,16 @@ _SETTLE = 2  # times the few mean-shift steps of `mode_of_votes`
 
 
 @njit(cache=True)
-def animal_points(heights, look, phase, points):
-    """P points (P, 3) mm on the animal's back, view frame, evenly spread over its pixels in reading
-    order.
+def animal_points(heights, packed_camera, phase, points):
+    """Points on the animal's back, evenly spread over its pixels in reading order.
 
-    phase in [0, 1) chooses which of the pixels; look (17,) says how the height map (S, S) was cut.
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        phase: in [0, 1), chooses which of the pixels.
+        points: (P, 3) filled, mm, view frame.
     """
+    camera = crop_camera(packed_camera)
     total = 0
     for h in heights.flat:
         total += h > 0
@@ -35,37 +42,53 @@ def animal_points(heights, look, phase, points):
             if h <= 0:
                 continue
             while k < n and int((k + phase) * total / n) == seen:
-                z = look[13] - h / 16.0
-                x = (look[14] + look[16] * column - look[2]) / look[0] * z
-                y = (look[15] + look[16] * row - look[3]) / look[1] * z
-                for i in range(3):
-                    points[k, i] = look[4 + 3 * i] * x + look[5 + 3 * i] * y + look[6 + 3 * i] * z
-                points[k, 2] += look[13]
+                z = camera.distance - h / 16.0
+                x = (camera.u0 + camera.step * column - camera.cx) / camera.fx * z
+                y = (camera.v0 + camera.step * row - camera.cy) / camera.fy * z
+                points[k, 0] = camera.r00 * x + camera.r01 * y + camera.r02 * z
+                points[k, 1] = camera.r10 * x + camera.r11 * y + camera.r12 * z
+                points[k, 2] = camera.r20 * x + camera.r21 * y + camera.r22 * z
+                points[k, 2] += camera.distance
                 k += 1
             seen += 1
 
 
 @njit(cache=True, parallel=True)
-def points_all(heights, looks, image, phases, points):
-    """`animal_points` for a batch: image (n,) and phases (n,) into points (n, P, 3)."""
+def points_all(heights, crop_cameras, image, phases, points):
+    """`animal_points` for a batch of images.
+
+    Args:
+        heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (m, 17) packed crop cameras of the height maps.
+        image: (n,) index of each sample's height map.
+        phases: (n,) in [0, 1).
+        points: (n, P, 3) filled, mm, view frame.
+    """
     for s in prange(image.size):
-        animal_points(heights[image[s]], looks[image[s]], phases[s], points[s])
+        animal_points(heights[image[s]], crop_cameras[image[s]], phases[s], points[s])
 
 
 @njit(cache=True, parallel=True)
-def views_all(looks, image, places, headings, reach, views):
-    """Views (n, 1, 9) of places (n, 3) mm whose offsets are turned by headings (n,) rad in the
-    image plane.
+def views_all(crop_cameras, image, places, headings, reach, views):
+    """Linearised projections at given positions, with offsets turned by a heading.
+
+    Args:
+        crop_cameras: (m, 17) packed crop cameras of the height maps.
+        image: (n,) index of each sample's height map.
+        places: (n, 3) positions, mm, view frame.
+        headings: (n,) rad, about the view's z axis.
+        reach: how far offsets reach, mm.
+        views: (n, 1, 9) float32, filled.
     """
     for s in prange(image.size):
         turned = np.eye(3)
         turn_to(headings[s], turned)
-        fill_view(turned, places[s], looks[image[s]], 1.0, reach, views[s, 0])
+        fill_view(turned, places[s], crop_cameras[image[s]], 1.0, reach, views[s, 0])
 
 
 @njit(cache=True)
 def turn_to(heading, rotation):
-    """Rotation (3, 3) about the view's z axis by an angle, rad."""
+    """Rotation (3, 3) about the view's z axis by an angle `heading`, rad, into `rotation`."""
     c = np.cos(heading)
     s = np.sin(heading)
     rotation[:] = 0.0
@@ -78,7 +101,11 @@ def turn_to(heading, rotation):
 
 @njit(cache=True)
 def heading_of(votes):
-    """The heading, rad, that most votes (n, 2) agree on; a vote weighs as much as it is long."""
+    """The heading, rad, that most votes (n, 2) agree on; a vote weighs as much as it is long.
+
+    The peak of a smoothed circular histogram is taken, then the mean direction of the votes within
+    about 45 degrees of it.
+    """
     counts = np.zeros(_BINS)
     angles = np.empty(len(votes))
     for k in range(len(votes)):
@@ -97,22 +124,39 @@ def heading_of(votes):
 
 
 @njit(cache=True)
-def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leaves, used, place):
-    """The base joint's place (3,) mm in the view frame, and the heading, rad, as F1's trees vote;
-    used (T,) bool.
+def locate(
+    heights, packed_camera, phase, n_points, reach, bandwidth, nodes, roots, leaves, used, place
+):
+    """Position and heading of the animal, as F1's trees vote.
 
-    Only votes whose own heading agrees with the chosen one take part in the place: a pixel that
+    Only votes whose own heading agrees with the chosen one take part in the position: a pixel that
     takes the nose for the tail errs in both.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        phase: in [0, 1), chooses which pixels vote.
+        n_points: number of pixels that vote.
+        reach: how far offsets reach, mm.
+        bandwidth: of the mean shift over positions, mm.
+        nodes: (N, 4) int32 packed nodes of F1.
+        roots: (T,) roots of its trees.
+        leaves: (n_leaves, 5) offset to the base, mm, and heading times a length.
+        used: (T,) bool, the trees that vote.
+        place: (3,) filled with the base's position, mm, view frame.
+
+    Returns:
+        The heading, rad.
     """
     points = np.empty((n_points, 3))
-    animal_points(heights, look, phase, points)
+    animal_points(heights, packed_camera, phase, points)
     view = np.empty((1, VIEW), np.float32)
     none = np.zeros(1, np.float32)
     upright = np.eye(3)
     votes = np.empty((roots.size * n_points, 5))
     n = 0
     for p in range(n_points):
-        fill_view(upright, points[p], look, 1.0, reach, view[0])
+        fill_view(upright, points[p], packed_camera, 1.0, reach, view[0])
         for t in range(roots.size):
             if not used[t]:
                 continue
@@ -141,7 +185,7 @@ def locate(heights, look, phase, n_points, reach, bandwidth, nodes, roots, leave
 @njit(cache=True, parallel=True)
 def locate_all(
     heights,
-    looks,
+    crop_cameras,
     image,
     phases,
     n_points,
@@ -154,13 +198,27 @@ def locate_all(
     places,
     headings,
 ):
-    """`locate` for a batch: image (n,), phases (n,), used (n, T) into places (n, 3) and headings
-    (n,).
+    """`locate` for a batch of images, in parallel.
+
+    Args:
+        heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (m, 17) packed crop cameras of the height maps.
+        image: (n,) index of each sample's height map.
+        phases: (n,) in [0, 1).
+        n_points: number of pixels that vote.
+        reach: how far offsets reach, mm.
+        bandwidth: of the mean shift over positions, mm.
+        nodes: (N, 4) int32 packed nodes of F1.
+        roots: (T,) roots of its trees.
+        leaves: (n_leaves, 5) leaf values of F1.
+        used: (n, T) bool, the trees that vote.
+        places: (n, 3) filled, mm, view frame.
+        headings: (n,) filled, rad.
     """
     for s in prange(image.size):
         headings[s] = locate(
             heights[image[s]],
-            looks[image[s]],
+            crop_cameras[image[s]],
             phases[s],
             n_points,
             reach,
@@ -175,8 +233,22 @@ def locate_all(
 
 @njit(cache=True)
 def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotations, positions):
-    """The pose at F2's coordinates (D,) in lever units, from where F1 put it; all joints' frames.
-    Returns the scale.
+    """Joint frames of the pose at F2's coordinates, from where F1 put it.
+
+    Args:
+        values: (D,) coordinates in lever units, see `baselines.forest.levers`.
+        levers: (D,) lever arms.
+        place: (3,) base position from F1, mm.
+        heading: heading from F1, rad.
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        axes: (J, 3) bool, the free axes.
+        rotations: (J, 3, 3) filled.
+        positions: (J, 3) filled, mm.
+
+    Returns:
+        The scale of the bones.
     """
     twist = np.empty(7)
     for k in range(7):
@@ -202,7 +274,7 @@ def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotatio
 @njit(cache=True, parallel=True)
 def guess_all(
     heights,
-    looks,
+    crop_cameras,
     found,
     n_points,
     reach,
@@ -220,7 +292,28 @@ def guess_all(
     axes,
     positions,
 ):
-    """Joints (n, J, 3) mm in their view frames, of the frames in which an animal was found."""
+    """Joints of the frames in which an animal was found, in parallel.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        found: (n,) bool, where there is an animal.
+        n_points: number of pixels that vote.
+        reach: how far offsets reach, mm.
+        bandwidths: (2,) of the mean shifts of F1 and F2, mm.
+        nodes: (N, 4) int32 packed nodes of F1.
+        roots: (T,) roots of F1's trees.
+        leaves: (n_leaves, 5) leaf values of F1.
+        pose_nodes: packed nodes of F2.
+        pose_roots: roots of F2's trees.
+        pose_leaves: (n_leaves, D) leaf values of F2.
+        levers: (D,) lever arms of F2's coordinates.
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        axes: (J, 3) bool, the free axes.
+        positions: (n, J, 3) joints, mm, view frame; filled where an animal was found.
+    """
     for i in prange(heights.shape[0]):
         if not found[i]:
             continue
@@ -229,7 +322,7 @@ def guess_all(
         width = pose_leaves.shape[1]
         heading = locate(
             heights[i],
-            looks[i],
+            crop_cameras[i],
             0.5,
             n_points,
             reach,
@@ -244,7 +337,7 @@ def guess_all(
         view = np.empty((1, VIEW), np.float32)
         none = np.zeros(1, np.float32)
         turn_to(heading, turned)
-        fill_view(turned, place, looks[i], 1.0, reach, view[0])
+        fill_view(turned, place, crop_cameras[i], 1.0, reach, view[0])
         votes = np.empty((n_trees, width))
         values = np.zeros(width)
         for t in range(n_trees):

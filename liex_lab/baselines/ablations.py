@@ -1,4 +1,6 @@
-"""The method without its learned metric: the plain mean of all candidates (Lie-X Tables 1 and 2).
+"""Ablation of the learned metric: the plain mean of all candidates (Lie-X Tables 1 and 2).
+
+    x_j = 1/K sum_k x_j^(k)        for each joint j over the K candidates.
 
 The other ablation, without multiple initial poses, needs no code of its own: it is
 `PoseEstimator(model, 1)`.
@@ -11,16 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines.baseline import Guesses, in_camera_frame, see
+from liex_lab.baselines.baseline import Guesses, see
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.foreground.crop_camera import in_camera_frame
 from liex_lab.foreground.height_maps import Foreground
 
 
 @dataclass(frozen=True)
 class PlainMean:
-    """The paper's variant whose candidates are averaged "for each of the joints in the 3D Euclidean
-    space".
+    """The paper's variant that averages all of its candidates, without the learned metric.
+
+    They are averaged "for each of the joints in the 3D Euclidean space".
+
+    Attributes:
+        estimator: the estimator whose candidates are averaged.
     """
 
     estimator: PoseEstimator
@@ -31,15 +38,30 @@ class PlainMean:
         return self.estimator.skeleton
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """As the paper's variant: the home size."""
+        """Size of the animal as the estimator finds it; the home size for the paper's variant.
+
+        Args:
+            sample: (n, H, W) float32 frames, mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+        """
         return self.estimator.find_size(sample, scene)
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> Guesses:
-        """The mean over all candidates of each joint's position."""
-        crops, looks = see(depths, scene, parallel)
-        _, positions, _, _ = self.estimator.candidates(crops, looks, size, parallel)
-        joints = in_camera_frame(positions.mean(axis=1), looks)
+        """Average each joint's position over all candidates.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: the animal's size over home size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame; bones do not keep their lengths.
+        """
+        crops, crop_cameras = see(depths, scene, parallel)
+        _, positions, _, _ = self.estimator.candidates(crops, crop_cameras, size, parallel)
+        joints = in_camera_frame(positions.mean(axis=1), crop_cameras)
         joints[~crops.found] = np.nan
         return Guesses(joints, crops.found, crops)

@@ -1,5 +1,7 @@
-"""What every baseline does: frames and a learned scene in, the joints of the animal in each frame
-out.
+"""Interface of the baselines: frames and a fitted segmenter in, the animal's joints per frame out.
+
+All baselines of Lie-X section 5.2 work on the product's own segmentation, so that only the pose
+estimation differs.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.foreground.height_maps import Crops, Foreground
+from liex_lab.foreground.height_maps import Foreground, HeightMaps
 
 Array = NDArray[np.float64]
 
@@ -28,40 +30,68 @@ DAMAGE = (
 
 @dataclass(frozen=True)
 class Guesses:
-    """Joints (n, J, 3) mm of n frames in the camera frame, NaN where no animal was found; found
-    (n,).
+    """Joints that a baseline estimates in n frames.
+
+    Attributes:
+        joints: (n, J, 3) joints, mm, camera frame; NaN where no animal was found.
+        found: (n,) bool, where an animal was found.
+        crops: the height maps that the estimate was made from.
     """
 
     joints: Array
     found: NDArray[np.bool_]
-    crops: Crops
+    crops: HeightMaps
 
 
 class Baseline(Protocol):
-    """A way to measure poses that is not ours, at work on the product's own foreground."""
+    """A way to measure poses that is not ours, at work on the product's own segmentation."""
 
     @property
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """The animal's size over home size; 1 where the baseline knows of no such thing, as the
-        paper's do not.
+        """Estimate the animal's size from a sample of frames.
+
+        Args:
+            sample: (n, H, W) float32 frames, mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+
+        Returns:
+            The animal's spine over the home length; 1 where the baseline knows of no such thing, as
+            the paper's do not.
         """
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> Guesses:
-        """Joints of frames (n, H, W) mm in the camera frame; on one core unless `parallel`."""
+        """Estimate the joints in each frame.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: the animal's size, as from `find_size`.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
 
 
-def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple[Crops, Array]:
-    """The animal of each frame (n, H, W) mm as the paper's features see it, and how it was cut (n,
-    17).
+def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple[HeightMaps, Array]:
+    """Segment the animal of each frame as the paper's features see it.
 
-    Heights along the optical axis, no size known. Where two things have about the animal's area,
-    the one that is more like it in area and volume is taken, as for the paper's own variant of the
-    method.
+    Heights are measured along the optical axis, and no size is known. Where two components have
+    about the animal's area, the one that is more like it in area and volume is taken, as for the
+    paper's own variant of the method.
+
+    Args:
+        depths: (n, H, W) float32 mm, 0 where unread.
+        scene: the segmenter that was fitted to the recording.
+        parallel: use all cores rather than one.
+
+    Returns:
+        The height maps, and their packed crop cameras (n, 17).
     """
     crops, second = scene.extract_both(depths, 1.0, parallel, camera_view=True)
     unsure = np.flatnonzero(crops.n_blobs > 1)
@@ -72,23 +102,4 @@ def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple
         ]
         better = unsure[misfits[1] < misfits[0]]
         crops.put(better, second[better])
-    return crops, scene.looks(crops, camera_view=True)
-
-
-def in_camera_frame(points: Array, looks: Array) -> Array:
-    """Points (n, ..., 3) mm of the view frames given by `looks` (n, 17) in their camera frames."""
-    off = points - _origin(points, looks)
-    return np.einsum("nji,n...j->n...i", looks[:, 4:13].reshape(-1, 3, 3), off)
-
-
-def in_view_frame(points: Array, looks: Array) -> Array:
-    """The inverse of `in_camera_frame`."""
-    turned = np.einsum("nij,n...j->n...i", looks[:, 4:13].reshape(-1, 3, 3), points)
-    return turned + _origin(points, looks)
-
-
-def _origin(points: Array, looks: Array) -> Array:
-    """The camera's centre (n, ..., 3) mm in the view frames."""
-    origin = np.zeros((len(looks), *(1,) * (points.ndim - 2), 3))
-    origin[..., 2] = looks[:, 13].reshape(-1, *(1,) * (points.ndim - 2))
-    return origin
+    return crops, scene.crop_cameras(crops, camera_view=True)

@@ -1,14 +1,15 @@
-"""CNN, the paper's second baseline: an AlexNet that regresses all joints from one patch (Lie-X
-section 5.2).
+"""AlexNet that regresses all joints from one depth patch, the paper's CNN baseline.
 
-The paper takes AlexNet as trained on ImageNet and trains it on for 50 epochs of its 95,000 to
-104,000 images. Here it is trained from scratch: weights that come from photographs cannot be had
-where this is built, and the budget is that of two CPU cores (`CnnPlan`). What follows from that:
-batch normalisation after every convolution, without which an AlexNet hardly learns from scratch in
-so few steps; no dropout, since no image is seen more than a few times; fully connected layers of
-1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column), at a
-`width` of its numbers of channels. Products are of bfloat16 numbers, which such CPUs as have them
-do in half the time. The loss is the mean distance of the joints, in half sides of the patch.
+Lie-X section 5.2. The paper takes AlexNet as trained on ImageNet and trains it on for 50 epochs of
+its 95,000 to 104,000 images. Here it is trained from scratch: weights that come from photographs
+cannot be had where this is built, and the budget is that of two CPU cores (`CnnPlan`). What follows
+from that: batch normalisation after every convolution, without which an AlexNet hardly learns from
+scratch in so few steps; no dropout, since no image is seen more than a few times; fully connected
+layers of 1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column),
+at a `width` of its numbers of channels. Products are of bfloat16 numbers, which such CPUs as have
+them do in half the time. The loss is the mean distance of the joints,
+
+    L = 1/J sum_j |y_j - y_j*|,        in half sides of the patch.
 
 torch is an optional dependency: `pip install 'liex_lab[cnn]'`.
 """
@@ -25,11 +26,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines.baseline import DAMAGE, Guesses, in_camera_frame, see
+from liex_lab.baselines.baseline import DAMAGE, Guesses, see
 from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets_of
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
+from liex_lab.foreground.crop_camera import in_camera_frame
 from liex_lab.foreground.height_maps import Foreground
 from liex_lab.runtime.threads import threads
 
@@ -43,10 +45,16 @@ _BATCH = 64
 
 @dataclass(frozen=True)
 class CnnPlan:
-    """The budget: about seven minutes of two cores with bfloat16 for 122,880 views. width: of
-    AlexNet's own numbers of channels, halved to see more images in that time; connected: neurons of
-    the two hidden layers; epochs: times that every image is seen; the step size rises to `rate` and
-    falls to nothing.
+    """Size of the network and of its training.
+
+    The budget is about seven minutes of two cores with bfloat16 for 122,880 views.
+
+    Attributes:
+        width: of AlexNet's own numbers of channels, halved to see more images in that time.
+        connected: neurons of each of the two hidden fully connected layers.
+        epochs: times that every image is seen.
+        rate: peak learning rate; it rises to this and falls to nothing (one-cycle schedule).
+        decay: weight decay of AdamW.
     """
 
     width: float = 0.5
@@ -57,7 +65,11 @@ class CnnPlan:
 
 
 def require_torch() -> None:
-    """Raises MissingPackageError where torch is not installed."""
+    """Check that torch is installed.
+
+    Raises:
+        MissingPackageError: it is not.
+    """
     from importlib.util import find_spec
 
     if find_spec("torch") is None:
@@ -67,12 +79,25 @@ def require_torch() -> None:
 
 
 def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
-    """The network for three channels of 224 x 224."""
+    """Build the network for three channels of 224 x 224.
+
+    Args:
+        n_outputs: number of outputs, 3 J.
+        plan: width of the convolutions and of the hidden layers.
+
+    Returns:
+        The untrained network; its convolutions have no bias and are followed by batch
+        normalisation.
+    """
     from torch import nn
 
     def convolution(
         before: int, after: int, size: int, stride: int, padding: int
     ) -> list[nn.Module]:
+        """A convolution from `before` to `after` channels with batch normalisation and ReLU.
+
+        `size`, `stride` and `padding` are its kernel's, in pixels.
+        """
         layer = nn.Conv2d(before, after, size, stride, padding, bias=False)
         return [layer, nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
 
@@ -98,14 +123,14 @@ def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
 
 
 def low_precision() -> torch.autocast:
-    """Within the block, convolutions and products are of bfloat16 numbers."""
+    """A context in which convolutions and products are of bfloat16 numbers."""
     import torch
 
     return torch.autocast("cpu", torch.bfloat16)
 
 
 def torch_layout() -> Any:
-    """Channels last, which a CPU convolves about a third faster."""
+    """The memory format: channels last, which a CPU convolves about a third faster."""
     import torch
 
     return torch.channels_last
@@ -113,7 +138,11 @@ def torch_layout() -> Any:
 
 @contextmanager
 def torch_threads(parallel: bool) -> Iterator[None]:
-    """Within the block torch runs on one thread unless `parallel`."""
+    """A context in which torch runs on one thread unless `parallel`.
+
+    Args:
+        parallel: leave torch its threads.
+    """
     import torch
 
     before = torch.get_num_threads()
@@ -127,39 +156,69 @@ def torch_threads(parallel: bool) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Cnn:
-    """The trained network at work. It says joints, not a pose: nothing holds its bones at their
-    lengths.
+    """The trained network at work.
+
+    It estimates joints, not a pose: nothing holds its bones at their lengths.
+
+    Attributes:
+        skeleton: the animal's skeleton.
+        net: the network.
     """
 
     skeleton: Skeleton
     net: torch.nn.Sequential
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """1: the network knows nothing of size."""
+        """Always 1: the network knows nothing of size.
+
+        Args:
+            sample: not used.
+            scene: not used.
+        """
         return 1.0
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> Guesses:
-        """Joints of frames (n, H, W) mm in the camera frame."""
-        crops, looks = see(depths, scene, parallel)
-        joints = np.full((len(looks), self.skeleton.n_joints, 3), np.nan)
+        """Estimate the joints in each frame.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: not used.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
+        crops, crop_cameras = see(depths, scene, parallel)
+        joints = np.full((len(crop_cameras), self.skeleton.n_joints, 3), np.nan)
         rows = np.flatnonzero(crops.found)
         for start in range(0, len(rows), _BATCH):
             part = rows[start : start + _BATCH]
-            joints[part] = self.joints(crops.heights[part], looks[part], parallel)
+            joints[part] = self.joints(crops.heights[part], crop_cameras[part], parallel)
         return Guesses(joints, crops.found, crops)
 
-    def joints(self, heights: NDArray[np.int16], looks: Array, parallel: bool = True) -> Array:
-        """Joints (n, J, 3) mm in the camera frame of animals whose height maps (n, S, S) were cut
-        by looks (n, 17).
+    def joints(
+        self, heights: NDArray[np.int16], crop_cameras: Array, parallel: bool = True
+    ) -> Array:
+        """Estimate the joints of animals from their height maps.
+
+        Args:
+            heights: (n, S, S) int16 height maps, 1/16 mm, each with at least one pixel of the
+                animal.
+            crop_cameras: (n, 17) packed crop cameras of the height maps.
+            parallel: use all cores rather than one.
+
+        Returns:
+            (n, J, 3) joints, mm, camera frame.
         """
         import torch
 
         with threads(parallel), torch_threads(parallel), torch.no_grad(), low_precision():
-            frames = frames_of(heights, looks)
-            told = self.net.eval()(_channels(patches_of(heights, looks, frames)))
-        return joints_of(told.float().numpy(), looks, frames)
+            frames = frames_of(heights, crop_cameras)
+            told = self.net.eval()(_channels(patches_of(heights, crop_cameras, frames)))
+        return joints_of(told.float().numpy(), crop_cameras, frames)
 
     def to_bytes(self) -> bytes:
         """The weights as the bytes of an .npz without pickle."""
@@ -169,7 +228,16 @@ class Cnn:
 
     @staticmethod
     def load(path: Path, skeleton: Skeleton, plan: CnnPlan) -> Cnn:
-        """The network with the weights in a file of `to_bytes`. Raises ModelError."""
+        """Read the weights of a trained network.
+
+        Args:
+            path: file with the bytes of `to_bytes`.
+            skeleton: the animal's skeleton.
+            plan: the plan that the network was built with.
+
+        Raises:
+            ModelError: the file is damaged, or its weights do not fit the plan.
+        """
         import torch
 
         net = alexnet(3 * skeleton.n_joints, plan)
@@ -187,8 +255,9 @@ class Cnn:
 
 
 def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
-    """Patches (n, 224, 224) of 0-255, as the network wants them: three equal channels, about -1 to
-    1.
+    """Patches (n, 224, 224) of 0-255 as the network's input.
+
+    They become three equal channels of about -1 to 1.
     """
     import torch
 
@@ -199,7 +268,18 @@ def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
 def train_cnn(
     data: TrainingSet, skeleton: Skeleton, plan: CnnPlan, rng: np.random.Generator, tell: Tell
 ) -> Cnn:
-    """Train from scratch with AdamW and one cycle of the step size."""
+    """Train the network from scratch with AdamW and a one-cycle learning rate.
+
+    Args:
+        data: training images with truth; those that show no animal are left out.
+        skeleton: the animal's skeleton.
+        plan: size of the network and of its training.
+        rng: source of the initial weights' seed and of the order of images.
+        tell: called before each step with the share done and what is being trained.
+
+    Raises:
+        MissingPackageError: torch is not installed.
+    """
     import torch
 
     require_torch()
@@ -227,16 +307,16 @@ def train_cnn(
 
 
 def _loss(net: torch.nn.Sequential, data: TrainingSet, rows: NDArray[np.int64]) -> torch.Tensor:
-    """Mean distance of the joints of some images, in half sides of their patches."""
+    """Mean distance of the joints of the images `rows`, in half sides of their patches."""
     import torch
 
     heights = data.images.heights[rows]
-    looks = data.images.looks[rows]
-    frames = frames_of(heights, looks)
+    crop_cameras = data.images.crop_cameras[rows]
+    frames = frames_of(heights, crop_cameras)
     wanted = torch.from_numpy(
-        targets_of(in_camera_frame(data.truth.positions[rows], looks), looks, frames)
+        targets_of(in_camera_frame(data.truth.positions[rows], crop_cameras), crop_cameras, frames)
     )
     with low_precision():
-        told = net(_channels(patches_of(heights, looks, frames)))
+        told = net(_channels(patches_of(heights, crop_cameras, frames)))
     off = (told.float() - wanted).reshape(len(rows), -1, 3)
     return torch.sqrt((off**2).sum(-1) + 1e-8).mean()

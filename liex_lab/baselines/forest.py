@@ -1,27 +1,20 @@
-"""RF, the paper's regression forest: F1 finds the animal and its heading, F2 its pose (Lie-X
-section 5.2).
+"""Two-stage regression forest (F1 position and heading, F2 pose), the paper's RF baseline.
 
-"Two separate regression forests, F1 and F2 [...]. F1 is used to estimate the 3D location and
-in-plane orientation of the subject, followed by F2 which produces a set of 3D pose candidates", 7
-and 12 trees of depth 20, on the depth invariant two-point features of Shotton et al. (2013). The
-rest the paper leaves open, and is chosen here:
+Lie-X section 5.2: "Two separate regression forests, F1 and F2 [...]. F1 is used to estimate the 3D
+location and in-plane orientation of the subject, followed by F2 which produces a set of 3D pose
+candidates", 7 and 12 trees of depth 20, on the depth invariant two-point features of Shotton et al.
+(2013). The rest the paper leaves open, and is chosen here:
 
-- F1 is asked at `n_points` pixels spread over the animal. Each of its leaves votes for the way from
-  the pixel to the
-  base joint and for the heading. The heading that most votes agree on is taken, then the mean-shift
-  mode of the places
-  of those votes that agree with it.
-- F2 is asked once, at the place of F1, its offsets turned by the heading of F1. Each of its trees
-  gives one pose
-  candidate in the skeleton's own coordinates, so bones keep their proportions; the mean-shift mode
-  of the candidates is
-  the answer.
+- F1 is asked at `n_points` pixels spread over the animal. Each of its leaves votes for the offset
+  from the pixel to the base joint and for the heading (Hough voting). The heading that most votes
+  agree on is taken, then the mean-shift mode of the positions of those votes that agree with it.
+- F2 is asked once, at the position of F1, its offsets turned by the heading of F1. Each of its
+  trees gives one pose candidate in the skeleton's own coordinates, so bones keep their proportions;
+  the mean-shift mode of the candidates is the answer.
 - Offsets reach as far as the animal is long. In half of the tests tried the second of the two
-  points is the pixel
-  itself, as in Shotton's own forests.
-- F2 learns from where trees of F1 that have not seen the image put it, and from that only where F1
-  has not taken the
-  tail for the head.
+  points is the pixel itself, as in Shotton's own forests.
+- F2 learns from where trees of F1 that were not grown on the image put it, and from that only where
+  F1 has not taken the tail for the head.
 """
 
 from __future__ import annotations
@@ -35,11 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.baselines import _forest as kernels
-from liex_lab.baselines.baseline import DAMAGE, Guesses, in_camera_frame, see
+from liex_lab.baselines.baseline import DAMAGE, Guesses, see
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
+from liex_lab.foreground.crop_camera import in_camera_frame
 from liex_lab.foreground.height_maps import Foreground
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples
@@ -51,16 +45,21 @@ Array = NDArray[np.float64]
 
 _F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
 _F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
-_LEAST_LEVER = (
-    0.05  # of the animal's length: a turn about its own axis moves no joint of a straight animal
-)
+# of the animal's length: a turn about its own axis moves no joint of a straight animal
+_LEAST_LEVER = 0.05
 
 
 @dataclass(frozen=True)
 class ForestPlan:
-    """How the two forests grow. training_points: pixels of an image that F1 learns from, and
-    n_points that it is asked at; draws: times that F2 sees each image, from other pixels;
-    bandwidths (2) of the modes, of the animal's length.
+    """How the two forests grow and vote.
+
+    Attributes:
+        where: plan of F1.
+        pose: plan of F2.
+        training_points: pixels of an image that F1 learns from.
+        n_points: pixels of an image that F1 is asked at.
+        draws: times that F2 sees each image, from other pixels.
+        bandwidths: (2,) bandwidths of the modes of F1 and F2, of the animal's length.
     """
 
     where: GrowthPlan = _F1
@@ -73,8 +72,14 @@ class ForestPlan:
 
 @dataclass(frozen=True)
 class RegressionForest:
-    """The trained pair. where: F1, leaves (5): way to the base mm, heading; pose: F2, leaves (D):
-    skeleton coordinates in lever units.
+    """The trained pair of forests.
+
+    Attributes:
+        skeleton: the animal's skeleton.
+        plan: how the forests grew and vote.
+        where: F1; leaves (5,): offset to the base joint, mm, and heading (cosine, sine) times half
+            the animal's length.
+        pose: F2; leaves (D,): skeleton coordinates in lever units, see `levers`.
     """
 
     skeleton: Skeleton
@@ -83,21 +88,36 @@ class RegressionForest:
     pose: Forest
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """1: the paper's forests know nothing of size."""
+        """Always 1: the paper's forests know nothing of size.
+
+        Args:
+            sample: not used.
+            scene: not used.
+        """
         return 1.0
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> Guesses:
-        """Joints of frames (n, H, W) mm in the camera frame."""
-        crops, looks = see(depths, scene, parallel)
+        """Estimate the joints in each frame.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: not used.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
+        crops, crop_cameras = see(depths, scene, parallel)
         s = self.skeleton
-        n = len(looks)
+        n = len(crop_cameras)
         joints = np.full((n, s.n_joints, 3), np.nan)
         with threads(parallel):
             kernels.guess_all(
                 crops.heights,
-                looks,
+                crop_cameras,
                 crops.found,
                 self.plan.n_points,
                 s.length,
@@ -115,11 +135,12 @@ class RegressionForest:
                 s.axes,
                 joints,
             )
-        return Guesses(in_camera_frame(joints, looks), crops.found, crops)
+        return Guesses(in_camera_frame(joints, crop_cameras), crops.found, crops)
 
     def to_bytes(self) -> bytes:
-        """The model as the bytes of an .npz without pickle; skeleton and plan are known to who asks
-        for it.
+        """The forests as the bytes of an .npz without pickle.
+
+        Skeleton and plan are not stored; who loads the file knows them.
         """
         arrays: dict[str, Any] = {}
         for name, forest in (("where", self.where), ("pose", self.pose)):
@@ -132,7 +153,16 @@ class RegressionForest:
 
     @staticmethod
     def load(path: Path, skeleton: Skeleton, plan: ForestPlan) -> RegressionForest:
-        """The forests in a file of `to_bytes`. Raises ModelError."""
+        """Read a trained pair of forests.
+
+        Args:
+            path: file with the bytes of `to_bytes`.
+            skeleton: the animal's skeleton.
+            plan: the plan that the forests were trained with.
+
+        Raises:
+            ModelError: the file does not hold two whole forests.
+        """
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 where, pose = (
@@ -147,12 +177,18 @@ class RegressionForest:
 
 
 def levers(skeleton: Skeleton) -> Array:
-    """How far (D,) mm a unit of each coordinate of F2 moves the joints of the home pose, root mean
-    square over joints.
+    """Lever arm of each coordinate of F2: how far a unit of it moves the joints of the home pose.
 
-    Coordinates: the base's rotation about x, y, z (rad), its translation (mm, lever 1), log scale,
-    then the angles about the other joints' free axes in the skeleton's order. One unit of label is
-    then about one millimetre of error.
+    It is the root mean square over all joints, and at least 5 % of the animal's length for
+    rotations. Coordinates are the base's rotation about x, y, z (rad), its translation (mm, lever
+    1), the logarithm of the scale, then the angles about the other joints' free axes in the
+    skeleton's order (rad). One unit of a label is then about one millimetre of error.
+
+    Args:
+        skeleton: the animal's skeleton.
+
+    Returns:
+        (D,) mm.
     """
     rotations, positions = forward_kinematics(
         skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(())
@@ -178,8 +214,17 @@ def levers(skeleton: Skeleton) -> Array:
 def coordinates(
     data: TrainingSet, skeleton: Skeleton, image: NDArray[np.int32], places: Array, headings: Array
 ) -> Array:
-    """True coordinates (n, D) of F2 in lever units, as seen from places (n, 3) and headings (n,) in
-    images (n,).
+    """True coordinates of F2, relative to a position and a heading that F1 estimated.
+
+    Args:
+        data: training images with truth.
+        skeleton: the animal's skeleton.
+        image: (n,) int32 index of each sample's image.
+        places: (n, 3) base positions, mm, view frame.
+        headings: (n,) headings, rad, view frame.
+
+    Returns:
+        (n, D) coordinates in lever units.
     """
     zero = np.zeros_like(headings)
     start = SE3(so3.exp(np.stack([zero, zero, headings], axis=1)), places)
@@ -196,7 +241,15 @@ def coordinates(
 def train_forests(
     data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator, tell: Tell
 ) -> RegressionForest:
-    """Grow F1, then F2 on where F1 puts images that its trees have not seen."""
+    """Grow F1, then F2 on where F1 puts images that its trees were not grown on.
+
+    Args:
+        data: training images with truth; those that show no animal are left out.
+        skeleton: the animal's skeleton.
+        plan: how the forests grow.
+        rng: source of pixels, bags and seeds.
+        tell: called before each forest with the share done and what is being trained.
+    """
     tell(0.0, "F1")
     where, in_bag = _grow_where(data, skeleton, plan, rng)
     tell(0.5, "F2")
@@ -207,7 +260,7 @@ def train_forests(
     unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees have seen it: then all are asked
     kernels.locate_all(
         data.images.heights,
-        data.images.looks,
+        data.images.crop_cameras,
         image,
         rng.random(len(image)),
         plan.n_points,
@@ -230,11 +283,11 @@ def train_forests(
 def _grow_where(
     data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator
 ) -> tuple[Forest, NDArray[np.bool_]]:
-    """F1, and which images each of its trees has seen (T, n_images)."""
+    """Grow F1; also returns which images each of its trees was grown on (T, n_images)."""
     animals = np.flatnonzero(data.animal).astype(np.int32)
     points = np.empty((len(animals), plan.training_points, 3))
     kernels.points_all(
-        data.images.heights, data.images.looks, animals, rng.random(len(animals)), points
+        data.images.heights, data.images.crop_cameras, animals, rng.random(len(animals)), points
     )
     image = np.repeat(animals, plan.training_points)
     places = points.reshape(-1, 3)
@@ -249,10 +302,10 @@ def _grow_where(
 def _samples(
     data: TrainingSet, skeleton: Skeleton, image: NDArray[np.int32], places: Array, headings: Array
 ) -> Samples:
-    """What the forests see from places (n, 3) of images (n,)."""
+    """Features from positions (n, 3) of images (n,), with offsets turned by headings (n,)."""
     n = len(image)
     views = np.empty((n, 1, VIEW), np.float32)
-    kernels.views_all(data.images.looks, image, places, headings, skeleton.length, views)
+    kernels.views_all(data.images.crop_cameras, image, places, headings, skeleton.length, views)
     return Samples(
         data.images.heights, image, np.ones(n, np.float32), views, np.zeros((n, 1), np.float32)
     )

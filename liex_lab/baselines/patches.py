@@ -1,12 +1,12 @@
-"""What the CNN sees and says: 224 x 224 patches of depth, and joints relative to them. NumPy and
-numba alone.
+"""Input and output of the CNN baseline: 224 x 224 depth patches, and joints relative to them.
 
-A patch is the square around the animal's bounding box, a tenth larger. Depth is scaled to 0-255 by
-the same factor as the picture: 127.5 is the animal's mean depth, and half the square's side in mm
-goes to 0 or 255, so the animal keeps its proportions (the paper says only "rescaled to be in the
-range of 0 to 255"). Nearer is brighter; what is not the animal is 0. Joints are told in the same
-unit: (right, down, nearer) from the square's centre at the animal's mean depth, in half sides of
-the square.
+Lie-X section 5.2 crops the bounding box, scales depth to 0-255 and resizes to 224 x 224. Here a
+patch is the square around the animal's bounding box, a tenth larger. Depth is scaled by the same
+factor as the picture: 127.5 is the animal's mean depth, and half the square's side in mm goes to 0
+or 255, so the animal keeps its proportions (the paper says only "rescaled to be in the range of 0
+to 255"). Nearer is brighter; what is not the animal is 0. Joints are stated in the same unit:
+(right, down, nearer) from the square's centre at the animal's mean depth, in half sides of the
+square. NumPy and numba alone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from liex_lab.foreground._crop_camera_kernels import crop_camera
+
 Array = NDArray[np.float64]
 
 PATCH = 224
@@ -22,39 +24,74 @@ _MARGIN = 1.1
 _MM = 16.0  # heights are sixteenths
 
 
-def frames_of(heights: NDArray[np.int16], looks: Array) -> Array:
-    """Where each animal (n) is: picture pixel (u, v) of its square's centre, half the side in
-    pixels, the animal's mean depth mm, and half the side in mm there; (n, 5). heights (n, S, S)
-    with at least one pixel, looks (n, 17).
+def frames_of(heights: NDArray[np.int16], crop_cameras: Array) -> Array:
+    """Squares around the animals, from which patches are resampled.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, each with at least one pixel of the animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+
+    Returns:
+        (n, 5): picture pixel (u, v) of the square's centre, half the side in picture pixels, the
+        animal's mean depth, mm, and half the side in mm at that depth.
     """
-    frames = np.empty((len(looks), 5))
-    _frames_all(heights, looks, frames)
+    frames = np.empty((len(crop_cameras), 5))
+    _frames_all(heights, crop_cameras, frames)
     return frames
 
 
-def patches_of(heights: NDArray[np.int16], looks: Array, frames: Array) -> NDArray[np.float32]:
-    """The patches (n, PATCH, PATCH), 0 to 255."""
-    patches = np.empty((len(looks), PATCH, PATCH), np.float32)
-    _patches_all(heights, looks, frames, patches)
+def patches_of(
+    heights: NDArray[np.int16], crop_cameras: Array, frames: Array
+) -> NDArray[np.float32]:
+    """Resample patches from height maps, bilinearly.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        frames: (n, 5) squares from `frames_of`.
+
+    Returns:
+        (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 beside the animal.
+    """
+    patches = np.empty((len(crop_cameras), PATCH, PATCH), np.float32)
+    _patches_all(heights, crop_cameras, frames, patches)
     return patches
 
 
-def targets_of(joints_camera: Array, looks: Array, frames: Array) -> NDArray[np.float32]:
-    """What the CNN should say (n, 3 J) of joints (n, J, 3) mm in the camera frame."""
+def targets_of(joints_camera: Array, crop_cameras: Array, frames: Array) -> NDArray[np.float32]:
+    """Training targets of the CNN from true joints.
+
+    Args:
+        joints_camera: (n, J, 3) joints, mm, camera frame.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        frames: (n, 5) squares from `frames_of`.
+
+    Returns:
+        (n, 3 J) float32 (right, down, nearer) of each joint, in half sides of its square.
+    """
     x, y, z = np.moveaxis(joints_camera, -1, 0)
     u0, v0, half_px, depth, half_mm = frames.T[:, :, None]
-    fx, fy, cx, cy = looks.T[:4, :, None]
+    fx, fy, cx, cy = crop_cameras.T[:4, :, None]
     right = (fx * x / z + cx - u0) / half_px
     down = (fy * y / z + cy - v0) / half_px
     told = np.stack([right, down, (depth - z) / half_mm], axis=-1)
-    return told.reshape(len(looks), -1).astype(np.float32)
+    return told.reshape(len(crop_cameras), -1).astype(np.float32)
 
 
-def joints_of(told: NDArray[np.float32], looks: Array, frames: Array) -> Array:
-    """The inverse of `targets_of`."""
-    right, down, nearer = np.moveaxis(told.astype(float).reshape(len(looks), -1, 3), -1, 0)
+def joints_of(told: NDArray[np.float32], crop_cameras: Array, frames: Array) -> Array:
+    """Joints from outputs of the CNN; the inverse of `targets_of`.
+
+    Args:
+        told: (n, 3 J) float32 outputs.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        frames: (n, 5) squares from `frames_of`.
+
+    Returns:
+        (n, J, 3) joints, mm, camera frame.
+    """
+    right, down, nearer = np.moveaxis(told.astype(float).reshape(len(crop_cameras), -1, 3), -1, 0)
     u0, v0, half_px, depth, half_mm = frames.T[:, :, None]
-    fx, fy, cx, cy = looks.T[:4, :, None]
+    fx, fy, cx, cy = crop_cameras.T[:4, :, None]
     z = depth - nearer * half_mm
     return np.stack(
         [(u0 + right * half_px - cx) / fx * z, (v0 + down * half_px - cy) / fy * z, z], axis=-1
@@ -62,8 +99,9 @@ def joints_of(told: NDArray[np.float32], looks: Array, frames: Array) -> Array:
 
 
 @njit(cache=True, parallel=True)
-def _frames_all(heights, looks, frames):
-    for k in prange(len(looks)):
+def _frames_all(heights, crop_cameras, frames):
+    for k in prange(len(crop_cameras)):
+        camera = crop_camera(crop_cameras[k])
         low = np.full(2, 1 << 30)
         high = np.full(2, -1)
         total = 0.0
@@ -77,18 +115,16 @@ def _frames_all(heights, looks, frames):
                     total = total + h
                     n = n + 1
         side = max(high[0] - low[0], high[1] - low[1]) + 1
-        frames[k, 0] = looks[k, 14] + looks[k, 16] * (low[0] + high[0]) / 2
-        frames[k, 1] = looks[k, 15] + looks[k, 16] * (low[1] + high[1]) / 2
-        frames[k, 2] = 0.5 * _MARGIN * side * looks[k, 16]
-        frames[k, 3] = looks[k, 13] - total / max(n, 1) / _MM
-        frames[k, 4] = frames[k, 2] * frames[k, 3] / np.sqrt(looks[k, 0] * looks[k, 1])
+        frames[k, 0] = camera.u0 + camera.step * (low[0] + high[0]) / 2
+        frames[k, 1] = camera.v0 + camera.step * (low[1] + high[1]) / 2
+        frames[k, 2] = 0.5 * _MARGIN * side * camera.step
+        frames[k, 3] = camera.distance - total / max(n, 1) / _MM
+        frames[k, 4] = frames[k, 2] * frames[k, 3] / np.sqrt(camera.fx * camera.fy)
 
 
 @njit(cache=True)
 def _shade(heights, row, column, level, per_mm):
-    """The brightness of one height map pixel; `level` is the animal's mean height, sixteenths of a
-    mm.
-    """
+    """Brightness of one pixel of a height map; `level` is the animal's mean height, 1/16 mm."""
     if (
         not (0 <= row < heights.shape[0] and 0 <= column < heights.shape[1])
         or heights[row, column] <= 0
@@ -98,12 +134,13 @@ def _shade(heights, row, column, level, per_mm):
 
 
 @njit(cache=True, parallel=True)
-def _patches_all(heights, looks, frames, patches):
-    for k in prange(len(looks)):
-        scale = 2.0 * frames[k, 2] / looks[k, 16] / PATCH  # height map pixels a patch pixel
-        left = (frames[k, 0] - frames[k, 2] - looks[k, 14]) / looks[k, 16]
-        top = (frames[k, 1] - frames[k, 2] - looks[k, 15]) / looks[k, 16]
-        level = (looks[k, 13] - frames[k, 3]) * _MM
+def _patches_all(heights, crop_cameras, frames, patches):
+    for k in prange(len(crop_cameras)):
+        camera = crop_camera(crop_cameras[k])
+        scale = 2.0 * frames[k, 2] / camera.step / PATCH  # height map pixels a patch pixel
+        left = (frames[k, 0] - frames[k, 2] - camera.u0) / camera.step
+        top = (frames[k, 1] - frames[k, 2] - camera.v0) / camera.step
+        level = (camera.distance - frames[k, 3]) * _MM
         per_mm = 1.0 / frames[k, 4]
         for i in range(PATCH):
             y = top + (i + 0.5) * scale

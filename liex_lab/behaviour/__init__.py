@@ -1,5 +1,6 @@
-"""What the animal did: measures per frame, bouts, places and sums, and groups compared. Pandas in,
-pandas out.
+"""Behaviour of one animal: kinematics, bouts, zones and summary; statistics of groups of animals.
+
+Pandas in, pandas out.
 """
 
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts

@@ -1,4 +1,8 @@
-"""How activity goes up and down over a session: one row per minute."""
+"""Activity over a session in bins of one minute: distance, mean speed and time in each action.
+
+Time-binned activity as in open-field and locomotor assays; a recording of less than ten minutes is
+cut into ten bins.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,17 @@ FEWEST = 10  # intervals; a shorter recording is cut into so many
 
 
 def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
-    """The table `activity` of one animal."""
+    """The table `activity` of one animal: one row per bin of time.
+
+    Args:
+        kinematics: the table `kinematics`.
+        bouts: the table `bouts`, in order of time.
+        words: the actions' names.
+
+    Returns:
+        The columns of `activity_columns`; a frame counts in the bin in which it begins, a bout in
+        every bin it overlaps.
+    """
     time_s = kinematics["time_s"].to_numpy(float)
     hold = stop_times(time_s) - time_s
     edges = intervals(float(time_s[-1] + hold[-1]))
@@ -30,6 +44,7 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
     n = len(edges) - 1
 
     def total(values: Array, mask: NDArray[np.bool_]) -> Array:
+        """Sum of `values` (n,) over the frames of `mask` (n,) in each bin, (k,)."""
         return np.bincount(row[mask], values[mask], n).astype(float)
 
     distance = total(step, moved)
@@ -55,8 +70,12 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
 
 
 def intervals(duration_s: float) -> Array:
-    """Edges (k + 1,) s of whole minutes, the last one perhaps shorter, or of a tenth of less than
-    ten minutes.
+    """Edges (k + 1,) of the bins, s: whole minutes, the last one perhaps shorter.
+
+    Less than ten minutes are cut into tenths.
+
+    Args:
+        duration_s: length of the recording, s.
     """
     if duration_s < FEWEST * BIN_S:
         return np.linspace(0.0, duration_s, FEWEST + 1)
@@ -64,8 +83,12 @@ def intervals(duration_s: float) -> Array:
 
 
 def time_within(start_s: Array, stop_s: Array, edges: Array) -> Array:
-    """(k,) s of spans (n,), which do not overlap and are in order, within each interval between
-    edges (k + 1,).
+    """(k,) time of spans within each of k intervals, s.
+
+    Args:
+        start_s: (n,) beginnings of the spans, s, in order; spans do not overlap.
+        stop_s: (n,) their ends, s.
+        edges: (k + 1,) edges of the intervals, s.
     """
     if len(start_s) == 0:
         return np.zeros(len(edges) - 1)

@@ -1,4 +1,4 @@
-"""A measure around the onsets of an action: what happens before, at and after it."""
+"""Peri-event average: median and quartiles of a measure around the onsets of an action."""
 
 from __future__ import annotations
 
@@ -20,8 +20,14 @@ _FEWEST = 5  # bouts; of fewer no quartiles are told
 
 @dataclass(frozen=True)
 class Around:
-    """Times (k,) s relative to the onset; median and quartiles (k,) over the bouts; how many bouts
-    they are.
+    """A measure around the onsets of an action, at k times.
+
+    Attributes:
+        time_s: (k,) time relative to the onset, s.
+        low: (k,) lower quartile over the bouts, in the measure's own unit.
+        median: (k,) median over the bouts.
+        high: (k,) upper quartile over the bouts.
+        n: number of bouts.
     """
 
     time_s: Array
@@ -34,11 +40,19 @@ class Around:
 def around_onsets(
     kinematics: pd.DataFrame, bouts: pd.DataFrame, action: str, column: str
 ) -> Around | None:
-    """`column` of the table `kinematics` around every onset of `action`; None where there are too
-    few bouts.
+    """Peri-event median and quartiles of a column around every onset of an action.
 
-    Values are interpolated between the frames' true times, never across a gap; where a bout has no
-    value it does not count.
+    Values are interpolated linearly between the frames' true times, never across a gap; where a
+    bout has no value it does not count, and a time with fewer than five values is NaN.
+
+    Args:
+        kinematics: the table `kinematics`.
+        bouts: the table `bouts`.
+        action: the action whose onsets are taken.
+        column: the column of `kinematics`.
+
+    Returns:
+        From `BEFORE_S` before to `AFTER_S` after the onset; None where there are too few bouts.
     """
     own = bouts.loc[bouts["action"] == action, "start_s"].to_numpy(float)
     if len(own) < _FEWEST:

@@ -1,6 +1,4 @@
-"""Which joints play which part in an animal's chain: front, rear, the axis that gives its
-heading.
-"""
+"""Roles of the joints in an animal's skeleton: front, rear, midline, heading axis and trunk."""
 
 from __future__ import annotations
 
@@ -10,12 +8,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Body:
-    """An animal's joints by the parts they play, as places in its skeleton.
+    """An animal's joints by the parts they play, as indices into its skeleton.
 
-    swims: the chain begins at the head, as a fish's does, and the animal moves in all three
-    directions. spine: the chain from front to rear. axis: (from, to), the line whose direction is
-    the heading. trunk: the joints whose mean is the body's centre. back: those between front and
-    rear.
+    Attributes:
+        joints: names of the J joints.
+        swims: whether the chain begins at the head, as a fish's does, and the animal moves in all
+            three directions.
+        spine: the chain from front to rear.
+        axis: (from, to), the line whose direction is the heading.
+        trunk: the joints whose mean is the body's centre.
     """
 
     joints: tuple[str, ...]
@@ -26,27 +27,31 @@ class Body:
 
     @property
     def front(self) -> int:
-        """The nose, or the head."""
+        """The nose, or the head, as an index."""
         return self.spine[0]
 
     @property
     def rear(self) -> int:
-        """The tail's base, or its tip."""
+        """The tail's base, or its tip, as an index."""
         return self.spine[-1]
 
     @property
     def back(self) -> tuple[int, ...]:
-        """The joints between front and rear."""
+        """The joints between front and rear, as indices."""
         return self.spine[1:-1] or self.spine[:1]
 
     @staticmethod
     def of(joints: Sequence[str]) -> Body:
-        """The parts by name or along the chain: one that begins at a head swims; any other begins
-        at the rump.
+        """The parts by name or along the chain, which begins at the head or at the rump.
+
+        A chain that begins at a head is that of an animal that swims; any other begins at the rump.
 
         A swimming body's heading is that of the front quarter of its chain, which is stiff, and its
         centre that of the front half, which the tail's beat hardly moves; a walking body's are rump
         to neck, and all but the nose.
+
+        Args:
+            joints: names of the joints in the skeleton's order.
         """
         names = tuple(joints)
         n = len(joints)

@@ -1,9 +1,10 @@
-"""Named stretches of behaviour by rule: rear, run, walk, pause. A thin first ethogram for the
-mouse.
+"""Rule-based ethogram of a mouse (rear, run, walk, pause) by double thresholds on speed and height.
 
-One label per frame, half-open bouts, never across a gap. For every action: hysteresis, then
-interruptions shorter than `merge_pauses_s` are bridged, then bouts shorter than `min_bout_s` are
-dropped; where two actions claim a frame the first of `ACTIONS` has it.
+One label per frame, half-open bouts, never across a gap; a thin first ethogram. For every action:
+hysteresis (two thresholds, enter and leave), then interruptions shorter than `merge_pauses_s` are
+bridged, then bouts shorter than `min_bout_s` are dropped; where two actions claim a frame the first
+of `ACTIONS` has it. Starting values of the thresholds: Live Mouse Tracker (de Chaumont et al.
+2019).
 """
 
 from __future__ import annotations
@@ -28,12 +29,25 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MouseRules:
-    """Thresholds of the first ethogram, by the names they have in a plan:
-    `MouseRules(**plan.behaviour.model_dump())`.
+    """Thresholds of the first ethogram, by the names they have in a plan.
 
-    Starting values: Live Mouse Tracker's. Its 40 mm of rearing belong to an adult of some 90 mm; a
-    smaller animal rears from 0.6 of its own length on. A bout of rearing reaches to where the nose
-    is below two thirds of that height.
+    `MouseRules(**plan.behaviour.model_dump())` makes them from one. Starting values are Live Mouse
+    Tracker's. Its 40 mm of rearing belong to an adult of some 90 mm; a smaller animal rears from
+    0.6 of its own length on. A bout of rearing reaches to where the nose is below two thirds of
+    that height.
+
+    Attributes:
+        speed_half_window_s: speed at t is taken between frames this far before and after it, s.
+        pause_below_mm_s: slower than this is a pause, mm/s.
+        run_above_mm_s: faster than this is a run, mm/s.
+        impossible_above_mm_s: faster than this is a tracking error, mm/s.
+        rear_height_mm: nose above the tail's base that makes an adult rear, mm.
+        rear_height_bl: the same for a smaller animal, in body lengths.
+        rear_leave: rearing lasts down to this share of its height.
+        speed_hysteresis: a threshold is crossed upwards this share above it, downwards as much
+            below.
+        merge_pauses_s: shorter interruptions of a bout are bridged, s.
+        min_bout_s: shorter bouts are dropped, s.
     """
 
     speed_half_window_s: float = 0.034
@@ -43,20 +57,21 @@ class MouseRules:
     rear_height_mm: float = 40.0
     rear_height_bl: float = 0.6
     rear_leave: float = 2.0 / 3.0
-    speed_hysteresis: float = (
-        0.1  # a threshold is crossed upwards 10 % above it, downwards 10 % below
-    )
+    # a threshold is crossed upwards 10 % above it, downwards 10 % below
+    speed_hysteresis: float = 0.1
     merge_pauses_s: float = 0.33
     min_bout_s: float = 0.23
 
     def rear_mm(self, spine_mm: float) -> float:
-        """How much higher than the tail's base the nose of an animal of this length is when it
-        rears.
+        """Height of the nose above the tail's base, mm, from which on an animal rears.
+
+        Args:
+            spine_mm: length of the animal's spine, mm.
         """
         return min(self.rear_height_mm, self.rear_height_bl * spine_mm)
 
     def definitions(self) -> dict[str, str]:
-        """What each word of `ACTIONS` means with these numbers."""
+        """What each word of `ACTIONS` means with these numbers, as sentences for a reader."""
         walk = f"{self.pause_below_mm_s:g} mm/s"
         run = f"{self.run_above_mm_s:g} mm/s"
         return {
@@ -75,7 +90,17 @@ class MouseRules:
 def find_bouts(
     frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None
 ) -> pd.DataFrame:
-    """The table `bouts` of one animal from its tables `frames` and `kinematics`."""
+    """The table `bouts` of one animal by rule, with the measures of each bout.
+
+    Args:
+        frames: the table `frames`; spine_mm is read.
+        kinematics: the table `kinematics` of the same frames.
+        rules: the thresholds; None takes the defaults.
+
+    Returns:
+        One row per bout in order of time, source "rule"; the score is the share of its frames that
+        satisfy the rule themselves.
+    """
     rules = rules or MouseRules()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
@@ -98,8 +123,14 @@ def find_bouts(
 def raw_labels(
     kinematics: pd.DataFrame, spine_mm: float, number: NDArray[np.int64], rules: MouseRules
 ) -> dict[str, Mask]:
-    """(n,) per action: the frames that satisfy its rule, with hysteresis inside each unbroken
-    stretch.
+    """Per action (n,) bool: the frames that satisfy its rule, with hysteresis in every stretch.
+
+    Args:
+        kinematics: the table `kinematics`; without nose_over_rump_mm (a swimming animal) nothing
+            rears.
+        spine_mm: length of the animal's spine, mm.
+        number: (n,) unbroken stretch of each frame, see `segments`.
+        rules: the thresholds.
     """
     speed = kinematics["speed_mm_s"].to_numpy(float)
     slope = (
@@ -122,11 +153,17 @@ def raw_labels(
 
 
 def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int64]) -> Mask:
-    """(n,) True from where `values` reach `enter` until they fall below `leave`, afresh in every
-    stretch `number`.
+    """(n,) bool: the runs above `leave` that reach `enter`, afresh in every stretch.
 
-    Rising belongs to it: the frames between `leave` and `enter` just before the threshold is
-    reached count as well.
+    It is True until the values fall below `leave`. Rising belongs to it: the frames between `leave`
+    and `enter` just before the threshold is reached count as well (as in Canny's edge detector, not
+    as in a causal Schmitt trigger).
+
+    Args:
+        values: (n,) the measure; NaN is below every threshold.
+        enter: upper threshold, in the unit of `values`.
+        leave: lower threshold, in the unit of `values`.
+        number: (n,) unbroken stretch of each frame, see `segments`.
     """
     high = values >= enter
     inside = values >= leave
@@ -147,8 +184,20 @@ def tidy(
     stop_s: Array,
     rules: MouseRules,
 ) -> Iterator[tuple[int, int]]:
-    """Bouts (start, stop) of a rule's frames: short pauses bridged over free frames, then short
-    bouts dropped.
+    """Yield the bouts (start, stop) of a mask: short pauses bridged, then short bouts dropped.
+
+    Pauses are bridged over free frames of one stretch only.
+
+    Args:
+        mask: (n,) bool, the frames that satisfy the rule.
+        free: (n,) bool, the frames that no action claimed before.
+        number: (n,) unbroken stretch of each frame, see `segments`.
+        time_s: (n,) times of the frames, s.
+        stop_s: (n,) when each frame's validity ends, s, see `stop_times`.
+        rules: `merge_pauses_s` and `min_bout_s` are used.
+
+    Yields:
+        Rows [start, stop) of each bout, in order of time.
     """
     merged: list[tuple[int, int]] = []
     for start, stop, which in stretches(np.where(mask, number, -1)):
@@ -173,7 +222,7 @@ def _table(
     number: NDArray[np.int64],
     stop_s: Array,
 ) -> pd.DataFrame:
-    """One row per run of equal labels inside one stretch."""
+    """The table `bouts`: one row per run of equal labels inside one stretch."""
     time_s = kinematics["time_s"].to_numpy(float)
     count = frame_count(kinematics["frame_index"].to_numpy())
     code = {action: k for k, action in enumerate(ACTIONS)}

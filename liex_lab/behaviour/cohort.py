@@ -1,8 +1,10 @@
-"""Groups compared: from one row per session to one row per measure and contrast, with n at every
-level.
+"""Comparison of groups of animals: Hedges' g, permutation test or mixed model, Benjamini-Hochberg.
 
-Every measure that was asked for is in the table, significant or not, tested or refused. The false
-discovery rate is that of the whole table.
+From one row per session to one row per measure and contrast, with n at every level. The units come
+from `design` (no pseudoreplication), tests, t intervals and Hedges' g from `statistics`, and the p
+values of the whole table are corrected by Benjamini and Hochberg's procedure (`multiplicity`).
+Every measure that was asked for is in the table, significant or not, tested or refused. `liex
+compare` and the dashboard's page of groups show it.
 """
 
 from __future__ import annotations
@@ -96,8 +98,14 @@ STATS: tuple[Column, ...] = columns(
 
 
 def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
-    """One row per session and animal: who it is (the table `sessions`), its summary, its number of
-    bouts.
+    """One row per session and animal: who it is, its summary, and its number of bouts.
+
+    Args:
+        sessions: opened sessions that hold a summary.
+
+    Returns:
+        Columns of the tables `sessions` and `summary`, and n_bouts; columns that both have carry
+        `_summary` in the second.
     """
     rows = []
     for session in sessions:
@@ -112,8 +120,13 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
-    """What is compared when nobody says: the usual ones that have values, and every
-    action's share.
+    """Measures compared when none is named: the usual ones with values, every action's share.
+
+    Args:
+        table: one row per session, see `collect`.
+
+    Returns:
+        Names of columns of `table` with at least one value.
     """
     shares = [
         str(name)
@@ -135,12 +148,24 @@ def compare(
     family: str = "all measures and contrasts",
     seed: int = 0,
 ) -> pd.DataFrame:
-    """The table `stats` from one row per session (see `collect`): every measure, every pair of
-    groups.
+    """The table `stats`: every measure and pair of groups with effect size, interval, p and n.
 
-    reference: compare each group with this one only. engine: permutation, mixed, or auto, which
-    takes the mixed model where something is nested, there are `FEWEST_FOR_MODEL` units in each
-    group and its variance is not zero. blocks: columns within which animals are exchanged.
+    Args:
+        table: one row per session, see `collect`; missing columns of `WHO` count as unknown.
+        measures: columns of `table` to compare; one that is missing is refused in its row.
+        reference: compare each group with this one only; None takes every pair of groups.
+        engine: permutation, mixed, or auto, which takes the mixed model where something is nested,
+            there are `FEWEST_FOR_MODEL` units in each group and its variance is not zero. Where no
+            model can be fitted, mixed permutes, too.
+        blocks: columns within which animals are exchanged.
+        alpha: a permutation test that cannot reach this level is refused.
+        family: name of the family of tests, written into the table.
+        seed: of the random arrangements; each row has its own stream.
+
+    Returns:
+        One row per measure and contrast with the columns `STATS`; p_fdr is corrected over all tests
+        of the table (Benjamini-Hochberg). Where a mixed model was fitted, estimate, interval
+        and effect size are the model's, else those of `estimate`.
     """
     table = _prepared(table, blocks)
     groups = sorted(set(table["group"]) - {""})
@@ -187,7 +212,7 @@ def _compare_one(
     alpha: float,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """One row of the table."""
+    """One row of the table `stats`."""
     own = table[table["group"].isin(groups)]
     rows = own[np.isfinite(own["value"])]
     cages = set(rows["cage"]) - {""}
@@ -246,7 +271,7 @@ def _described(units: Units) -> dict[str, Any]:
 
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
-    """The difference, and the same in standard deviations between animals."""
+    """The difference with its interval, and both as Hedges' g."""
     second = (rows["group"] == groups[1]).to_numpy()
     animal = (
         pd.factorize(rows["subject_id"])[0] * 2 + second
@@ -271,7 +296,7 @@ def _tested(
     alpha: float,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """The p and the test's name. Raises NotComparable where the permutation cannot reach alpha."""
+    """The p and the test's name; raises NotComparable where p cannot reach alpha."""
     enough = min(int((~units.second).sum()), int(units.second.sum())) >= FEWEST_FOR_MODEL
     if engine == "mixed" or (engine == "auto" and enough):
         model = mixed_model(rows, units, groups)
@@ -291,7 +316,15 @@ def _tested(
 
 
 def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
-    """A sentence or three for a methods section, from the table `stats`."""
+    """Text for a methods section: units, tests, intervals, and how p was corrected.
+
+    Args:
+        stats: the table `stats`, see `compare`.
+        alpha: the level of significance that the text names.
+
+    Returns:
+        One paragraph; empty for an empty table.
+    """
     done = stats[stats["test"] != ""]
     refused = stats[stats["refused"] != ""]
     if len(stats) == 0:

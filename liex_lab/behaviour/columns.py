@@ -1,5 +1,8 @@
-"""The columns per frame and per bout: unit, meaning, formula, source, listed once. Writers and
-readers share them.
+"""Data dictionary of the tables `kinematics` and `bouts`.
+
+Unit, meaning, formula and source of every column, listed once; writers, readers, columns.json and
+the report share the list. Rules after Live Mouse Tracker (de Chaumont et al. 2019) and ZebraZoom
+(Mirat et al. 2013) are marked as such.
 """
 
 from __future__ import annotations
@@ -453,17 +456,30 @@ SWIMMING_BOUTS = tuple(
 
 
 def kinematics_columns(swims: bool) -> tuple[Column, ...]:
-    """The columns of the table `kinematics`."""
+    """The columns of the table `kinematics`.
+
+    Args:
+        swims: of an animal that swims, else of one that walks.
+    """
     return (*KINEMATICS, *(SWIMMING if swims else WALKING))
 
 
 def bout_columns(swims: bool) -> tuple[Column, ...]:
-    """The measures that the table `bouts` has beside who, when and what."""
+    """The measures that the table `bouts` has beside who, when and what.
+
+    Args:
+        swims: of an animal that swims, else of one that walks.
+    """
     return (*BOUT_MEASURES, *(SWIMMING_BOUTS if swims else WALKING_BOUTS))
 
 
 def trusted(columns_of: tuple[Column, ...], fps: float) -> frozenset[str]:
-    """The columns that a camera of this rate can measure; the others stay empty."""
+    """Names of the columns that a camera of this rate can measure; the others stay empty.
+
+    Args:
+        columns_of: the columns to choose from.
+        fps: frame rate of the camera, frames/s.
+    """
     return frozenset(
         c.name
         for c in columns_of

@@ -1,10 +1,11 @@
-"""How animals came to their groups, read from who is where; and whether that allows a comparison at
-all.
+"""Units of analysis of a two-group design (cage, animal or paired), against pseudoreplication.
 
-What was assigned to a group is what a test may shuffle: whole cages where every cage is of one
-group, animals within their cage where a cage holds both groups, animals where nothing is known of
-cages, and the two halves of an animal's own sessions where every animal was in both groups.
-Sessions and bouts are never units.
+What was assigned to a group is what a test may exchange (Hurlbert 1984; restricted permutation):
+whole cages where every cage is of one group, animals within their cage where a cage holds both
+groups, animals where nothing is known of cages, and an animal's own difference where every animal
+was in both groups. Sessions and bouts are never units: they are averaged per animal. How the
+animals came to their groups is read from who is where; `NotComparable` says where that allows no
+comparison.
 """
 
 from __future__ import annotations
@@ -26,12 +27,15 @@ class NotComparable(Exception):
 
 @dataclass(frozen=True)
 class Units:
-    """The units of one comparison: values (n,), whether each is of the second group (n,), its block
-    (n,).
+    """The n units of one comparison of two groups.
 
-    unit: cage, animal, or animal's own difference (values are then second minus first, `second` is
-    all True). parent (n,): for units that are animals within cages, their cage. n_animals (n,):
-    animals that each value stands for.
+    Attributes:
+        unit: what a unit is: cage, animal, or an animal's own difference (`PAIRED`).
+        values: (n,) value of each unit, in the measure's own unit; second group minus first where
+            paired.
+        second: (n,) whether the unit is of the second group; all True where paired.
+        block: (n,) number of the block within which the unit may be exchanged.
+        n_animals: (n,) animals that each value stands for.
     """
 
     unit: str
@@ -54,10 +58,23 @@ PAIRED = "animal, in both groups"
 def find_units(
     rows: pd.DataFrame, groups: tuple[str, str], blocks: Sequence[str] = ("batch",)
 ) -> Units:
-    """The units of a comparison of two groups from one row per session.
+    """The units of a comparison of two groups, from one row per session.
 
-    rows: subject_id, group, cage, value and the columns named in `blocks`; an empty cage or block
-    is not known. Raises NotComparable.
+    Sessions are averaged per animal. Animals in both groups give paired differences; cages of one
+    group each become the units; where a cage holds both groups it is a block, as are the known
+    columns of `blocks`.
+
+    Args:
+        rows: one row per session: subject_id, group, cage, value, and the columns named in
+            `blocks`; an empty cage or block is not known. Rows of other groups or without a value
+            are left out.
+        groups: names of the first and the second group.
+        blocks: columns within which animals are exchanged; those unknown or constant are ignored.
+
+    Raises:
+        NotComparable: sessions do not name their animal, only some animals were in both groups, a
+            group has fewer than two animals, cages are known for some only, an animal or cage is in
+            more than one block, or group and block cannot be told apart.
     """
     rows = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
     nameless = int((rows["subject_id"] == "").sum())
@@ -94,7 +111,7 @@ def find_units(
 
 
 def _animals(rows: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
-    """One row per animal, its value the mean of its sessions'."""
+    """One row per animal, its value the mean of its sessions' values."""
     animal, names = pd.factorize(rows["subject_id"], sort=True)
     first = np.unique(animal, return_index=True)[1]
     columns: dict[str, Any] = {
@@ -110,7 +127,12 @@ def _animals(rows: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
 
 
 def animal_means(values: Array, animal: NDArray[np.int64]) -> Array:
-    """(k,) the mean of the values (n,) of each animal, numbered from 0."""
+    """(k,) mean of the values of each animal.
+
+    Args:
+        values: (n,) one value per session.
+        animal: (n,) number of each session's animal, 0 to k - 1.
+    """
     return np.bincount(animal, values) / np.bincount(animal)
 
 
@@ -131,7 +153,7 @@ def _holds_both(cage: NDArray[np.str_], second: NDArray[np.bool_]) -> bool:
 def _blocks(
     animals: pd.DataFrame, names: Sequence[str], second: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """(n,) the block of each animal: what it may be exchanged within.
+    """(n,) number of the block of each animal: what it may be exchanged within.
 
     A block of one group is no use; if all are so, group and block cannot be told apart, and the
     comparison is refused.
@@ -159,7 +181,7 @@ def _blocks(
 def _whole_cages(
     animals: pd.DataFrame, second: NDArray[np.bool_], block: NDArray[np.int64]
 ) -> Units:
-    """One value per cage, the mean of its animals'."""
+    """One value per cage, the mean of its animals' values."""
     table = animals.assign(second=second, block=block)
     cages = table.groupby("cage", sort=True).agg(
         value=("value", "mean"),
@@ -180,9 +202,7 @@ def _whole_cages(
 
 
 def _own_differences(rows: pd.DataFrame, groups: tuple[str, str]) -> Units:
-    """One value per animal: the mean of its sessions in the second group minus that of those in the
-    first.
-    """
+    """One value per animal: its mean in the second group minus its mean in the first."""
     means = rows.groupby(["subject_id", "group"])["value"].mean().unstack("group")
     values = (means[groups[1]] - means[groups[0]]).to_numpy(float)
     if len(values) < 2:

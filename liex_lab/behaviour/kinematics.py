@@ -1,10 +1,12 @@
-"""What a body does from frame to frame: speed, heading, turning, heights, curvature. Pandas in,
-pandas out.
+"""Kinematics per frame: central differences over true times, with propagated standard deviations.
 
-Every derivative is taken over the frames' true times and never across a gap, and carries the
-standard deviation that follows from the joints' own. Errors of the joints of one frame are taken as
-one common error (the body is off as a whole), those of the two ends of a line as independent, and
-an error as lasting for `ERROR_LASTS_S`.
+Rate of v at t: (v(t + h) - v(t - h)) / true time between the two frames, h about `HALF_WINDOW_S`,
+never across a gap, one-sided at the ends of an unbroken stretch; speed, acceleration, yaw rate. Its
+standard deviation is sqrt(s1^2 + s2^2 - 2 r s1 s2) / span with r = exp(-span / `ERROR_LASTS_S`),
+the autocorrelation of an Ornstein-Uhlenbeck process: the nearer two frames, the more their errors
+agree. Errors of the joints of one frame are taken as one common error (the body is off as a whole),
+those of the two ends of a line as independent. Heading, pitch, length, bend and heights come from
+`posture`, the tail's beat from `tail`. Pandas in, pandas out.
 """
 
 from __future__ import annotations
@@ -29,9 +31,8 @@ from liex_lab.tracking.track import Track
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-HALF_WINDOW_S = (
-    0.034  # speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
-)
+# speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
+HALF_WINDOW_S = 0.034
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
 ERROR_LASTS_S = 0.3
@@ -66,8 +67,15 @@ STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direct
 
 @dataclass(frozen=True)
 class Spans:
-    """Which frames a derivative at each of some frames `rows` (m) is taken between, and the time
-    from one to the other, s. What it is taken of are always the values of all frames (n).
+    """Which frames the derivative at each of m frames is taken between.
+
+    What it is taken of are always the values of all n frames.
+
+    Attributes:
+        before: (m,) int64 row of the earlier frame.
+        after: (m,) int64 row of the later frame.
+        span_s: (m,) time from the one to the other, s; NaN where a frame stands alone.
+        rows: the m frames among all n.
     """
 
     before: Rows
@@ -77,31 +85,45 @@ class Spans:
 
     @staticmethod
     def of(time_s: Array, observed: NDArray[np.bool_], half_window_s: float) -> Spans:
-        """The neighbours about `half_window_s` away; a frame that stands alone has an empty
-        span.
+        """The neighbours about `half_window_s` away; a frame that stands alone has an empty span.
+
+        Args:
+            time_s: (n,) times of the frames, s.
+            observed: (n,) bool, whether the frame has a pose.
+            half_window_s: how far before and after the frame its neighbours are, s.
         """
         before, after = neighbours(time_s, observed, half_window_s)
         span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
         return Spans(before, after, span_s, slice(None))
 
     def __getitem__(self, rows: slice) -> Spans:
-        """Those of some of all frames."""
+        """The spans of some of all frames; `rows` is a slice of a `Spans` of all n frames."""
         return Spans(self.before[rows], self.after[rows], self.span_s[rows], rows)
 
     def rate(self, values: Array) -> Array:
-        """Change per second of values (n,) or (n, k)."""
+        """(m,) or (m, k) change per second of values, NaN where a frame stands alone.
+
+        Args:
+            values: (n,) or (n, k), of all frames.
+        """
         span = self.span_s if values.ndim == 1 else self.span_s[:, None]
         return np.asarray((values[self.after] - values[self.before]) / span)
 
     def turning(self, angle: Array) -> Array:
-        """(m,) rad/s, adding the smallest turns from `before` over the frame itself to `after`."""
+        """(m,) rad/s, adding the smallest turns from `before` over the frame itself to `after`.
+
+        Args:
+            angle: (n,) rad, of all frames.
+        """
         here = angle[self.rows]
         turn = smallest_turn(here - angle[self.before]) + smallest_turn(angle[self.after] - here)
         return np.asarray(turn / self.span_s)
 
     def sd(self, sd: Array) -> Array:
-        """(m,) standard deviation of the rate of values with these (n,); the nearer two frames, the
-        more they agree.
+        """(m,) standard deviation of the rate; the nearer two frames, the more their errors agree.
+
+        Args:
+            sd: (n,) standard deviation of the values of all frames, in their unit.
         """
         first = sd[self.before]
         second = sd[self.after]
@@ -119,11 +141,20 @@ def kinematics(
     surface_z_mm: float | None = None,
     room: Room = np.empty,
 ) -> pd.DataFrame:
-    """The table `kinematics` from the tables `frames` and `poses` (or its joints) of one animal:
-    one row per frame.
+    """The table `kinematics` of one animal: one row per frame, rates with standard deviations.
 
-    surface_z_mm: height of the water's surface above the floor, for an animal that swims. room:
-    where its columns are to lie.
+    Args:
+        frames: the table `frames` of n frames.
+        poses: the table `poses` of these frames, or its joints.
+        half_window_s: derivatives use neighbours this far before and after, s.
+        impossible_above_mm_s: a faster speed is a tracking error and left empty, mm/s.
+        surface_z_mm: height of the water's surface above the floor, mm, for an animal that swims;
+            None where it is not known.
+        room: makes the arrays of the columns (an allocator, as `np.empty`).
+
+    Returns:
+        The columns of `kinematics_columns`: mm, s and rad in the arena frame, NaN where nothing is
+        known.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = Body.of(joints.names)
@@ -150,9 +181,7 @@ def kinematics(
 
 
 def _frame_by_frame(body: Body, joints: Joints, room: Room) -> tuple[Shape, dict[str, Array]]:
-    """What each frame tells by itself, and of an animal that stands its heights; a block of frames
-    is in memory.
-    """
+    """What each frame tells by itself, and of an animal that stands its heights, block by block."""
     shape = Shape.empty(joints.n_frames, room)
     heights = {} if body.swims else {name: room((joints.n_frames,), float) for name in _HEIGHTS}
     for rows in blocks(joints.n_frames, _BLOCK):
@@ -166,7 +195,7 @@ def _frame_by_frame(body: Body, joints: Joints, room: Room) -> tuple[Shape, dict
 
 
 def _put_away(column: pd.Series[Any], room: Room) -> NDArray[Any]:
-    """A column (n,) in that room."""
+    """A copy (n,) of a column in an array of the allocator."""
     values = room((len(column),), column.dtype)
     values[:] = column.to_numpy()
     let_go(values)
@@ -174,7 +203,7 @@ def _put_away(column: pd.Series[Any], room: Room) -> NDArray[Any]:
 
 
 def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> None:
-    """Values (m,) of some rows into their columns (n,)."""
+    """Write values (m,) of some rows into their columns (n,)."""
     for name, some in values.items():
         columns[name][rows] = some
 
@@ -182,7 +211,7 @@ def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> No
 def _moving(
     shape: Shape, swims: bool, spans: Spans, hold_s: Array, impossible_above_mm_s: float, room: Room
 ) -> dict[str, Array]:
-    """Place, speed and turning of the body as a whole; hold_s (n,): how long each frame counts."""
+    """Position, speed and turning of the whole body; hold_s (n,) is how long a frame counts, s."""
     columns = {name: room((len(hold_s),), float) for name in _MOVING}
     speed, speed_sd, heading, heading_sd = (
         columns[name] for name in ("speed_mm_s", "speed_sd_mm_s", "heading_rad", "heading_sd_rad")
@@ -263,8 +292,13 @@ def _swimming(
 
 @dataclass(frozen=True)
 class Joints:
-    """The joints of n frames: their names; at: positions (m, J, 3) mm in the arena of some frames
-    and the sd (m, J) mm along an axis, NaN where they are not known.
+    """The J joints of n frames, read some frames at a time.
+
+    Attributes:
+        names: names of the joints.
+        n_frames: number of frames.
+        at: from a slice of m frames to positions (m, J, 3) mm in the arena frame and their standard
+            deviation (m, J) mm along an axis, NaN where they are not known.
     """
 
     names: list[str]
@@ -273,7 +307,13 @@ class Joints:
 
     @staticmethod
     def of_table(poses: pd.DataFrame, n: int) -> Joints:
-        """Those of the table `poses` of n frames."""
+        """The joints of the table `poses`.
+
+        Args:
+            poses: the table `poses`, J rows per frame; without sd_mm all standard deviations are
+                NaN.
+            n: number of frames.
+        """
         column = poses["joint"]
         names = (
             column.cat.categories
@@ -295,9 +335,14 @@ class Joints:
 
     @staticmethod
     def of_track(track: Track) -> Joints:
-        """Those of a track; what was bridged was not measured."""
+        """The joints of a track; what was bridged was not measured and is NaN.
+
+        Args:
+            track: the track; its arena-frame joints, mm, are read block by block.
+        """
 
         def at(rows: slice) -> tuple[Array, Array]:
+            """Positions (m, J, 3) mm and standard deviations (m, J) mm of the frames `rows`."""
             part = track[rows]
             xyz = np.where(part.bridged[:, None, None], np.nan, part.joints_mm)
             sd = part.sd_mm.copy()
@@ -308,15 +353,21 @@ class Joints:
 
 
 def _apart(xyz: Sequence[Array]) -> Array:
-    """Three coordinates (m, J) as (m, J, 3), each by itself in memory: sums over joints then have
-    the same bits.
+    """Three coordinates (m, J) as (m, J, 3), each contiguous in memory.
+
+    Sums over joints then have the same bits, wherever the joints came from.
     """
     return np.moveaxis(np.stack(xyz), 0, -1)
 
 
 def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
-    """(n,) the number of the unbroken stretch each frame belongs to: no missing frame, no lost
-    animal inside.
+    """(n,) int64 number of the unbroken stretch each frame belongs to, from 0 upwards.
+
+    A stretch has no missing frame and no lost animal inside.
+
+    Args:
+        time_s: (n,) times of the frames, s.
+        observed: (n,) bool, whether the frame has a pose.
     """
     broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[
         : len(time_s)
@@ -327,11 +378,19 @@ def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
 def neighbours(
     time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S
 ) -> tuple[Rows, Rows]:
-    """(n,) rows to difference between: about `half_window_s` before and after, never outside the
-    frame's own stretch.
+    """Rows to difference between: about `half_window_s` before and after, within the own stretch.
 
-    At the ends of a stretch the difference is one-sided; a stretch of one frame has none (before ==
-    after).
+    At the ends of a stretch the difference is one-sided; a stretch of one frame and a frame without
+    a pose have none (before == after).
+
+    Args:
+        time_s: (n,) times of the frames, s.
+        observed: (n,) bool, whether the frame has a pose.
+        half_window_s: how far before and after the frame its neighbours are, s; at the camera's own
+            rate the next frame counts, jitter of its clock or not.
+
+    Returns:
+        before and after, (n,) int64 rows each.
     """
     n = len(time_s)
     rows = np.arange(len(time_s))
@@ -350,5 +409,9 @@ def neighbours(
 
 
 def smallest_turn(angle: Array) -> Array:
-    """Angles brought into (-pi, pi]."""
+    """Angles wrapped into (-pi, pi].
+
+    Args:
+        angle: angles of any shape, rad.
+    """
     return np.asarray(np.pi - (np.pi - angle) % (2.0 * np.pi))

@@ -1,7 +1,7 @@
-"""The columns that a reader is told of first: README.md's list is printed from the columns' own
-descriptions.
+"""README.md's list of columns, printed from the columns' own descriptions.
 
-`python -m liex_lab.behaviour.listing` prints it; a test holds README.md to it.
+The columns are those that a reader is told of first. `python -m liex_lab.behaviour.listing` prints
+the list; a test holds README.md to it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def all_columns() -> dict[str, Column]:
 
 
 def first_columns() -> str:
-    """README.md's table of columns, Markdown."""
+    """README.md's table of columns, as Markdown."""
     known = all_columns()
     lines = ["| column | unit | meaning |", "|---|---|---|"]
     for name in FIRST:

@@ -1,4 +1,10 @@
-"""The measures of each bout, whoever named it: a rule, a model or a person."""
+"""Measures of each bout: path, displacement, speeds, turns, nose height, tail beats, body wave.
+
+The list of a swimming animal's bouts follows ZebraZoom (Mirat et al. 2013): bends, oscillations,
+tail-beat frequency, first bend, asymmetry. The speed of the body wave is a third of the length over
+the lag at which the curvatures of the middle and rear third correlate best (cross-correlation on a
+grid ten times as fine as the frames). Bouts may be named by a rule, a model or a person.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +22,22 @@ from liex_lab.tables.schema import BOUTS, to_pandas
 
 Array = NDArray[np.float64]
 _MOST_LAG_S = 0.25  # a wave that takes longer for a third of the body is none
-_LEAST_CORRELATION = (
-    0.5  # of the curvatures of two thirds of the body, for a wave that runs from one to the other
-)
+# of the curvatures of two thirds of the body, for a wave that runs from one to the other
+_LEAST_CORRELATION = 0.5
 
 
 def measure_bouts(bouts: pd.DataFrame, kinematics: pd.DataFrame) -> pd.DataFrame:
-    """The table `bouts` with its measures: `bouts` needs the columns of `tables.BOUTS`, others of
-    it are replaced.
+    """The table `bouts` with its measures.
 
     What a camera of this frame rate cannot measure is left empty (see unreliable_below_fps in
     columns.json).
+
+    Args:
+        bouts: needs the columns of `tables.BOUTS`; all others of it are replaced.
+        kinematics: the table `kinematics` of the same animal.
+
+    Returns:
+        The columns `BOUTS` and those of `bout_columns`, one row per bout.
     """
     swims = "tail_angle_rad" in kinematics
     described = bout_columns(swims)
@@ -63,7 +74,11 @@ class BoutReader:
         self._columns: dict[str, Array] = {}
 
     def rows_of(self, bouts: pd.DataFrame) -> list[tuple[int, int]]:
-        """The rows [start, stop) of every bout."""
+        """The rows [start, stop) of every bout, at least one row each.
+
+        Args:
+            bouts: the table `bouts`; start_frame and stop_frame are the camera's counts.
+        """
         starts = np.searchsorted(self.frame_index, bouts["start_frame"].to_numpy())
         stops = np.searchsorted(self.frame_index, bouts["stop_frame"].to_numpy())
         n = len(self.frame_index)
@@ -73,13 +88,26 @@ class BoutReader:
         ]
 
     def measure(self, start: int, stop: int) -> dict[str, float]:
-        """All measures but the one that needs the bout before."""
+        """All measures of one bout but since_last_s, which needs the bout before.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+
+        Returns:
+            Column name to value; NaN where nothing is known.
+        """
         found = {**self._way(start, stop), **self._turn(start, stop)}
         return {**found, **(self._tail(start, stop) if self.swims else self._height(start, stop))}
 
     def since_last(self, bouts: pd.DataFrame, spans: Sequence[tuple[int, int]]) -> Array:
-        """(n,) s from the end of the last bout of the same action, where the animal was in sight
-        all the time.
+        """(n,) time from the end of the last bout of the same action, s.
+
+        It is NaN at the first one, and where the animal was out of sight in between.
+
+        Args:
+            bouts: the table `bouts`, in order of time.
+            spans: the rows of the n bouts, see `rows_of`.
         """
         number = segments(self.time_s, np.isfinite(self.place[:, 0]))
         last: dict[str, int] = {}
@@ -189,7 +217,7 @@ class BoutReader:
         }
 
     def _wave(self, start: int, stop: int) -> float:
-        """Speed, mm/s, of the bend that runs from the middle third of the body to the rear one."""
+        """Speed of the bend that runs from the middle third of the body to the rear one, mm/s."""
         middle, rear = (self._cut(f"bend_{part}_rad", start, stop) for part in ("middle", "rear"))
         if not (np.isfinite(middle).all() and np.isfinite(rear).all()) or stop - start < 8:
             return np.nan

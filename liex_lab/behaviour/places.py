@@ -1,4 +1,11 @@
-"""Where the animal was: zones, walls, height in the water."""
+"""Where the animal was: zone visits, thigmotaxis (outer half of an open field), novel tank test.
+
+A visit is a bout of being inside a zone, with the merging and the least length of `bouts.tidy`. The
+outer half is the border along the walls that takes half of the floor's area: of a circle r (1 -
+sqrt(1/2)), of a rectangle the m that solves (a - m)(b - m) = a b / 2, a and b half its sides. Of a
+fish, the shares of the time in the top and bottom third of the water. Shares are of the time in
+which the animal was observed.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +30,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is around the animal: the arena's shape, the zones' names, the height of the water's
-    surface, mm.
+    """What is around the animal.
+
+    Attributes:
+        arena: shape of the arena.
+        zones: names of the zones.
+        surface_z_mm: height of the water's surface above the floor, mm; None where there is none or
+            it is not known.
     """
 
     arena: Arena = UNKNOWN
@@ -33,8 +45,15 @@ class Surroundings:
 
 
 def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> float | None:
-    """Height of the water's surface above the floor, from what session.json says of camera and
-    optics.
+    """Height of the water's surface above the floor, mm, from what session.json says.
+
+    Args:
+        floor_distance_mm: distance of the camera from the floor, mm.
+        optics: the camera's optics; water.height_mm is the distance of the surface below the lens,
+            mm.
+
+    Returns:
+        None where there is no water, or the surface is not above the floor.
     """
     water = optics.get("water")
     if not isinstance(water, dict) or not water.get("height_mm"):
@@ -46,7 +65,15 @@ def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> fl
 def visits(
     frames: pd.DataFrame, kinematics: pd.DataFrame, zones: Sequence[str], rules: MouseRules
 ) -> pd.DataFrame:
-    """The table `zones`: one row per zone."""
+    """The table `zones`: time, share, visits, latency, mean visit and distance of each zone.
+
+    Args:
+        frames: the table `frames`.
+        kinematics: the table `kinematics` of the same frames.
+        zones: names of the zones.
+        rules: shorter absences than `merge_pauses_s` are bridged, then shorter visits than
+            `min_bout_s` dropped.
+    """
     time_s = kinematics["time_s"].to_numpy(float)
     stop_s = stop_times(time_s)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
@@ -79,7 +106,12 @@ def visits(
 
 
 def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
-    """For each zone (n,) whether the centroid lies in it."""
+    """For each zone (n,) bool, whether the animal's centroid lies in it; zones may overlap.
+
+    Args:
+        frames: the table `frames`; its column zone holds names joined by `SEPARATOR`.
+        zones: names of the zones; () for sessions of older versions, which have no such column.
+    """
     if not zones:  # sessions of older versions have no such column
         return []
     words = pd.Series(frames["zone"].astype(str))
@@ -91,8 +123,13 @@ def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
 
 
 def outer_margin_mm(arena: Arena) -> float:
-    """How wide the border along the walls is that takes half of the floor's area; NaN for an
-    unknown shape.
+    """Width of the border along the walls that takes half of the floor's area, mm.
+
+    Args:
+        arena: shape of the arena.
+
+    Returns:
+        NaN for a shape that is neither a circle nor a rectangle.
     """
     if arena.radius_mm is not None:
         return float(arena.radius_mm * (1.0 - np.sqrt(0.5)))
@@ -103,8 +140,15 @@ def outer_margin_mm(arena: Arena) -> float:
 
 
 def place_measures(frames: pd.DataFrame, hold: Array, arena: Arena) -> dict[str, float]:
-    """Distance from the walls; hold (n,) s is how long each observed frame counts, 0 for the
-    others.
+    """Median distance from the walls, mm, and share of the time in the outer half of the floor.
+
+    Args:
+        frames: the table `frames` of n frames; without wall_distance_mm both are NaN.
+        hold: (n,) how long each observed frame counts, s; 0 for the others.
+        arena: shape of the arena.
+
+    Returns:
+        The columns wall_distance_mm and outer_half_share of the summary.
     """
     wall = (
         frames["wall_distance_mm"].to_numpy(float)
@@ -128,7 +172,18 @@ def place_measures(frames: pd.DataFrame, hold: Array, arena: Arena) -> dict[str,
 def depth_measures(
     kinematics: pd.DataFrame, hold: Array, surface_z_mm: float | None
 ) -> dict[str, float]:
-    """Where in the water the animal was."""
+    """Where in the water the animal was: the measures of the novel tank test.
+
+    Args:
+        kinematics: the table `kinematics` of n frames.
+        hold: (n,) how long each observed frame counts, s; 0 for the others.
+        surface_z_mm: height of the water's surface above the floor, mm; None where it is not known,
+            and only the mean height is given.
+
+    Returns:
+        mean_height_mm, top_third_share, bottom_third_share and top_third_latency_s (s from the
+        first sight of the animal); NaN where not known.
+    """
     z = kinematics["z_mm"].to_numpy(float)
     time_s = kinematics["time_s"].to_numpy(float)
     known = np.isfinite(z)

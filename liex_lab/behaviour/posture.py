@@ -1,9 +1,11 @@
-"""The shape of a chain of joints in each frame: axis, length, bend and curvature.
+"""Posture of a chain of joints per frame: heading, pitch, length, bend and midline curvature.
 
-A bend is measured in the animal's own frontal plane: the one through its axis and the horizontal,
-as if it did not roll. Positive bends are towards the animal's left. What "the bend of a body" is
-differs between publications by a factor of two and more; here it is the whole turn from the
-direction of the front bone to that of the rear one.
+Heading = atan2(dy, dx) and pitch = atan2(dz, hypot(dx, dy)) of the body's axis; the bend is the sum
+of the signed turning angles at the inner joints (total curvature of the discrete midline). It is
+measured in the animal's own frontal plane: the one through its axis and the horizontal, as if it
+did not roll. Positive bends are towards the animal's left. What "the bend of a body" is differs
+between publications by a factor of two and more; here it is the whole turn from the direction of
+the front bone to that of the rear one.
 """
 
 from __future__ import annotations
@@ -22,11 +24,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Posture:
-    """A body (n frames) by its joints `spine` (n, K, 3) mm, front to rear, with their sd (n, K) mm
-    along an axis.
+    """A body in n frames, by its K midline joints from front to rear; arena frame.
 
-    centre (n, 3) mm and its sd (n,); axis (n, 3) mm, the line whose direction is the heading, and
-    the sd (n,) of the difference of its ends.
+    Attributes:
+        body: which joint plays which part.
+        spine: (n, K, 3) joints from front to rear, mm.
+        spine_sd: (n, K) their standard deviation along an axis, mm.
+        centre: (n, 3) centre of the body, mm.
+        centre_sd: (n,) its standard deviation along an axis, mm.
+        axis: (n, 3) the vector whose direction is the heading, mm.
+        axis_sd: (n,) standard deviation of the difference of the axis' two ends, mm.
     """
 
     body: Body
@@ -39,7 +46,13 @@ class Posture:
 
     @staticmethod
     def of(body: Body, xyz: Array, sd: Array) -> Posture:
-        """From all joints (n, J, 3) mm and their sd (n, J)."""
+        """The posture from all joints; errors of the joints of one frame count as one common error.
+
+        Args:
+            body: which joint plays which part.
+            xyz: (n, J, 3) joints in the arena frame, mm.
+            sd: (n, J) their standard deviation along an axis, mm.
+        """
         spine, trunk, (start, stop) = list(body.spine), list(body.trunk), body.axis
         return Posture(
             body,
@@ -53,29 +66,31 @@ class Posture:
 
     @cached_property
     def pitch_rad(self) -> Array:
-        """(n,) angle of the axis above the floor."""
+        """(n,) angle of the axis above the floor, rad; positive nose up."""
         return np.asarray(np.arctan2(self.axis[:, 2], self._reach))
 
     @cached_property
     def pitch_sd_rad(self) -> Array:
-        """(n,) standard deviation of the pitch."""
+        """(n,) standard deviation of the pitch, rad."""
         return self.axis_sd / _positive(np.linalg.norm(self.axis, axis=1))
 
     @cached_property
     def heading_rad(self) -> Array:
-        """(n,) direction of the axis over the floor."""
+        """(n,) direction of the axis on the floor, rad, counter-clockwise from x, from above."""
         return np.asarray(np.arctan2(self.axis[:, 1], self.axis[:, 0]))
 
     @cached_property
     def heading_sd_rad(self) -> Array:
-        """(n,) standard deviation of the heading; of a direction that is not known at all it is no
-        more than that.
+        """(n,) standard deviation of the heading, rad, at most pi / sqrt(3).
+
+        That is the standard deviation of a direction that is not known at all (uniform on the
+        circle).
         """
         return np.asarray(np.minimum(self.axis_sd / _positive(self._reach), np.pi / np.sqrt(3.0)))
 
     @cached_property
     def length_mm(self) -> Array:
-        """(n,) length of the chain, all bones added up."""
+        """(n,) length of the chain, all bones added up, mm."""
         return np.asarray(self._bone_mm.sum(axis=1))
 
     @cached_property
@@ -87,9 +102,7 @@ class Posture:
 
     @cached_property
     def turns_rad(self) -> Array:
-        """(n, K - 2) by how much the chain turns at each inner joint, front to rear; positive to
-        the left.
-        """
+        """(n, K - 2) turn at each inner joint, front to rear, rad; positive to the left."""
         bones = np.diff(self.spine, axis=1)
         a = bones[:, :-1]
         b = bones[:, 1:]
@@ -100,7 +113,7 @@ class Posture:
 
     @cached_property
     def bend_rad(self) -> Array:
-        """(n,) the whole turn from the front bone to the rear one."""
+        """(n,) whole turn from the front bone to the rear one, rad; NaN of fewer than 3 joints."""
         return (
             np.asarray(self.turns_rad.sum(axis=1))
             if self.spine.shape[1] > 2
@@ -109,13 +122,11 @@ class Posture:
 
     @cached_property
     def rear_sd_mm(self) -> Array:
-        """(n,) standard deviation of the chain's rear end."""
+        """(n,) standard deviation of the chain's rear end along an axis, mm."""
         return self.spine_sd[:, -1]
 
     def thirds_rad(self) -> tuple[Array, Array, Array]:
-        """(n,) each: by how much the front, middle and rear third of the chain turns; positive to
-        the left.
-        """
+        """(n,) each: turn of the chain's front, middle, rear third, rad; positive to the left."""
         inner = self.turns_rad.shape[1]
         third = 3 * np.arange(1, inner + 1) // (inner + 1)
         front, middle, rear = (self.turns_rad[:, third == k].sum(axis=1) for k in range(3))
@@ -123,15 +134,14 @@ class Posture:
 
     @cached_property
     def tail_mm(self) -> Array:
-        """(n,) how far the chain's rear end is beside the line of the axis; positive to the
-        left.
-        """
+        """(n,) distance of the chain's rear end from the axis' line, mm; positive to the left."""
         return np.asarray(np.einsum("ni,ni->n", self.spine[:, -1] - self.spine[:, 0], self._left))
 
     @cached_property
     def tail_angle_rad(self) -> Array:
-        """(n,) angle at the front between the backward axis and the line to the rear end; positive
-        to the left.
+        """(n,) angle at the front between the backward axis and the line to the rear end, rad.
+
+        Positive to the animal's left.
         """
         to_rear = self.spine[:, -1] - self.spine[:, 0]
         ahead = self.axis / _positive(np.linalg.norm(self.axis, axis=1))[:, None]
@@ -147,21 +157,37 @@ class Posture:
 
     @cached_property
     def _left(self) -> Array:
-        """(n, 3) the animal's left, horizontal; unknown for a vertical axis."""
+        """(n, 3) unit vector to the animal's left, horizontal; NaN for a vertical axis."""
         left = np.stack([-self.axis[:, 1], self.axis[:, 0], np.zeros(len(self.axis))], axis=1)
         return left / _positive(self._reach)[:, None]
 
     @cached_property
     def _dorsal(self) -> Array:
-        """(n, 3) the animal's back, upright in the vertical plane through its axis."""
+        """(n, 3) unit vector out of the animal's back, in the vertical plane through its axis."""
         ahead = self.axis / _positive(np.linalg.norm(self.axis, axis=1))[:, None]
         return np.asarray(np.cross(ahead, self._left))
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What is told of a body's posture in each of n frames; see `Posture`. thirds_rad (n, 3);
-    rear_sd_mm (n,): of the chain's rear end. Of a body that does not swim the last four are empty.
+    """The measures of a posture in each of n frames, as columns; see `Posture` for their meaning.
+
+    Of a body that does not swim the last four are empty (NaN).
+
+    Attributes:
+        centre: (n, 3) mm, arena frame.
+        centre_sd: (n,) mm.
+        pitch_rad: (n,) rad.
+        pitch_sd_rad: (n,) rad.
+        heading_rad: (n,) rad.
+        heading_sd_rad: (n,) rad.
+        length_mm: (n,) mm.
+        straightness: (n,) from 0 to 1.
+        bend_rad: (n,) rad.
+        thirds_rad: (n, 3) turns of the front, middle and rear third, rad.
+        tail_mm: (n,) mm.
+        tail_angle_rad: (n,) rad.
+        rear_sd_mm: (n,) standard deviation of the chain's rear end, mm.
     """
 
     centre: Array
@@ -180,7 +206,12 @@ class Shape:
 
     @staticmethod
     def empty(n: int, room: Room = np.empty) -> Shape:
-        """For n frames; room: where they are to lie."""
+        """Columns for n frames, filled with NaN.
+
+        Args:
+            n: number of frames.
+            room: makes the arrays of the columns (an allocator, as `np.empty`).
+        """
         more = {"centre": (n, 3), "thirds_rad": (n, 3)}
         shape = Shape(*(room(more.get(one.name, (n,)), float) for one in fields(Shape)))
         for column in vars(shape).values():
@@ -189,11 +220,16 @@ class Shape:
         return shape
 
     def rest(self) -> None:
-        """Let go of the memory of columns that lie on disk, until they are looked at again."""
+        """Release the memory of columns that lie on disk, until they are looked at again."""
         let_go(*vars(self).values())
 
     def put(self, rows: slice, posture: Posture) -> None:
-        """What a posture tells of some frames."""
+        """Write the measures of a posture into some frames.
+
+        Args:
+            rows: the m frames.
+            posture: the posture of these m frames.
+        """
         told = [one.name for one in fields(Shape)]
         for name in told[: None if posture.body.swims else -4]:
             if name == "thirds_rad":

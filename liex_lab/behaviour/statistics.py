@@ -1,9 +1,20 @@
-"""Tests and effect sizes for the units of a design: a permutation restricted by it, and a mixed
-model.
+"""Permutation test, linear mixed model, Welch's t interval and Hedges' g for two groups of animals.
 
-Whatever tests, the interval is that of the units' means (Welch's t, or a paired or blocked one). A
-bootstrap of three to six units, which is what many studies have, gives intervals that are far too
-short.
+All of them take the units of a design (`design.Units`: cages, animals or an animal's own
+difference), never sessions or bouts.
+
+- Permutation test (Fisher 1935, Pitman 1937): the groups are given anew to the units as the design
+  allows, p = share of the arrangements with |difference| >= the observed one; exact up to
+  `MOST_EXACT` arrangements, beyond that Monte Carlo with p = (1 + b) / (1 + m) (Phipson and Smyth
+  2010). Paired units have their signs flipped; blocks are permuted within themselves.
+- Linear mixed model (Laird and Ware 1982): value ~ group + (1 | cage) or (1 | animal), by
+  restricted maximum likelihood (REML), t with units - 2 degrees of freedom.
+- Confidence interval: Welch's t with Welch and Satterthwaite's degrees of freedom, a paired t, or
+  least squares with a mean per block. A bootstrap of three to six units, which is what many studies
+  have, gives intervals that are far too short.
+- Hedges' g (1981): J x difference / pooled sd, with J = 1 - 3 / (4 df - 1).
+
+`liex_lab.behaviour.cohort` calls all of them.
 """
 
 from __future__ import annotations
@@ -27,8 +38,12 @@ FEWEST_FOR_MODEL = 6  # units per group; with fewer, a model's variances are gue
 
 @dataclass(frozen=True)
 class Estimate:
-    """Second group minus first: the difference, its 95 % interval, and how the interval was
-    made.
+    """Second group minus first group, with the interval's two ends.
+
+    Attributes:
+        difference: difference of the groups, in the measure's own unit.
+        low: lower end of the confidence interval; NaN where a group has fewer than two units.
+        high: upper end of the confidence interval; NaN where a group has fewer than two units.
     """
 
     difference: float
@@ -37,7 +52,21 @@ class Estimate:
 
 
 def estimate(units: Units, level: float = 0.95) -> Estimate:
-    """The difference of the groups in the measure's own unit."""
+    """Difference of the two groups with its t interval, in the measure's own unit.
+
+    Paired units: the mean of the animals' own differences, t with n - 1 degrees of freedom. More
+    than one block: least squares with a mean per block. Otherwise Welch's t, whose degrees of
+    freedom are Welch and Satterthwaite's: (va + vb)^2 / (va^2 / (na - 1) + vb^2 / (nb - 1)), v =
+    variance / n.
+
+    Args:
+        units: the units of the comparison, see `find_units`.
+        level: coverage of the interval, 0 to 1.
+
+    Returns:
+        The estimate; its interval is NaN where an unpaired, unblocked group has fewer than two
+        units.
+    """
     from scipy.stats import t
 
     y = units.values
@@ -64,9 +93,7 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
 
 
 def _within_blocks(units: Units) -> tuple[float, float, float]:
-    """Least squares with a mean for each block: difference, its standard error, degrees of
-    freedom.
-    """
+    """Least squares with a mean per block: difference, standard error, degrees of freedom."""
     design = np.concatenate(
         [units.second[:, None], units.block[:, None] == np.unique(units.block)], axis=1
     ).astype(float)
@@ -84,8 +111,18 @@ def _within_blocks(units: Units) -> tuple[float, float, float]:
 
 
 def spread_of_animals(values: Array, second: NDArray[np.bool_]) -> tuple[float, float]:
-    """Standard deviation between animals within their groups, and Hedges' correction for so few of
-    them.
+    """Pooled standard deviation between animals within groups, and Hedges' correction factor J.
+
+    J = 1 - 3 / (4 df - 1) with df = n - 2 takes out most of the bias that Cohen's d has with few
+    animals (Hedges 1981).
+
+    Args:
+        values: (n,) one mean per animal; an animal that was in both groups counts in both.
+        second: (n,) bool, whether the animal is of the second group.
+
+    Returns:
+        The pooled standard deviation, in the measure's own unit (NaN without degrees of freedom),
+        and J, which is 1 with fewer than two degrees of freedom.
     """
     a = values[~second]
     b = values[second]
@@ -99,7 +136,14 @@ def spread_of_animals(values: Array, second: NDArray[np.bool_]) -> tuple[float, 
 
 
 def arrangements(units: Units) -> int:
-    """In how many ways the groups could have been given to the units."""
+    """Number of ways in which the groups could have been given to the units.
+
+    2^n for n paired units; otherwise the product over the blocks of C(n, k), k of a block's n units
+    being of the second group.
+
+    Args:
+        units: the units of the comparison.
+    """
     if units.paired:
         return int(2 ** len(units.values))
     sizes = [
@@ -110,7 +154,14 @@ def arrangements(units: Units) -> int:
 
 
 def smallest_p(units: Units) -> float:
-    """The smallest two-sided p that a permutation can give."""
+    """The smallest two-sided p that a permutation test of these units can give.
+
+    It is 2 / `arrangements` where every arrangement has its mirror image (paired units, or equally
+    many of both groups in every block), else 1 / `arrangements`.
+
+    Args:
+        units: the units of the comparison.
+    """
     even = units.paired or all(
         2 * int(units.second[units.block == b].sum()) == int((units.block == b).sum())
         for b in np.unique(units.block)
@@ -119,8 +170,19 @@ def smallest_p(units: Units) -> float:
 
 
 def permutation(units: Units, rng: np.random.Generator) -> float:
-    """Two-sided p: how often a difference at least as large comes from giving the groups anew, as
-    the design allows.
+    """Two-sided p of the permutation test that the design allows (Fisher 1935, Pitman 1937).
+
+    The statistic is the blocked difference of the groups, as least squares gives it, or for paired
+    units the sum of the differences, whose signs are flipped. Up to `MOST_EXACT` arrangements all
+    are gone through; of more, `MOST_EXACT` are drawn and p = (1 + b) / (1 + m), b of the m being at
+    least as large as the observed one.
+
+    Args:
+        units: the units of the comparison.
+        rng: draws the arrangements where there are too many; unused in an exact test.
+
+    Returns:
+        p, 0 to 1: how often a difference at least as large comes from giving the groups anew.
     """
     weight = _weights(units)
     observed = abs(float(weight @ units.values) if not units.paired else float(units.values.sum()))
@@ -135,9 +197,7 @@ def permutation(units: Units, rng: np.random.Generator) -> float:
 
 
 def _weights(units: Units) -> Array:
-    """(n,) so that their product with the values is the blocked difference of the groups, as least
-    squares gives it.
-    """
+    """Weights (n,) whose product with the values is the blocked difference, up to a factor."""
     out = np.zeros(len(units.values))
     for block in np.unique(units.block):
         inside = units.block == block
@@ -151,7 +211,7 @@ def _weights(units: Units) -> Array:
 
 
 def _all_differences(units: Units) -> Array:
-    """The statistic for every arrangement."""
+    """The statistic for every arrangement, (`arrangements`,)."""
     y = units.values
     if units.paired:
         signs = 1 - 2 * ((np.arange(2 ** len(y))[:, None] >> np.arange(len(y))) & 1)
@@ -169,7 +229,7 @@ def _all_differences(units: Units) -> Array:
 
 
 def _some_differences(units: Units, rng: np.random.Generator) -> Array:
-    """The statistic for `MOST_EXACT` arrangements drawn at random."""
+    """The statistic for `MOST_EXACT` arrangements drawn at random, (`MOST_EXACT`,)."""
     y = units.values
     if units.paired:
         return np.asarray(rng.choice([-1.0, 1.0], (MOST_EXACT, len(y))) @ y)
@@ -185,8 +245,12 @@ def _some_differences(units: Units, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True)
 class ModelResult:
-    """What a mixed model found: difference, its 95 % interval and p; which random intercept
-    it had.
+    """What a linear mixed model found.
+
+    Attributes:
+        found: the fixed effect of the group with its 95 % interval.
+        p: two-sided p of that effect.
+        random: what had a random intercept: cage or animal.
     """
 
     found: Estimate
@@ -195,12 +259,21 @@ class ModelResult:
 
 
 def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> ModelResult | None:
-    """The model value ~ group + (1 | cage) on the animals' means, or (1 | animal) on the sessions'
-    values.
+    """Linear mixed model of a group difference, fitted by restricted maximum likelihood (REML).
 
-    rows: as for `find_units`. None where the model does not fit, or its random variance lies at
-    zero, so that its errors are not to be trusted. p is of t with as many degrees of freedom as
-    there are units beyond the fixed effects.
+    value ~ group + (1 | cage) on the animals' means where whole cages were assigned, otherwise
+    value ~ group + (1 | animal) on the sessions' values. p and interval are of t with as many
+    degrees of freedom as there are clusters beyond the two fixed effects.
+
+    Args:
+        rows: one row per session, as for `find_units`.
+        units: the units that `find_units` made of these rows.
+        groups: names of the first and the second group.
+
+    Returns:
+        None for paired units, where nothing is nested or the units are exchanged within blocks (the
+        permutation test says it all), and where the model does not converge or its random
+        variance lies at zero, so that its errors are not to be trusted.
     """
     from scipy.stats import t
 
@@ -234,7 +307,7 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
 
 
 def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[float, float] | None:
-    """Difference and standard error of the restricted likelihood's fit, or None."""
+    """Difference and standard error of the REML fit; None where it cannot be trusted."""
     from statsmodels.regression.mixed_linear_model import MixedLM
 
     scale = float(values.std())
@@ -262,7 +335,16 @@ def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[floa
 
 
 def check_reachable(units: Units, alpha: float) -> None:
-    """Refuse a test that cannot come out significant. Raises NotComparable."""
+    """Refuse a permutation test that cannot come out significant, however large the difference is.
+
+    Args:
+        units: the units of the comparison.
+        alpha: level of significance.
+
+    Raises:
+        NotComparable: the smallest p that these units can give is above `alpha`; the text says how
+            many units there are and that more are needed.
+    """
     least = smallest_p(units)
     if least <= alpha:
         return

@@ -1,6 +1,8 @@
-"""Everything this room says about one animal, and the row that a biologist reads first.
+"""All behaviour tables of one animal, and the summary: the one row that a biologist reads first.
 
-Shares are of the time in which the animal was observed.
+Glue over `kinematics`, `bouts`, `measures`, `transitions`, `activity` and `places`; the summary
+adds distance, speeds, turn bias, time budget (count, time, share, rate and latency of each action)
+and times in zones. Shares are of the time in which the animal was observed.
 """
 
 from __future__ import annotations
@@ -54,7 +56,19 @@ TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
 
 @dataclass(frozen=True)
 class Behaviour:
-    """The behaviour tables of one animal."""
+    """The behaviour tables of one animal.
+
+    Attributes:
+        kinematics: one row per frame.
+        bouts: one row per bout, with its measures.
+        summary: one row.
+        transitions: one row per ordered pair of different actions.
+        activity: one row per bin of time.
+        zones: one row per zone.
+        rules: the thresholds that were used.
+        vocabulary: what decides which columns there are.
+        actions: word of the ethogram -> its definition.
+    """
 
     kinematics: pd.DataFrame
     bouts: pd.DataFrame
@@ -72,9 +86,7 @@ class Behaviour:
         return {name: getattr(self, name) for name in TABLES}
 
     def for_session(self) -> dict[str, Any]:
-        """The arguments that hand all of it to a session:
-        `writer.close(**behaviour.for_session())`.
-        """
+        """The arguments that hand it to a session: `writer.close(**behaviour.for_session())`."""
         return {
             "results": self.tables,
             "columns": self.vocabulary.columns,
@@ -94,12 +106,19 @@ def measure(
     actions: Mapping[str, str] | None = None,
     room: Room = np.empty,
 ) -> Behaviour:
-    """The behaviour tables of one animal from its tables `frames` and `poses` (or its joints), and
-    `gaps` where there are any.
+    """The behaviour tables of one animal from its poses.
 
-    bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`), with its vocabulary
-    `actions`, word -> definition; None takes the rules'. around: arena, zones and water. room:
-    where the table `kinematics` is to lie.
+    Args:
+        frames: the table `frames`.
+        poses: the table `poses` of these frames, or its joints.
+        rules: the thresholds; None takes the defaults.
+        around: arena, zones and water; None where nothing is known.
+        gaps: the table `gaps`; None where there are none.
+        bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`); None takes the
+            rules'.
+        actions: its vocabulary, word -> definition; None takes the rules'. Words that occur in no
+            vocabulary are added without a definition.
+        room: makes the arrays of the table `kinematics` (an allocator, as `np.empty`).
     """
     rules = rules or MouseRules()
     around = around or Surroundings()
@@ -137,14 +156,25 @@ def measure(
 def measure_rows(
     rows: Rows, rules: MouseRules | None = None, around: Surroundings | None = None, **how: Any
 ) -> Behaviour:
-    """`measure` of a track that is not in a session yet; how: what else that may be told."""
+    """`measure` of a track that is not in a session yet.
+
+    Args:
+        rows: the track with its frame counts and names.
+        rules: the thresholds; None takes the defaults.
+        around: arena, zones and water; None where nothing is known.
+        **how: bouts, actions and room of `measure`.
+    """
     frames = rows.frames_table(_FRAMES)
     gaps = to_pandas(GAPS, rows.gaps())
     return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **how)
 
 
 def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
-    """The thresholds and the surroundings that a session states."""
+    """The thresholds and the surroundings that a session states.
+
+    Args:
+        session: an opened session; thresholds that its session.json lacks are the defaults.
+    """
     about = session.metadata
     known = about.get("rules") or {}
     stated = {name: known[name] for name in MouseRules.__dataclass_fields__ if name in known}
@@ -157,8 +187,11 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:
-    """The behaviour tables of a session made anew from its folder alone, with its own ethogram and
-    thresholds.
+    """The behaviour tables of a session made anew from its folder alone, with its own ethogram.
+
+    Args:
+        session: an opened session.
+        rules: the thresholds; None takes those that the session states.
     """
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
@@ -180,8 +213,18 @@ def summarise(
     words: Vocabulary | None = None,
     around: Surroundings | None = None,
 ) -> pd.DataFrame:
-    """The table `summary`: one row from the tables `frames`, `kinematics` and `bouts` of one
-    animal.
+    """The table `summary`: one row for one animal.
+
+    Args:
+        frames: the table `frames`.
+        kinematics: the table `kinematics`.
+        bouts: the table `bouts` with its measures.
+        words: actions, zones and whether the animal swims; None takes the rules' actions of a
+            walking animal.
+        around: arena, zones and water; None where nothing is known.
+
+    Returns:
+        The columns of `summary_columns`.
     """
     words = words or Vocabulary(ACTIONS)
     around = around or Surroundings()

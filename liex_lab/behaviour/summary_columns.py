@@ -1,5 +1,7 @@
-"""The columns of the tables that sum a session up. Which there are depends on the actions' names
-and on the zones.
+"""Data dictionary of the tables `summary`, `transitions`, `zones` and `activity`.
+
+Unit, meaning, formula and source of each column, listed once. Which columns there are depends on
+the actions' names, the zones' names, and whether the animal swims.
 """
 
 from __future__ import annotations
@@ -163,7 +165,13 @@ _SWIMMER = (
 def summary_columns(
     words: Sequence[str], zones: Sequence[str] = (), swims: bool = False
 ) -> tuple[Column, ...]:
-    """The columns of the table `summary`: one row per animal."""
+    """The columns of the table `summary`: one row per animal.
+
+    Args:
+        words: the actions' names.
+        zones: the zones' names.
+        swims: of an animal that swims, else of one that walks.
+    """
     named = [row for word in words for row in _of_action(word)]
     placed = [row for zone in zones for row in _of_zone(zone)]
     rest = (
@@ -323,8 +331,12 @@ ZONES: tuple[Column, ...] = columns(
 
 
 def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
-    """The columns of the table `activity`: one row per minute, or per tenth of a recording of less
-    than ten.
+    """The columns of the table `activity`: one row per bin of time.
+
+    A bin is a minute, or a tenth of a recording of less than ten.
+
+    Args:
+        words: the actions' names.
     """
     return columns(
         "activity",
@@ -355,8 +367,12 @@ def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What decides which columns a session has: the actions' names, the zones' names, and how the
-    animal moves.
+    """What decides which columns a session has.
+
+    Attributes:
+        words: the actions' names.
+        zones: the zones' names.
+        swims: whether the animal swims, else it walks.
     """
 
     words: tuple[str, ...]

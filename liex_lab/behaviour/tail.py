@@ -1,4 +1,10 @@
-"""The tail's beat: where the tail turns back, how often in a second, and how far it swings."""
+"""Tail-beat analysis of a swimming animal: turning points of the swing, frequency and amplitude.
+
+Turning points are those of a peak detector with hysteresis (a reversal of at least 5 % of the
+length and 2 sd); their times are refined by the parabola through three samples. A swing lasts from
+one turning point to the next: frequency = 1 / (2 x its time), amplitude = half the distance between
+the two extremes. Bends and beats are counted as in ZebraZoom (Mirat et al. 2013).
+"""
 
 from __future__ import annotations
 
@@ -13,19 +19,21 @@ from liex_lab.tables.rows import stretches
 Array = NDArray[np.float64]
 
 SLOWEST_HZ = 1.0  # a slower swing to and fro is a turn of the body and no beat
-TRUSTED_SHARE = (
-    0.25  # of the frame rate: a faster beat may be another one seen through the camera's shutter
-)
+# of the frame rate: a faster beat may be another one seen through the camera's shutter
+TRUSTED_SHARE = 0.25
 _LEAST_SHARE = 0.05  # of the body's length: a smaller swing is none
 _LEAST_SD = 2.0  # nor is one of fewer standard deviations
 
 
 @dataclass(frozen=True)
 class TailBeat:
-    """Per frame (n,): the tail's angle where it turns back, else NaN; frequency and amplitude of
-    the swing it is in.
+    """The tail's beat in each of n frames.
 
-    amplitude_mm is half the way of the rear end from one side to the other.
+    Attributes:
+        extreme_rad: (n,) the tail's angle where it turns back, rad; NaN in all other frames.
+        frequency_hz: (n,) frequency of the swing that the frame is in, Hz; NaN at rest.
+        amplitude_mm: (n,) half the path of the rear end from one side to the other, mm; NaN at
+            rest.
     """
 
     extreme_rad: Array
@@ -34,12 +42,17 @@ class TailBeat:
 
 
 def tail_beat(shape: Shape, time_s: Array, number: NDArray[np.int64], step_s: float) -> TailBeat:
-    """The beat within each unbroken stretch `number` (n,); step_s: the usual time from frame to
-    frame.
+    """Frequency and amplitude of the tail's beat within each unbroken stretch.
 
-    A swing lasts from one turning point to the next; frequency = 1 / (2 x its time). Slower than
-    `SLOWEST_HZ` it is left empty, and so are one faster than a quarter of the frame rate and its
-    neighbours, for bends may be missing.
+    A swing lasts from one turning point to the next; frequency = 1 / (2 x its time). A swing slower
+    than `SLOWEST_HZ` is left empty, and so are one faster than a quarter of the frame rate
+    (`TRUSTED_SHARE`) and its neighbours, for bends may be missing.
+
+    Args:
+        shape: the posture of n frames of a body that swims.
+        time_s: (n,) times of the frames, s.
+        number: (n,) unbroken stretch of each frame, see `segments`.
+        step_s: the usual time from frame to frame, s; 0 gives an empty beat.
     """
     swing = shape.tail_mm
     angle = shape.tail_angle_rad
@@ -72,7 +85,18 @@ def tail_beat(shape: Shape, time_s: Array, number: NDArray[np.int64], step_s: fl
 
 
 def turning_points(values: Array, least: float) -> NDArray[np.int64]:
-    """Places where values (n,) turn back by `least` or more, after having come by as much."""
+    """Rows where a series turns back by `least` or more, after having come by as much.
+
+    A peak detector with hysteresis: highs and lows alternate. The first one counts only if the
+    series came by `least` before it.
+
+    Args:
+        values: (n,) the series, without NaN.
+        least: smallest reversal that counts, in the unit of `values`.
+
+    Returns:
+        (k,) int64 rows, in order.
+    """
     found: list[int] = []
     low = high = 0
     rising: bool | None = None
@@ -97,8 +121,17 @@ def turning_points(values: Array, least: float) -> NDArray[np.int64]:
 def vertex_times(
     time_s: Array, values: Array, rows: NDArray[np.int64], start: int, stop: int
 ) -> Array:
-    """Times of turning points `rows`, from the parabola through each and its two neighbours in
-    [start, stop).
+    """Times of turning points, from the parabola through each and its two neighbours.
+
+    Args:
+        time_s: (n,) times of the frames, s.
+        values: (n,) the series that turns.
+        rows: (k,) int64 rows of the turning points.
+        start: first row of the stretch.
+        stop: row after the last of the stretch; a point at either end keeps its frame's time.
+
+    Returns:
+        (k,) s, each between the times of its point's neighbours.
     """
     inner = rows[(rows > start) & (rows < stop - 1)]
     at = time_s[rows].copy()

@@ -1,4 +1,10 @@
-"""Which action follows upon which, and whether more often than chance would have it."""
+"""First-order transition matrix of actions, tested against quasi-independence (Goodman 1968).
+
+Expected: p(j after i) of a table with the counted row and column sums and an empty diagonal, fitted
+by iterative proportional fitting (Deming and Stephan 1940), for an action never follows itself.
+Observed n of n_from is compared with it by an exact two-sided binomial test per pair, and the p are
+corrected by Benjamini and Hochberg's procedure.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +28,18 @@ def transitions(
 ) -> pd.DataFrame:
     """The table `transitions` of one animal: every ordered pair of different actions.
 
-    Chance: each action is followed by another one in proportion to how often those occur. One
-    bout's action depends on the last one's only; longer patterns are not looked for.
+    By chance, each action is followed by another one in proportion to how often those occur. One
+    bout's action depends on the last one's only (first-order Markov); longer patterns are not
+    looked for.
+
+    Args:
+        bouts: the table `bouts`, in order of time.
+        words: the k words of the vocabulary; every action of `bouts` is one of them.
+        gaps: the table `gaps`.
+        longest_pause_s: bouts further apart than this do not follow each other, s.
+
+    Returns:
+        k (k - 1) rows with the columns `TRANSITIONS`.
     """
     counts = count_transitions(bouts, words, gaps, longest_pause_s)
     expected = by_chance(counts)
@@ -54,8 +70,16 @@ def transitions(
 def count_transitions(
     bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float
 ) -> Counts:
-    """(k, k) how often word j followed upon word i != j, without a gap or a longer nameless stretch
-    in between.
+    """(k, k) int64, how often word j followed upon word i != j.
+
+    A transition does not count across a gap with missing frames, or across an unnamed stretch
+    longer than `longest_pause_s`.
+
+    Args:
+        bouts: the table `bouts`, in order of time.
+        words: the k words of the vocabulary.
+        gaps: the table `gaps`.
+        longest_pause_s: longest time between two bouts that follow each other, s.
     """
     place = {word: k for k, word in enumerate(words)}
     code = np.array([place[word] for word in bouts["action"]], np.int64)
@@ -73,10 +97,15 @@ def count_transitions(
 
 
 def by_chance(counts: Counts) -> Array:
-    """(k, k) probability of j after i under quasi-independence: rows and columns as counted, the
-    diagonal empty.
+    """(k, k) probability of j after i under quasi-independence, by iterative proportional fitting.
 
-    NaN in the rows of actions that nothing followed.
+    Row and column sums are those counted, the diagonal is empty (Goodman 1968).
+
+    Args:
+        counts: (k, k) int64 transitions, zero on the diagonal.
+
+    Returns:
+        Rows add up to one; NaN in the rows of actions that nothing followed.
     """
     rows = counts.sum(axis=1).astype(float)
     columns = counts.sum(axis=0).astype(float)
@@ -96,7 +125,7 @@ def by_chance(counts: Counts) -> Array:
 
 
 def _binomial(n: int, total: int, chance: float) -> float:
-    """Two-sided p of n out of total; NaN where chance leaves no choice."""
+    """Two-sided p of the exact binomial test; NaN where chance leaves no choice."""
     if total == 0 or not 1e-9 < chance < 1.0 - 1e-9:
         return float("nan")
     from scipy.stats import binomtest

@@ -1,6 +1,4 @@
-"""The articulated body: its skeleton, its pose, the joints of a pose, and the surface
-around them.
-"""
+"""The articulated body: kinematic tree, pose, forward and inverse kinematics, surface, renderer."""
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton

@@ -1,5 +1,7 @@
-"""Kernel of forward kinematics: where all joints of many poses are, without NumPy's cost
-per joint.
+"""Kernels of forward kinematics (product of exponentials) for many poses, without NumPy's overhead.
+
+t_j = t_p + s R_p b_j, R_j = R_p Q_j exp(hat(w_j)), with exp by Rodrigues' formula; the twin of
+`kinematics.forward_kinematics`.
 """
 
 from __future__ import annotations
@@ -10,7 +12,12 @@ from numba import njit
 
 @njit(cache=True)
 def exp_so3(w, out):
-    """Rotation (3, 3) of a rotation vector (3,) rad."""
+    """Rotation of a rotation vector by Rodrigues' formula, with its series below 1e-4 rad.
+
+    Args:
+        w: (3,) rad.
+        out: (3, 3), out.
+    """
     th2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if th2 < 1e-8:
         a = 1.0 - th2 / 6.0
@@ -35,10 +42,18 @@ def exp_so3(w, out):
 
 @njit(cache=True)
 def place_joints(parents, offsets, rest, moves, rotation, translation, angles, scale, out):
-    """Positions (n, J, 3) mm of the joints of n poses into `out`; the kernel twin of `Pose.joints`.
+    """Positions of the joints of n poses; the kernel twin of `Pose.joints`.
 
-    rotation (n, 3, 3), translation (n, 3): of the root; angles (n, J, 3); scale (n,); moves (J,):
-    which joints turn.
+    Args:
+        parents: (J,) int64.
+        offsets: (J, 3) mm, bones in their parents' frames.
+        rest: (J, 3, 3) rotations at home.
+        moves: (J,) bool, which joints turn.
+        rotation: (n, 3, 3) of the root.
+        translation: (n, 3) mm of the root.
+        angles: (n, J, 3) rad.
+        scale: (n,) of the bones.
+        out: (n, J, 3) mm, out.
     """
     n_joints = parents.size
     turned = np.empty((n_joints, 3, 3))

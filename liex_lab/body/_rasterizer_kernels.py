@@ -1,9 +1,10 @@
-"""A z-buffer for triangle meshes: the kernel for one picture and drivers for a batch.
+"""Z-buffer rasteriser of triangle meshes: depth pictures, one or a batch.
 
-Depth is drawn as its inverse: 1 / z of a plane is linear in the pixel, so it is interpolated
-without perspective error, and the nearest surface is the largest value. Both sides of a triangle
-are drawn: in a closed surface the nearer side hides the other anyway, and where a bent body folds
-into itself a turned triangle can be the one that is seen.
+Pinhole projection u = fx x / z + cx, v = fy y / z + cy; inside a triangle, by barycentric
+coordinates, the inverse depth 1 / z is interpolated, which is linear in the pixel for a plane and
+so without perspective error; the buffer keeps the largest 1 / z (Catmull 1974). Both sides of a
+triangle are drawn: in a closed surface the nearer side hides the other anyway, and where a bent
+body folds into itself a turned triangle can be the one that is seen.
 """
 
 from __future__ import annotations
@@ -18,12 +19,23 @@ NEAR_MM = 1.0
 
 @njit(cache=True)
 def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse):
-    """Draw triangles (F, 3) into `inverse` (H, W), 1/mm: keeps the largest 1 / z under each pixel's
-    centre.
+    """Draw triangles into a picture of inverse depth.
 
-    vertices (V, 3) mm in a frame that (rotation, translation) carries into the camera's. (u0, v0)
-    is the picture's pixel that `inverse[0, 0]` shows. Triangles that reach behind NEAR_MM are left
+    Keeps the largest 1 / z under each pixel's centre. Triangles that reach behind NEAR_MM are left
     out.
+
+    Args:
+        vertices: (V, 3) mm in a frame that (rotation, translation) carries into the camera's.
+        faces: (F, 3) int32.
+        rotation: (3, 3).
+        translation: (3,) mm.
+        fx: focal length, px.
+        fy: focal length, px.
+        cx: principal point, px.
+        cy: principal point, px.
+        u0: the picture's column that `inverse[0, 0]` shows.
+        v0: the picture's row that `inverse[0, 0]` shows.
+        inverse: (H, W) 1/mm, changed in place; 0 where nothing was drawn.
     """
     projected = np.empty((vertices.shape[0], 3))
     for i in range(vertices.shape[0]):
@@ -86,7 +98,12 @@ def _draw_triangle(p, a, b, c, inverse):
 
 @njit(cache=True)
 def to_depth(inverse, depth):
-    """Depth (H, W) mm from inverse depth (H, W); 0 where nothing was drawn."""
+    """Depth from inverse depth; 0 where nothing was drawn.
+
+    Args:
+        inverse: (H, W) 1/mm.
+        depth: (H, W) mm, out.
+    """
     for row in range(inverse.shape[0]):
         for column in range(inverse.shape[1]):
             value = inverse[row, column]
@@ -95,8 +112,16 @@ def to_depth(inverse, depth):
 
 @njit(cache=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth (n, H, W) mm of meshes (n, V, 3), one after the other; arguments as in `draw`, leading
-    axis n.
+    """Depth pictures of n meshes, one after the other; see `draw`.
+
+    Args:
+        vertices: (n, V, 3) mm.
+        faces: (F, 3) int32, shared.
+        rotation: (n, 3, 3).
+        translation: (n, 3) mm.
+        intrinsics: (n, 4) fx, fy, cx, cy px.
+        origin: (n, 2) the picture's pixel (u, v) at the window's top left.
+        depth: (n, H, W) mm, out; 0 where nothing was drawn.
     """
     inverse = np.empty(depth.shape[1:])
     for i in range(len(vertices)):
@@ -119,8 +144,16 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
 
 @njit(cache=True, parallel=True, nogil=True)
 def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth (n, H, W) mm of meshes (n, V, 3) on all threads; arguments as in `draw`, leading axis
-    n.
+    """Depth pictures of n meshes on all threads; see `draw`.
+
+    Args:
+        vertices: (n, V, 3) mm.
+        faces: (F, 3) int32, shared.
+        rotation: (n, 3, 3).
+        translation: (n, 3) mm.
+        intrinsics: (n, 4) fx, fy, cx, cy px.
+        origin: (n, 2) the picture's pixel (u, v) at the window's top left.
+        depth: (n, H, W) mm, out; 0 where nothing was drawn.
     """
     for i in prange(len(vertices)):
         inverse = np.zeros(depth.shape[1:])

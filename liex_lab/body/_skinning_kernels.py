@@ -1,10 +1,14 @@
-"""Kernels that lay a closed triangle mesh around the joints of one pose; drivers that do it for a
-batch.
+"""Kernels that lay generalised cylinders around the joints of a pose: closed triangle meshes.
 
-Every part of a mesh is a *tube*: a pole, some rings, a pole. A body is one tube of ellipses along
-the spine, an ear or a foot an ellipsoid (a tube as well), a tail a thin tube, a capsule a straight
-tube around one bone. Lengths in mm, in the frame in which the joints are given; the tail needs that
-frame's z up and its floor at z = 0.
+Every part of a mesh is a *tube*: a pole, some rings, a pole. A body is one tube of superellipses
+along the spine, an ear or a foot an ellipsoid (a tube as well), a tail a thin tube, a capsule a
+straight tube around one bone. The mid-axis of a body is a chord-length Catmull-Rom spline through
+the joints, written as a cubic Hermite curve:
+
+    c(s) = h00 p_k + h10 L m_k + h01 p_k+1 + h11 L m_k+1,
+
+with tangents m of the parabola through three joints. Lengths in mm, in the frame in which the
+joints are given; the tail needs that frame's z up and its floor at z = 0.
 """
 
 from __future__ import annotations
@@ -25,8 +29,14 @@ CAPSULE_SEGMENTS = 10
 
 
 def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
-    """Triangles (F, 3) of a closed tube: vertex 0 is the first pole, then ring after ring, the last
-    the other pole.
+    """Triangles of a closed tube: first pole, ring after ring, last pole.
+
+    Args:
+        n_rings: rings between the poles.
+        n_segments: vertices of a ring.
+
+    Returns:
+        (F, 3) int32; vertex 0 is the first pole, the last the other.
     """
     faces = []
     for k in range(n_segments):
@@ -42,7 +52,11 @@ def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
 
 
 def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
-    """Triangles (F, 3) of several tubes (n_rings, n_segments) whose vertices follow one another."""
+    """Triangles (F, 3) int32 of several tubes whose vertices follow one another.
+
+    Args:
+        tubes: (n_rings, n_segments) of each.
+    """
     faces = []
     start = 0
     for n_rings, n_segments in tubes:
@@ -53,11 +67,17 @@ def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
 
 @njit(cache=True)
 def spine_frame(joints, rotations, arc, station, out):
-    """Centre, forward, left and up of the mid-axis at `station` (share of the spine's length) into
-    `out` (4, 3).
+    """Centre, forward, left and up of the mid-axis at one station.
 
-    Between the joints (J, 3) runs a Catmull-Rom curve, outside it goes straight on. Up blends the
-    joints' z axes (rotations (J, 3, 3)). `arc` (J,) mm: length of the chain up to each joint.
+    Between the joints runs a Catmull-Rom curve, outside it goes straight on. Up blends the joints'
+    z axes.
+
+    Args:
+        joints: (J, 3) mm of a chain.
+        rotations: (J, 3, 3) of its joints.
+        arc: (J,) mm, length of the chain up to each joint.
+        station: share of the spine's length.
+        out: (4, 3), out: centre mm, and three unit vectors.
     """
     n_joints = joints.shape[0]
     total = arc[n_joints - 1]
@@ -121,7 +141,12 @@ def _cross(rows, a, b, out):
 
 @njit(cache=True)
 def chain_arc(joints, arc):
-    """Fill `arc` (J,) mm with the chain's length up to each of the joints (J, 3)."""
+    """The chain's length up to each joint.
+
+    Args:
+        joints: (J, 3) mm.
+        arc: (J,) mm, out.
+    """
     arc[0] = 0.0
     for j in range(1, joints.shape[0]):
         square = 0.0
@@ -165,8 +190,16 @@ def _body(
 
 @njit(cache=True)
 def ellipsoid(frame, radii, out, start):
-    """An ellipsoid about frame (4, 3) = centre, forward, left, up with radii (3,) mm into `out`
-    from row `start`.
+    """An ellipsoid's vertices.
+
+    Args:
+        frame: (4, 3) centre, forward, left, up.
+        radii: (3,) mm forward, left, up.
+        out: (V, 3) mm, out.
+        start: its first row.
+
+    Returns:
+        The row behind its last.
     """
     at = start
     for r in range(BLOB_RINGS + 2):
@@ -254,8 +287,20 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
 def skin_tube(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
-    """Vertices (V, 3) mm of one animal with a tubular body: trunk, blobs, tail. Shapes as in
-    `BodyShape`.
+    """Vertices of one animal with a tubular body: trunk, ellipsoids, tail; see `BodyShape`.
+
+    Args:
+        joints: (J, 3) mm of a chain.
+        rotations: (J, 3, 3) of its joints.
+        girth: multiplies all lengths of the shape.
+        stations: (R,) shares of the spine's length.
+        half_width: (R,) mm.
+        half_height: (R,) mm.
+        power: of the superellipse.
+        blobs: (B, 6) ellipsoids.
+        tail: (3,) length, radius at the rump, radius at the tip.
+        bends: (TAIL_RINGS,) rad.
+        out: (V, 3) mm, out.
     """
     arc = np.empty(joints.shape[0])
     frame = np.empty((4, 3))
@@ -272,7 +317,21 @@ def skin_tube(
 def skin_tubes(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
-    """`skin_tube` for a batch (n, ...), one after the other; stations (R,) are shared."""
+    """`skin_tube` for a batch, one after the other.
+
+    Args:
+        joints: (n, J, 3) mm.
+        rotations: (n, J, 3, 3).
+        girth: (n,).
+        stations: (R,), shared.
+        half_width: (n, R) mm.
+        half_height: (n, R) mm.
+        power: (n,).
+        blobs: (n, B, 6).
+        tail: (n, 3).
+        bends: (n, TAIL_RINGS) rad.
+        out: (n, V, 3) mm, out.
+    """
     for i in range(len(joints)):
         skin_tube(
             joints[i],
@@ -293,7 +352,21 @@ def skin_tubes(
 def skin_tubes_parallel(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
-    """`skin_tube` for a batch (n, ...) on all threads; stations (R,) are shared."""
+    """`skin_tube` for a batch, on all threads.
+
+    Args:
+        joints: (n, J, 3) mm.
+        rotations: (n, J, 3, 3).
+        girth: (n,).
+        stations: (R,), shared.
+        half_width: (n, R) mm.
+        half_height: (n, R) mm.
+        power: (n,).
+        blobs: (n, B, 6).
+        tail: (n, 3).
+        bends: (n, TAIL_RINGS) rad.
+        out: (n, V, 3) mm, out.
+    """
     for i in prange(len(joints)):
         skin_tube(
             joints[i],
@@ -312,9 +385,17 @@ def skin_tubes_parallel(
 
 @njit(cache=True, parallel=True)
 def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out):
-    """Vertices of C capsules, round at both ends, for a batch: rotations (n, J, 3, 3), joints (n,
-    J, 3), which (C, 2) joints carry the ends, offsets (n, C, 2, 3) mm times scale (n,), radii (n,
-    C, 2) mm times girth (n,); out (n, V, 3).
+    """Vertices of C tapered capsules, round at both ends, for a batch.
+
+    Args:
+        rotations: (n, J, 3, 3).
+        joints: (n, J, 3) mm.
+        scale: (n,) multiplies the offsets.
+        girth: (n,) multiplies the radii.
+        which: (C, 2) int64, the joints that carry the ends.
+        offsets: (n, C, 2, 3) mm of the ends in the joints' frames.
+        radii: (n, C, 2) mm.
+        out: (n, V, 3) mm, out.
     """
     for i in prange(len(joints)):
         at = 0

@@ -1,5 +1,8 @@
-"""A body made of capsules: one around every bone, and more where a skeleton's [surface] table puts
-them.
+"""Body model of tapered capsules (sphere-swept segments) on a skeleton.
+
+One capsule around every bone, and more where a skeleton's [surface] table puts them. Its two ends
+are points in the frames of two joints, p_e = t_j + scale R_j offset_e, each with a radius of its
+own; the surface is a straight tube between them, round at both ends.
 """
 
 from __future__ import annotations
@@ -22,12 +25,15 @@ PARTS = ("capsules", "beyond")
 
 @dataclass(frozen=True)
 class Capsules:
-    """C tapered capsules that move with a skeleton; one body, or a batch (n) of them. Lengths in mm
-    at scale 1.
+    """C tapered capsules that move with a skeleton; one body, or a batch (n) of them.
 
-    joints (C, 2): which joints carry the two ends; offsets (..., C, 2, 3): where the ends lie in
-    these joints' frames; radii (..., C, 2) at the ends; fur (...) as in `BodyShape`. The first J -
-    1 capsules are the skeleton's bones, in order.
+    Lengths in mm at scale 1. The first J - 1 capsules are the skeleton's bones, in order.
+
+    Attributes:
+        joints: (C, 2) int64, the joints that carry the two ends.
+        offsets: (..., C, 2, 3) mm, where the ends lie in these joints' frames.
+        radii: (..., C, 2) mm at the ends.
+        fur: (...), as in `BodyShape`.
     """
 
     joints: NDArray[np.int64]
@@ -36,16 +42,25 @@ class Capsules:
     fur: Array = field(default_factory=lambda: np.array(0.0))
 
     def __len__(self) -> int:
+        """Number of bodies in a batch."""
         return len(self.fur)
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> Capsules:
-        """One body, or some, out of a batch."""
+        """One body, or some, out of a batch.
+
+        Args:
+            index: a number, a slice, or row numbers.
+        """
         return replace(
             self, offsets=self.offsets[index], radii=self.radii[index], fur=self.fur[index]
         )
 
     def broadcast(self, n: int) -> Capsules:
-        """A batch (n,) of this one body, or this batch."""
+        """A batch (n,) of this one body, or this batch.
+
+        Args:
+            n: bodies.
+        """
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
         offsets, radii, fur = (
@@ -55,8 +70,16 @@ class Capsules:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Capsules:
-        """The body that a skeleton's [surface] describes: radii_mm at the joints, and
-        [[surface.capsules]].
+        """The body that a skeleton's [surface] describes.
+
+        From radii_mm at the joints, and the list [[surface.capsules]].
+
+        Args:
+            skeleton: with its [surface] table.
+
+        Raises:
+            LiexError: there is not one positive radius for each joint, or a capsule is stated
+                wrongly.
         """
         radii = np.array(skeleton.surface.get("radii_mm", []), float)
         if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
@@ -76,8 +99,15 @@ class Capsules:
 
     @staticmethod
     def listed(skeleton: Skeleton, part: str) -> Capsules:
-        """The capsules of one of the lists in a skeleton's [surface]: 'capsules' belong to the
-        body, and 'beyond' says where something may go on that does not, as an arm behind a hand.
+        """The capsules of one of the lists in a skeleton's [surface].
+
+        Args:
+            skeleton: with its [surface] table.
+            part: 'capsules', which belong to the body, or 'beyond', where something may go on that
+                does not, as an arm behind a hand.
+
+        Raises:
+            LiexError: an unknown key or joint, or numbers that are not as many as they should be.
         """
         rows = [_parsed(table, skeleton, part) for table in skeleton.surface.get(part, [])]
         return Capsules(
@@ -88,20 +118,27 @@ class Capsules:
 
     @property
     def faces(self) -> NDArray[np.int32]:
-        """Triangles (F, 3) of the vertices that `vertices` makes."""
+        """Triangles (F, 3) int32 of the vertices that `vertices` makes."""
         return _skin.joined_faces(
             [(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * len(self.joints)
         )
 
     @property
     def n_vertices(self) -> int:
-        """Vertices of one pose's mesh."""
+        """Vertices V of one pose's mesh."""
         return len(self.joints) * (_skin.CAPSULE_RINGS * _skin.CAPSULE_SEGMENTS + 2)
 
     def vertices(self, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
-        """Mesh vertices (n, V, 3) mm for joints (n, J, 3, 3) and (n, J, 3) mm.
+        """Mesh vertices in many poses.
 
-        scale (n,) multiplies the offsets, girth (n,) the radii.
+        Args:
+            rotations: (n, J, 3, 3) of the joints.
+            positions: (n, J, 3) mm of the joints.
+            scale: (n,) multiplies the offsets.
+            girth: (n,) multiplies the radii.
+
+        Returns:
+            (n, V, 3) mm, in the frame of the joints.
         """
         body = self.broadcast(len(positions))
         out = np.empty((len(positions), self.n_vertices, 3))

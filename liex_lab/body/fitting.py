@@ -1,4 +1,15 @@
-"""Inverse kinematics: the poses of a skeleton that come nearest to given points of its body."""
+"""Inverse kinematics: least-squares fit of poses to measured points of the body.
+
+Levenberg-Marquardt on the manifold of poses, many poses at once. The cost of a pose is
+
+    sum_m |x_m(pose) - y_m|^2 + (1 mm)^2 sum |angle - home|^2,
+
+where home is the angle nearest to zero within the limits: the second term decides what the points
+leave open. A step turns and moves the base by a twist on the right, T exp(xi); it changes every
+joint's free angles and the logarithm of the scale. The damping is a share of the curvature's
+diagonal (Marquardt 1963), divided by 5 after a step that helps, else multiplied by 4; a coordinate
+at its limit and pushed against it is held (projected, active set).
+"""
 
 from __future__ import annotations
 
@@ -21,7 +32,12 @@ _REST_MM = 1.0
 
 @dataclass(frozen=True)
 class Fit:
-    """Poses (n) fitted to points, and the distance (n, M) mm that remains at each of them."""
+    """Poses fitted to points.
+
+    Attributes:
+        pose: (n) poses, in the points' frame.
+        residual_mm: (n, M) distance that remains at each point.
+    """
 
     pose: Pose
     residual_mm: Array
@@ -36,14 +52,18 @@ def fit_poses(
     n_steps: int = 60,
     keep_scale: bool = False,
 ) -> Fit:
-    """Poses whose points come nearest, in the sense of least squares, to measured ones (n, M, 3)
-    mm.
+    """Poses whose points come nearest to measured ones, in the sense of least squares.
 
-    points_of_joints (M, J): each point as a weighted mean of joints. start (n): where the search
-    begins; its angles should be within the limits. Levenberg and Marquardt's method on the
-    manifold, all poses at once: a step turns the base on the right, turns every joint about its
-    free axes, scales all bones, and stops at the limits of the joints. keep_scale leaves the bones
-    as long as they are.
+    Args:
+        skeleton: whose poses.
+        points: (n, M, 3) mm, measured, in the frame of the poses.
+        points_of_joints: (M, J) each point as a weighted mean of joints.
+        start: (n) poses where the search begins; their angles should be within the limits.
+        n_steps: steps that are tried.
+        keep_scale: whether the bones stay as long as they are.
+
+    Returns:
+        The fitted poses, within the joints' limits, and their residuals.
     """
     lower = skeleton.limits[..., 0]
     upper = skeleton.limits[..., 1]

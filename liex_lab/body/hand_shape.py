@@ -1,5 +1,8 @@
-"""Hands of many people: how long and thick their fingers are, how broad their palms, and the arm
-that carries them.
+"""Parametric hand and arm shapes: random bone lengths, girths and palms, as capsules.
+
+Log-normal factors (clipped at two standard deviations) multiply the preset's bone lengths finger by
+finger, the breadth of the palm, and the capsules' radii. A forearm, a sleeve and an upper arm are
+further capsules behind the wrist, placed from where the hand points.
 """
 
 from __future__ import annotations
@@ -31,9 +34,11 @@ N_ARM_CAPSULES = 4
 class HandShape:
     """The hands of n people. Lengths in mm at scale 1.
 
-    offsets (n, J, 3): the joints as in `Skeleton.offsets`; flesh: capsules, a batch (n); arm (n,
-    4): radii at wrist and elbow, how much wider than thick, and where on the forearm a sleeve
-    begins (1: none), as a share.
+    Attributes:
+        offsets: (n, J, 3) mm, the joints as in `Skeleton.offsets`.
+        flesh: capsules, a batch (n).
+        arm: (n, 4) radii mm at wrist and elbow, how much wider than thick, and where on the forearm
+            a sleeve begins (1: none), as a share.
     """
 
     offsets: Array
@@ -41,15 +46,26 @@ class HandShape:
     arm: Array
 
     def __len__(self) -> int:
+        """Number of people."""
         return len(self.offsets)
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> HandShape:
-        """Some of the people."""
+        """Some of the people.
+
+        Args:
+            index: a slice, or row numbers.
+        """
         return HandShape(self.offsets[index], self.flesh[index], self.arm[index])
 
     def joints(self, skeleton: Skeleton, pose: Pose) -> tuple[Array, Array]:
-        """Rotations (n, J, 3, 3) and positions (n, J, 3) mm of each person's own hand in a pose
-        (n).
+        """Joints of each person's own hand in a pose: forward kinematics with own bone lengths.
+
+        Args:
+            skeleton: of the hand.
+            pose: (n) poses.
+
+        Returns:
+            Rotations (n, J, 3, 3) and positions (n, J, 3) mm, in the poses' frame.
         """
         rotations = pose.frames(skeleton).rotation
         positions = np.empty(self.offsets.shape)
@@ -64,14 +80,30 @@ class HandShape:
 def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> HandShape:
     """Draw the hands of n people of a family.
 
-    'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds hands that no
-    model is trained on: short and plump ones, and long and slender ones.
+    Args:
+        rng: where chance comes from.
+        skeleton: of the hand, with names that begin with a finger's and an underscore.
+        family: 'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds
+            hands that no model is trained on: short and plump ones, and long and slender ones.
+        n: people.
+
+    Returns:
+        A batch (n) of hands.
+
+    Raises:
+        LiexError: there is no such family.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
     wide = {"train": 1.0, "augmented": 1.5, "other": 1.0}[family]
 
     def draw(sd: float, *shape: int) -> Array:
+        """Log-normal factors (n, *shape), clipped at two standard deviations.
+
+        Args:
+            sd: of their logarithm, before the family's own factor.
+            *shape: axes behind n.
+        """
         return np.exp(wide * sd * np.clip(rng.standard_normal((n, *shape)), -2.0, 2.0))
 
     lengths = draw(0.03, 5)
@@ -111,12 +143,20 @@ def forearms(
     scale: Array,
     bent: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Frames (n, 3, 3) of forearms, x from the elbow to the wrist, and elbows (n, 3) mm of hands in
-    the camera frame.
+    """Frames and elbows of the forearms that carry hands.
 
-    rotations (n, J, 3, 3), positions (n, J, 3) mm; scale (n,). The wrist bends as wrists do, and
-    further where the arm would otherwise come from the camera's side: who holds out a hand stands
-    behind it. bent (n, 3) rad: the wrists' bends where they are known; else each is drawn.
+    The wrist bends as wrists do, and further where the arm would otherwise come from the camera's
+    side: who holds out a hand stands behind it.
+
+    Args:
+        rng: where chance comes from.
+        rotations: (n, J, 3, 3) of the hands' joints, camera frame.
+        positions: (n, J, 3) mm of the joints, camera frame.
+        scale: (n,) of the hands.
+        bent: (n, 3) rad, the wrists' bends where they are known; None draws each.
+
+    Returns:
+        Frames (n, 3, 3), x from the elbow to the wrist, and elbows (n, 3) mm, camera frame.
     """
     n = len(scale)
     bend = np.zeros((n, 3))
@@ -134,8 +174,17 @@ def forearms(
 
 
 def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm: Array) -> Array:
-    """Meshes (n, V, 3) mm of forearm, sleeve and upper arm; frame and elbow from `forearms`,
-    shoulder (n, 3) mm, scale (n,), arm (n, 4) as in `HandShape`.
+    """Meshes of forearm, sleeve and upper arm: four capsules for each.
+
+    Args:
+        frame: (n, 3, 3) of the forearms, from `forearms`.
+        elbow: (n, 3) mm, from `forearms`.
+        shoulder: (n, 3) mm, in the same frame.
+        scale: (n,) of the hands.
+        arm: (n, 4) as in `HandShape`.
+
+    Returns:
+        (n, V, 3) mm.
     """
     n = len(scale)
     wrist = elbow + (scale * ARM_MM)[:, None] * frame[:, :, 0]

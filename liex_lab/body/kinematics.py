@@ -1,4 +1,11 @@
-"""Forward kinematics in batches, and its inverse for chains of known joint positions."""
+"""Forward kinematics by the product of exponentials, and analytic inverse kinematics of a chain.
+
+Lie-X section 3: with parent p, bone offset b_j, rest rotation Q_j and rotation vector w_j,
+
+    t_j = t_p + s R_p b_j,   R_j = R_p Q_j exp(hat(w_j)).
+
+The inverse aims one bone after the other by the smallest rotation that does it.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +21,16 @@ Array = NDArray[np.float64]
 def forward_kinematics(
     skeleton: Skeleton, root: SE3, angles: Array, scale: Array
 ) -> tuple[Array, Array]:
-    """Joint rotations (..., J, 3, 3) and positions (..., J, 3) mm by the product of exponentials
-    (Lie-X section 3).
+    """Rotations and positions of all joints of many poses, by the product of exponentials.
 
-    root: T_frame_root (...); angles (..., J, 3) rad relative to the parent; scale (...) of the
-    bones.
+    Args:
+        skeleton: the kinematic tree.
+        root: T_frame_root (...), mm.
+        angles: (..., J, 3) rad, relative to the parent.
+        scale: (...) of the bones.
+
+    Returns:
+        Joint rotations (..., J, 3, 3) and positions (..., J, 3) mm, in the root's outer frame.
     """
     local = skeleton.rest @ so3.exp(angles)
     n_joints = skeleton.n_joints
@@ -36,10 +48,17 @@ def forward_kinematics(
 
 
 def aim(direction_from: Array, direction_to: Array) -> Array:
-    """The smallest rotation vectors (..., 3) rad that turn directions (..., 3) onto others (...,
-    3).
+    """The smallest rotation vectors that turn directions onto others.
 
-    Opposite directions have no smallest rotation; they turn by pi about some perpendicular axis.
+    The axis is a x b, the angle atan2(|a x b|, a . b). Opposite directions have no smallest
+    rotation; they turn by pi about some perpendicular axis.
+
+    Args:
+        direction_from: (..., 3), any length but 0.
+        direction_to: (..., 3), any length but 0.
+
+    Returns:
+        (..., 3) rad.
     """
     a = _unit(direction_from)
     b = _unit(direction_to)
@@ -66,11 +85,18 @@ def _unit(v: Array) -> Array:
 
 
 def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3, Array, Array]:
-    """Root (...), angles (..., J, 3) and scale (...) of the chain through joint positions (..., J,
-    3) mm.
+    """Root, angles and scale of the chain through given joint positions.
 
-    up (3,) or (..., 3) is where the base's z axis should point as far as its bone allows. Serves
-    skeletons of one chain (mouse, fish): every joint but the last has exactly one child.
+    Serves skeletons of one chain (mouse, fish): every joint but the last has exactly one child.
+
+    Args:
+        skeleton: one chain of joints.
+        joints: (..., J, 3) mm.
+        up: (3,) or (..., 3), where the base's z axis should point as far as its bone allows; for a
+            base that points straight along it, another axis stands in.
+
+    Returns:
+        Root (...), angles (..., J, 3) rad and scale (...).
     """
     children = skeleton.next_joint
     along = joints[..., 1:, :] - joints[..., skeleton.parents[1:], :]

@@ -1,5 +1,13 @@
-"""A body made of a user's own triangle mesh: bound to the bones at home, it follows them in every
-pose.
+"""Linear blend skinning of a user's own triangle mesh.
+
+Every vertex follows the two bones that are nearest at home, with weights 1 / distance^4 of sum 1
+(skeleton-subspace deformation; Magnenat-Thalmann et al. 1988, Lewis et al. 2000):
+
+    v' = sum_b w_b (p_b + R_b (scale along_b + girth across_b))
+
+R_b, p_b is the frame of the joint that carries bone b; along and across are the parts of the
+vertex's home position in that frame, along the bone and across it, so that length and girth vary
+apart.
 """
 
 from __future__ import annotations
@@ -22,13 +30,18 @@ _SHARPNESS = 4  # a bone's pull falls off with the distance to this power
 
 @dataclass(frozen=True)
 class MeshBody:
-    """A mesh of V vertices that moves with a skeleton by linear blending; one body, or a batch (n).
-    mm at scale 1.
+    """A mesh of V vertices that moves with a skeleton; one body, or a batch (n).
 
-    faces (F, 3); bones (V, B): the joints that end the bones which a vertex follows; weight (V, B),
-    of sum 1; along and across (V, B, 3): where the vertex lies in the frame that carries the bone,
-    along it and across; width (..., J): the girth at each joint over the file's; fur (...) as in
-    `BodyShape`.
+    Lengths in mm at scale 1.
+
+    Attributes:
+        faces: (F, 3) int32.
+        bones: (V, B) int64, the joints that end the bones which a vertex follows.
+        weight: (V, B), of sum 1.
+        along: (V, B, 3) mm, the vertex in the frame that carries the bone: the part along the bone.
+        across: (V, B, 3) mm, the part across it.
+        width: (..., J), the girth at each joint over the file's.
+        fur: (...), as in `BodyShape`.
     """
 
     faces: NDArray[np.int32]
@@ -40,14 +53,23 @@ class MeshBody:
     fur: Array = field(default_factory=lambda: np.array(0.0))
 
     def __len__(self) -> int:
+        """Number of bodies in a batch."""
         return len(self.fur)
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> MeshBody:
-        """One body, or some, out of a batch."""
+        """One body, or some, out of a batch.
+
+        Args:
+            index: a number, a slice, or row numbers.
+        """
         return replace(self, width=self.width[index], fur=self.fur[index])
 
     def broadcast(self, n: int) -> MeshBody:
-        """A batch (n,) of this one body, or this batch."""
+        """A batch (n,) of this one body, or this batch.
+
+        Args:
+            n: bodies.
+        """
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
         return replace(
@@ -58,7 +80,14 @@ class MeshBody:
 
     @staticmethod
     def of(skeleton: Skeleton) -> MeshBody:
-        """The mesh of a skeleton's [surface] table, bound to the bones that are nearest at home."""
+        """The mesh of a skeleton's [surface] table, bound to the bones that are nearest at home.
+
+        Args:
+            skeleton: with vertices_mm and faces in its [surface].
+
+        Raises:
+            LiexError: vertices or faces are not finite triples, or a face names no vertex.
+        """
         table = skeleton.surface
         vertices = np.array(table["vertices_mm"], float)
         faces = np.array(table["faces"], np.int64)
@@ -107,15 +136,23 @@ class MeshBody:
 
     @property
     def n_vertices(self) -> int:
-        """Vertices of one pose's mesh."""
+        """Vertices V of one pose's mesh."""
         return len(self.weight)
 
     def vertices(
         self, skeleton: Skeleton, rotations: Array, positions: Array, scale: Array, girth: Array
     ) -> Array:
-        """Mesh vertices (n, V, 3) mm for joints (n, J, 3, 3) and (n, J, 3) mm.
+        """Mesh vertices in many poses.
 
-        scale (n,) multiplies lengths along the bones, girth (n,) those across.
+        Args:
+            skeleton: the one to which the mesh is bound.
+            rotations: (n, J, 3, 3) of the joints.
+            positions: (n, J, 3) mm of the joints.
+            scale: (n,) multiplies lengths along the bones.
+            girth: (n,) multiplies those across.
+
+        Returns:
+            (n, V, 3) mm, in the frame of the joints.
         """
         body = self.broadcast(len(positions))
         out = np.empty((len(positions), self.n_vertices, 3))
@@ -140,7 +177,7 @@ class MeshBody:
 def _skin_mesh(
     rotations, positions, scale, girth, carrier, bones, weight, along, across, width, out
 ):
-    """Linear blending for a batch; shapes as in `MeshBody`, out (n, V, 3)."""
+    """Linear blend skinning of a batch into out (n, V, 3); carrier (V, B) joints."""
     for i in prange(len(positions)):
         for v in range(len(weight)):
             for axis in range(3):

@@ -1,4 +1,9 @@
-"""A pose: a point on the manifold of SE(3) chains, one or a batch."""
+"""A pose: root transform in SE(3), joint rotation vectors and one scale, of one animal or a batch.
+
+The kinematic chain of Lie-X section 3 in coordinates: joint j's transform relative to its parent is
+exp of a rotation vector about its free axes, behind a fixed bone; the product of these exponentials
+along the tree gives every joint (`forward_kinematics`).
+"""
 
 from __future__ import annotations
 
@@ -20,9 +25,11 @@ Array = NDArray[np.float64]
 class Pose:
     """Skeleton coordinates, one pose or a batch (...).
 
-    root: T_frame_root, the base joint in the frame in which the pose lives; angles (..., J, 3) rad,
-    rotation vectors of each joint relative to its parent, zero at the base and on axes that are not
-    free; scale (...) of all bones.
+    Attributes:
+        root: T_frame_root (...), the base joint in the frame in which the pose lives, mm.
+        angles: (..., J, 3) rad, rotation vectors of each joint relative to its parent, zero at the
+            base and on axes that are not free.
+        scale: (...) of all bones.
     """
 
     root: SE3
@@ -31,13 +38,22 @@ class Pose:
 
     @staticmethod
     def home(skeleton: Skeleton, *batch: int) -> Pose:
-        """The straight pose at the origin, pointing along x, or a batch of it."""
+        """The straight pose at the origin, pointing along x, or a batch of it.
+
+        Args:
+            skeleton: whose pose.
+            *batch: shape of the batch; none for one pose.
+        """
         return Pose(SE3.identity(*batch), np.zeros((*batch, skeleton.n_joints, 3)), np.ones(batch))
 
     def __getitem__(
         self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]
     ) -> Pose:
-        """Some poses out of a batch."""
+        """Some poses out of a batch.
+
+        Args:
+            index: a mask, row numbers, a slice, a number, or a tuple for several batch axes.
+        """
         return Pose(
             SE3(self.root.rotation[index], self.root.translation[index]),
             self.angles[index],
@@ -45,21 +61,37 @@ class Pose:
         )
 
     def frames(self, skeleton: Skeleton) -> SE3:
-        """T_frame_joint of every joint, a batch (..., J)."""
+        """T_frame_joint of every joint, a batch (..., J), mm.
+
+        Args:
+            skeleton: whose pose it is.
+        """
         rotation, position = forward_kinematics(skeleton, self.root, self.angles, self.scale)
         return SE3(rotation, position)
 
     def joints(self, skeleton: Skeleton) -> Array:
-        """Joint positions (..., J, 3) mm in the pose's frame."""
+        """Joint positions (..., J, 3) mm in the pose's frame.
+
+        Args:
+            skeleton: whose pose it is.
+        """
         return forward_kinematics(skeleton, self.root, self.angles, self.scale)[1]
 
     def moved(self, T_new_old: SE3) -> Pose:
-        """The same posture in another frame."""
+        """The same posture in another frame.
+
+        Args:
+            T_new_old: carries the present frame into the new one; broadcasts with the batch.
+        """
         return Pose(T_new_old @ self.root, self.angles, self.scale)
 
     @staticmethod
     def join(parts: Sequence[Pose]) -> Pose:
-        """The poses of several batches (n), one after the other."""
+        """The poses of several batches (n), one after the other.
+
+        Args:
+            parts: at least one batch with one batch axis.
+        """
         root = SE3(
             *(
                 np.concatenate([getattr(p.root, name) for p in parts])
@@ -74,11 +106,16 @@ class Pose:
 
     @staticmethod
     def from_joints(skeleton: Skeleton, joints: ArrayLike, up: ArrayLike) -> Pose:
-        """The pose (...) whose bones point along given joint positions (..., J, 3) mm of one chain.
+        """The pose (...) whose bones point along given joint positions of one chain.
 
         Each joint turns by the smallest rotation that aims its bone; the base's roll is chosen so
-        that its z axis lies as near to `up` (3,) as its bone allows. Bones keep their proportions;
-        the scale comes from the total length.
+        that its z axis lies as near to `up` as its bone allows. Bones keep their proportions; the
+        scale comes from the total length.
+
+        Args:
+            skeleton: one chain of joints (mouse, fish).
+            joints: (..., J, 3) mm.
+            up: (3,) or (..., 3), any length.
         """
         root, angles, scale = chain_from_joints(
             skeleton, np.asarray(joints, float), np.asarray(up, float)

@@ -1,5 +1,9 @@
-"""Body shapes: the girth, limbs, tail and fur around a skeleton, and the families from which
-animals are drawn.
+"""Parametric body shapes of a tubular animal, and the random families from which animals are drawn.
+
+The trunk is a generalised cylinder: superellipses |x / a|^p + |y / b|^p = 1 across the mid-axis
+(Barr 1981), whose half widths a and half heights b are given at stations along the spine; ears and
+feet are ellipsoids, the tail is a thin tube. A family draws smooth random factors on the profiles,
+so that a model trained on rendered animals meets the variation of real ones (domain randomisation).
 """
 
 from __future__ import annotations
@@ -22,13 +26,17 @@ _HULL_SHARE = 0.5  # of the wild ones
 
 @dataclass(frozen=True)
 class BodyShape:
-    """What stands around a tubular animal's mid-axis, one shape or a batch (...). Lengths in mm at
-    scale 1.
+    """What stands around a tubular animal's mid-axis, one shape or a batch (...).
 
-    half_width, half_height (..., R) at the tube's stations; power (...) of the superellipse across
-    (2 is an ellipse); blobs (..., B, 6): station, left, up of the centre, radii forward, left, up;
-    tail (..., 3): length, radius at the rump, radius at the tip; fur (...) from 0 (sleek) to 1
-    (long and soft): how much a sensor loses at the outline.
+    Lengths in mm at scale 1.
+
+    Attributes:
+        half_width: (..., R) mm at the tube's stations.
+        half_height: (..., R) mm at the tube's stations.
+        power: (...) of the superellipse across (2 is an ellipse).
+        blobs: (..., B, 6) ellipsoids: station, left and up of the centre, radii forward, left, up.
+        tail: (..., 3) length, radius at the rump, radius at the tip.
+        fur: (...) from 0 (sleek) to 1 (long and soft): how much a sensor loses at the outline.
     """
 
     half_width: Array
@@ -40,7 +48,14 @@ class BodyShape:
 
     @staticmethod
     def default(skeleton: Skeleton) -> BodyShape:
-        """The animal that the skeleton's [surface] table describes."""
+        """The animal that the skeleton's [surface] table describes.
+
+        Args:
+            skeleton: one chain of joints, with stations in its [surface].
+
+        Raises:
+            LiexError: the joints are not one chain, or the table is incomplete.
+        """
         table = skeleton.surface
         if not skeleton.is_chain:
             raise LiexError(
@@ -70,20 +85,30 @@ class BodyShape:
         )
 
     def bare(self) -> BodyShape:
-        """The same trunk without ears, feet and tail: what a model of unknown limbs should be drawn
-        with.
+        """The same trunk without ears, feet and tail.
+
+        What a model of unknown limbs should be drawn with.
         """
         return replace(self, blobs=_with_radii(self.blobs, 0.0), tail=np.zeros_like(self.tail))
 
     def __len__(self) -> int:
+        """Number of shapes in a batch."""
         return len(self.fur)
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> BodyShape:
-        """One shape, or some, out of a batch."""
+        """One shape, or some, out of a batch.
+
+        Args:
+            index: a number, a slice, or row numbers.
+        """
         return BodyShape(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def broadcast(self, n: int) -> BodyShape:
-        """A batch (n,) of this one shape, or this batch."""
+        """A batch (n,) of this one shape, or this batch.
+
+        Args:
+            n: shapes.
+        """
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
         return BodyShape(*(np.broadcast_to(a, (n, *a.shape)).copy() for a in vars(self).values()))
@@ -92,9 +117,19 @@ class BodyShape:
 def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> BodyShape:
     """Draw n animals of a family.
 
-    'train' varies the default animal as mice vary; most of 'augmented' varies more than mice do, so
-    that no forest relies on one exact profile; 'other' holds bodies of another build, which no
-    model is trained on.
+    Args:
+        rng: where chance comes from.
+        skeleton: one chain of joints, with stations in its [surface].
+        family: 'train' varies the default animal as mice vary; most of 'augmented' varies more than
+            mice do, so that no forest relies on one exact profile; 'other' holds bodies of another
+            build, which no model is trained on.
+        n: animals.
+
+    Returns:
+        A batch (n,) of shapes.
+
+    Raises:
+        LiexError: there is no such family.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
@@ -127,8 +162,14 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
 
 
 def draw_tail_bends(rng: np.random.Generator, n: int) -> Array:
-    """How n tails lie: the turn in rad at each ring (n, TAIL_RINGS), slow waves and a little of
-    every ring's own.
+    """How n tails lie: slow waves and a little of every ring's own.
+
+    Args:
+        rng: where chance comes from.
+        n: tails.
+
+    Returns:
+        (n, TAIL_RINGS) rad, the turn at each ring.
     """
     ring = np.arange(TAIL_RINGS) / TAIL_RINGS
     first, second = rng.normal(0.0, 0.12, (2, n, 1))
@@ -182,8 +223,10 @@ def _varied(
 def _hulls(
     rng: np.random.Generator, default: BodyShape, stations: Array, n: int
 ) -> tuple[Array, Array]:
-    """Half widths and heights (n, R) of bodies that owe the default profile nothing: any smooth
-    closed outline whose rear is broader than its snout, with a waist, a neck, both or neither.
+    """Half widths and heights (n, R) of bodies that owe the default profile nothing.
+
+    Any smooth closed outline whose rear is broader than its snout, with a waist, a neck, both or
+    neither: monotone cubic interpolation (PCHIP) of its square through random knots.
     """
     from scipy.interpolate import PchipInterpolator
 

@@ -1,5 +1,10 @@
-"""A skeleton: a kinematic tree of joints and bones of fixed proportions, described by a
-TOML file.
+"""Kinematic tree of an animal: joints, bone offsets, free axes and limits, read from a TOML file.
+
+The skeletal model of Lie-X section 3: a base joint with six degrees of freedom and, below it,
+joints that turn about one to three axes of their own frame. Bones have fixed proportions; one scale
+multiplies all of them. A skeleton is data, so an animal is added without code: the presets 'fish',
+'mouse' and 'hand' are TOML files, and a user may write one. Its [[joints]] tables make the tree,
+[view] says how the animal is looked at, [surface] what stands around the bones.
 """
 
 from __future__ import annotations
@@ -25,9 +30,8 @@ AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the jo
 PRESETS = Path(__file__).parent / "presets"
 _JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
 _ROOT_DOF = 6
-REFERENCE_MM = (
-    52.834  # home length of the mouse: lengths that hold for every animal are stated for it
-)
+# home length of the mouse: lengths that hold for every animal are stated for it
+REFERENCE_MM = 52.834
 VIEWS = ("floor", "camera")
 FOREGROUNDS = ("background", "nearest")
 # of an animal of the reference length
@@ -42,13 +46,17 @@ _HUGE = 1e9  # no number of a skeleton is as large
 class View:
     """How an animal is looked at: the [view] table of its TOML.
 
-    frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along the
-    optical axis from behind_mm behind its mean depth, for one that swims (the same for all sizes,
-    or the height map would tell the size for which it was cut) or is held up (at home size).
-    smooth_mm: readings this near to one another, at home size, are averaged. area: the smallest and
-    the largest area seen from above, of the squared length. min_height_mm: what stands out from the
-    background by less is not the animal. foreground: 'background', it stands out from a still
-    scene, or 'nearest', nothing is nearer to the camera.
+    Attributes:
+        frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along
+            the optical axis from behind_mm behind its mean depth, for one that swims or is held up.
+        behind_mm: how far behind the mean depth the reference plane lies; the same for all sizes of
+            an animal that swims (or the height map would tell the size for which it was cut), at
+            home size for a hand.
+        smooth_mm: readings this near to one another, at home size, are averaged.
+        area: the smallest and the largest area seen from above, of the squared length.
+        min_height_mm: what stands out from the background by less is not the animal.
+        foreground: 'background', it stands out from a still scene, or 'nearest', nothing is nearer
+            to the camera.
     """
 
     frame: str = VIEWS[0]
@@ -60,7 +68,16 @@ class View:
 
     @staticmethod
     def from_table(table: dict[str, Any], relative_size: float, origin: str) -> View:
-        """The view that a TOML states; what it leaves out follows from the animal's size."""
+        """The view that a TOML states; what it leaves out follows from the animal's size.
+
+        Args:
+            table: the [view] table, empty where there is none.
+            relative_size: home length over REFERENCE_MM.
+            origin: names the file in errors.
+
+        Raises:
+            LiexError: an unknown key, or a value out of its range.
+        """
         known = View.__annotations__
         if not isinstance(table, dict):
             raise LiexError(f"{origin}: [view] is a table, got {table!r}")
@@ -108,13 +125,22 @@ MOUSE_VIEW = View()
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints of an animal in its home pose: straight, seen from above, base joint at the origin.
+    """Kinematic tree of J joints: a straight home pose, seen from above, base at the origin.
 
-    Frame of every joint: x forward (towards the head), y left, z up. `offsets` (J, 3) mm carries a
-    joint away from its parent, in the parent's frame; `rest` (J, 3, 3) turns the parent's frame
-    into the joint's at home; `axes` (J, 3) says which of roll, pitch and yaw the joint can do;
-    `limits` (J, 3, 2) rad. The base joint, 0, has all six degrees of freedom. Parents precede their
-    children. surface: the [surface] table, see `Surface.of`; table: the whole TOML.
+    Frame of every joint: x forward (towards the head), y left, z up. The base joint, 0, has all six
+    degrees of freedom. Parents precede their children.
+
+    Attributes:
+        name: of the animal.
+        names: J names of the joints.
+        parents: (J,) int64, -1 at the base.
+        offsets: (J, 3) mm, carries a joint away from its parent, in the parent's frame.
+        rest: (J, 3, 3), turns the parent's frame into the joint's at home.
+        axes: (J, 3) bool, which of roll, pitch and yaw (about x, y, z) the joint can do.
+        limits: (J, 3, 2) rad, lowest and highest.
+        surface: the [surface] table, see `Surface.of`.
+        view: how the animal is looked at.
+        table: the whole TOML.
     """
 
     name: str
@@ -130,8 +156,13 @@ class Skeleton:
 
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
-        """The skeleton of a preset ('fish', 'mouse', 'hand') or of a TOML file that a user
-        wrote.
+        """The skeleton of a preset or of a TOML file that a user wrote.
+
+        Args:
+            animal: 'fish', 'mouse', 'hand', or the path of a file.
+
+        Raises:
+            LiexError: there is no such file, it is not TOML, or it does not describe a skeleton.
         """
         path = PRESETS / f"{animal}.toml"
         if not path.is_file():
@@ -153,7 +184,15 @@ class Skeleton:
 
     @staticmethod
     def from_table(table: dict[str, Any], origin: str) -> Skeleton:
-        """A skeleton from the content of its TOML; `origin` names the file in errors."""
+        """A skeleton from the content of its TOML.
+
+        Args:
+            table: what the file holds.
+            origin: names the file in errors.
+
+        Raises:
+            LiexError: what is missing or wrong, and in which joint.
+        """
         joints = table.get("joints")
         surface = table.get("surface", {})
         if not isinstance(table.get("name"), str) or not isinstance(joints, list) or not joints:
@@ -214,13 +253,14 @@ class Skeleton:
 
     @cached_property
     def edges(self) -> list[tuple[int, int]]:
-        """The bones as (parent, child) pairs."""
+        """The bones as (parent, child) pairs, J - 1 of them."""
         return [(int(p), j) for j, p in enumerate(self.parents) if p >= 0]
 
     @cached_property
     def length(self) -> float:
-        """Length of the longest chain from the base at home, mm: the spine of a mouse, the body of
-        a fish.
+        """Length of the longest path from the base at home, mm.
+
+        The spine of a mouse, the body of a fish.
         """
         return _length(self.parents, self.offsets)
 
@@ -231,7 +271,7 @@ class Skeleton:
 
     @cached_property
     def next_joint(self) -> NDArray[np.int64]:
-        """(J,) the first child of each joint, the one its bone points at; -1 at an end-effector."""
+        """(J,) int64, each joint's first child, at which its bone points; -1 at an end-effector."""
         first = np.full(self.n_joints, -1, np.int64)
         for parent, child in reversed(self.edges):
             first[parent] = child
@@ -239,8 +279,9 @@ class Skeleton:
 
     @cached_property
     def tip(self) -> int:
-        """The joint whose direction from the base says which way the animal lies: a chain's last, a
-        tree's second.
+        """The joint whose direction from the base tells in which direction the animal lies.
+
+        The last of a chain, the base's first child in a tree.
         """
         return self.n_joints - 1 if self.is_chain else int(self.next_joint[0])
 

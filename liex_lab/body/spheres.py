@@ -1,5 +1,8 @@
-"""A body as a heap of balls that move with its joints: coarse, but quickly held against a
-picture.
+"""Sphere-set approximation of a body: spheres along its bones that move with its joints.
+
+Coarse, but quickly held against a depth picture (as the 48 spheres of a hand in Qian et al., CVPR
+2014). The centre of a sphere is (1 - share) a + share b, where a and b are points in the frames of
+two joints.
 """
 
 from __future__ import annotations
@@ -20,13 +23,18 @@ _SPACING = 1.3  # radii between the middles of two balls
 
 
 @dataclass(frozen=True)
-class Balls:
-    """B balls. Each lies between two points that two joints carry; lengths in mm at scale 1.
+class Spheres:
+    """B spheres, each between two points that two joints carry. Lengths in mm at scale 1.
 
-    joints (B, 2); offsets (B, 2, 3) of the points in the joints' frames; share (B,) of the way from
-    the first point to the second; radius (B,). The first n_own balls are the body; the others lie
-    where something may go on that is not the body, as an arm behind a hand, and what is seen there
-    says nothing about it.
+    The first n_own spheres are the body; the others lie where something may go on that is not the
+    body, as an arm behind a hand, and what is seen there says nothing about it.
+
+    Attributes:
+        joints: (B, 2) int64, the joints that carry the two points.
+        offsets: (B, 2, 3) mm, the points in the joints' frames.
+        share: (B,) of the line from the first point to the second, at which the centre lies.
+        radius: (B,) mm.
+        n_own: how many are the body.
     """
 
     joints: NDArray[np.int64]
@@ -37,12 +45,22 @@ class Balls:
 
     @property
     def unit_mm(self) -> float:
-        """A tenth of the usual radius at scale 1: by what distances from this body are measured."""
+        """A tenth of the mean radius of the body's spheres at scale 1, mm.
+
+        By it distances from this body are measured.
+        """
         return float(self.radius[: self.n_own].mean()) / 10.0
 
     @staticmethod
-    def of(skeleton: Skeleton) -> Balls:
-        """Balls along the capsules of a body, or along the chain of a tubular one."""
+    def of(skeleton: Skeleton) -> Spheres:
+        """Spheres along the capsules of a body, or along the chain of a tubular one.
+
+        Args:
+            skeleton: with its [surface] table.
+
+        Raises:
+            LiexError: the table describes neither capsules nor a tube.
+        """
         if "stations" in skeleton.surface:
             ends, offsets, radii = _tube(skeleton)
         else:
@@ -54,7 +72,7 @@ class Balls:
         n_own = len(rows)
         more = Capsules.listed(skeleton, PARTS[1])
         rows += _along(skeleton, more.joints, more.offsets, more.radii)
-        return Balls(
+        return Spheres(
             np.array([row[:2] for row in rows], np.int64),
             np.array([row[2:4] for row in rows], float),
             np.array([row[4] for row in rows], float),
@@ -66,9 +84,7 @@ class Balls:
 def _along(
     skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array
 ) -> list[tuple[Any, ...]]:
-    """Balls along capsules, so near to one another at home that they make a body: rows of the
-    fields of `Balls`.
-    """
+    """Spheres along capsules, so near to one another at home that they make a body."""
     home = _home(skeleton)
     rows = []
     bones = {(p, j) for p, j in skeleton.edges}

@@ -1,8 +1,10 @@
-"""The surface around a skeleton, as a triangle mesh, and its picture in a depth camera.
+"""The surface around a skeleton as a triangle mesh, and its depth picture.
 
 A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a
-tube along one chain of joints (the mouse), `radii_mm` a capsule around every bone and `capsules`
-further ones (anything else), `mesh` is the file of a body of one's own.
+tube along one chain of joints, a generalised cylinder with superelliptic cross-sections (the
+mouse); `radii_mm` a tapered capsule around every bone and `capsules` further ones (anything else);
+`mesh` is the file of a body of one's own, moved by linear blend skinning. Depth is rendered with a
+z-buffer, see `_rasterizer_kernels`.
 """
 
 from __future__ import annotations
@@ -34,11 +36,17 @@ _SILHOUETTE_PX = 400
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh of fixed topology that follows a skeleton: `faces` (F, 3) index the vertices (V, 3) of
-    every pose.
+    """A mesh of fixed topology that follows a skeleton.
 
-    shape: the default animal of a tubular body; capsules: a capsule body; mesh: that of a file. The
-    others are None.
+    Exactly one of shape, capsules and mesh is given; the others are None.
+
+    Attributes:
+        skeleton: whose poses it follows.
+        faces: (F, 3) int32, indices of the vertices (V, 3) of every pose.
+        stations: (R,) along a tubular body, shares of the spine's length; empty for another.
+        shape: the default animal of a tubular body.
+        capsules: a capsule body.
+        mesh: the body of a file.
     """
 
     skeleton: Skeleton
@@ -50,8 +58,13 @@ class Surface:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Surface:
-        """The surface that the skeleton's TOML describes. Raises LiexError where it
-        describes none.
+        """The surface that the skeleton's TOML describes.
+
+        Args:
+            skeleton: with its [surface] table.
+
+        Raises:
+            LiexError: the table describes none.
         """
         try:
             with np.errstate(all="raise", under="ignore"):
@@ -87,7 +100,7 @@ class Surface:
 
     @property
     def n_vertices(self) -> int:
-        """Vertices of one pose's mesh."""
+        """Vertices V of one pose's mesh."""
         return int(self.faces.max()) + 1
 
     @property
@@ -101,7 +114,7 @@ class Surface:
 
     @property
     def n_trunk_faces(self) -> int:
-        """The leading faces that belong to the trunk."""
+        """The leading faces that belong to the trunk, without ears, feet and tail."""
         return (
             2 * (len(self.stations) - 2) * _skin.BODY_SEGMENTS
             if self.shape is not None
@@ -110,7 +123,11 @@ class Surface:
 
     @property
     def area_mm2(self) -> float:
-        """About the area of the home pose seen from above."""
+        """About the area of the home pose seen from above, mm^2 at scale 1.
+
+        Of capsules: their level lengths times the sum of their radii at the ends; of a tube: its
+        width integrated along the spine; of a mesh: its silhouette.
+        """
         if self.mesh is not None:
             return self._silhouette_mm2()
         if self.capsules is not None:
@@ -149,11 +166,19 @@ class Surface:
         bends: Array | None = None,
         parallel: bool = True,
     ) -> Array:
-        """Mesh vertices (..., V, 3) mm of poses (...), in the poses' frame.
+        """Mesh vertices of poses, in the poses' frame.
 
-        shape: the animal; None is the default animal without ears, feet and tail. girth (...)
-        multiplies all lengths across the body; None takes the pose's scale. bends (n, TAIL_RINGS)
-        rad: how the tail lies. A tail needs poses in the arena frame: it sinks to z = 0.
+        A tail needs poses in the arena frame: it sinks to z = 0.
+
+        Args:
+            pose: a batch (...).
+            shape: the animal; None is the default animal without ears, feet and tail.
+            girth: (...) multiplies all lengths across the body; None takes the pose's scale.
+            bends: (n, TAIL_RINGS) rad, how the tail lies, the turn at each ring; None is straight.
+            parallel: whether to use all threads, else one.
+
+        Returns:
+            (..., V, 3) mm.
         """
         frames = pose.frames(self.skeleton)
         batch = frames.translation.shape[:-2]
@@ -204,8 +229,18 @@ class Surface:
         T_camera_pose: SE3 | None = None,
         **skinning: Array | float | None,
     ) -> NDArray[np.float32]:
-        """Depth (H, W) mm of one pose alone, 0 where it is not; see `vertices` and
-        `render_mesh`.
+        """Depth picture of one pose alone; see `vertices` and `render_mesh`.
+
+        Args:
+            pose: one pose.
+            camera: the ideal pinhole camera.
+            window: (u0, v0, width, height) px of the picture; None the whole of it.
+            shape: the animal; None is the default animal without ears, feet and tail.
+            T_camera_pose: carries the pose's frame into the camera's; None where they are the same.
+            **skinning: girth, bends and parallel of `vertices`.
+
+        Returns:
+            (H, W) float32 mm, 0 where the animal is not.
         """
         mesh = self.vertices(pose, shape, **skinning)  # type: ignore[arg-type]
         return render_mesh(mesh, self.faces, camera, window, T_camera_pose)
@@ -218,10 +253,17 @@ def render_mesh(
     window: Window | None = None,
     T_camera_mesh: SE3 | None = None,
 ) -> NDArray[np.float32]:
-    """Depth (H, W) mm of one closed mesh; 0 where it is not.
+    """Depth picture of one closed mesh, by z-buffer.
 
-    vertices (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there; window: (u0,
-    v0, width, height) of the picture, None the whole of it.
+    Args:
+        vertices: (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there.
+        faces: (F, 3) int32.
+        camera: the ideal pinhole camera.
+        window: (u0, v0, width, height) px of the picture; None the whole of it.
+        T_camera_mesh: carries the mesh's frame into the camera's; None where they are the same.
+
+    Returns:
+        (H, W) float32 mm, 0 where the mesh is not.
     """
     T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
     u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
@@ -253,10 +295,19 @@ def render_meshes(
     size: tuple[int, int],
     parallel: bool = True,
 ) -> NDArray[np.float32]:
-    """Depth (n, H, W) mm of meshes (n, V, 3), each seen by its own camera in its own window.
+    """Depth pictures of many meshes, each seen by its own camera in its own window.
 
-    T_camera_mesh (n); intrinsics (n, 4): fx, fy, cx, cy; origin (n, 2): the picture's pixel at the
-    window's top left; size: (width, height) of the windows.
+    Args:
+        vertices: (n, V, 3) mm.
+        faces: (F, 3) int32, shared.
+        T_camera_mesh: (n) transforms from the meshes' frames into the cameras'.
+        intrinsics: (n, 4) fx, fy, cx, cy px.
+        origin: (n, 2) the picture's pixel (u, v) at the window's top left.
+        size: (width, height) px of the windows.
+        parallel: whether to use all threads, else one.
+
+    Returns:
+        (n, H, W) float32 mm, 0 where the mesh is not.
     """
     depth = np.empty((len(vertices), size[1], size[0]), np.float32)
     drive = _render.draw_batch_parallel if parallel else _render.draw_batch

@@ -1,5 +1,8 @@
-"""Bodies of any animal, varied: the girth and the proportions around a skeleton whose species
-nobody described.
+"""Random variation of any animal's body: girth and proportions around its skeleton.
+
+For a species of which nobody described how individuals differ: smooth log-factors along the body
+(overall girth, a tilt of mass forward or back, flatness, a belly, and low-frequency sine waves)
+multiply the widths and heights of its tube, capsules or mesh (domain randomisation).
 """
 
 from __future__ import annotations
@@ -23,9 +26,19 @@ _WAVES = (0.5, 1.0, 1.5, 2.0)  # cycles along the body
 def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> Body:
     """Draw n animals of a family around the body that a skeleton's TOML describes.
 
-    'train' varies it as individuals vary; most of 'augmented' varies more than individuals do, so
-    that no forest relies on one exact profile; 'other' holds builds that neither of them reaches:
-    far slimmer or stouter, with the mass far forward or far back.
+    Args:
+        rng: where chance comes from.
+        skeleton: with its [surface] table.
+        family: 'train' varies it as individuals vary; most of 'augmented' varies more than
+            individuals do, so that no forest relies on one exact profile; 'other' holds builds that
+            neither of them reaches: far slimmer or stouter, with the mass far forward or far back.
+        n: animals.
+
+    Returns:
+        A batch (n,) of the kind of body that the skeleton has.
+
+    Raises:
+        LiexError: there is no such family, or the skeleton describes no surface.
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
@@ -59,7 +72,11 @@ def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int)
 
 
 def joint_reaches(skeleton: Skeleton) -> Array:
-    """How far (J,) along its chain each joint lies, of the longest chain's length."""
+    """Path lengths (J,) from the base to each joint, as shares of the longest.
+
+    Args:
+        skeleton: with at least one bone.
+    """
     reach = np.zeros(skeleton.n_joints)
     for parent, child in skeleton.edges:
         reach[child] = reach[parent] + np.linalg.norm(skeleton.offsets[child])

@@ -11,7 +11,7 @@ import typer
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.study.status import Standing
+    from liex_lab.pipelines.study.status import SessionStatus
 
 SOME_FAILED = 3  # the exit code of a study in which a session failed
 
@@ -136,7 +136,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def _tell_study(standings: list[Standing], all_of_them: bool) -> int:
+def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
     """Every session that is not simply done, and how many are in each state; returns how many
     failed.
     """

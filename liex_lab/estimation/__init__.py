@@ -1,1 +1,1 @@
-"""One depth frame in, a point on the pose manifold out (Lie-X Algorithms 1 and 2)."""
+"""Estimation of one point on the pose manifold per depth frame (Lie-X Algorithms 1 and 2)."""

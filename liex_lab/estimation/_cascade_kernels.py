@@ -1,8 +1,9 @@
-"""Numba kernels of Algorithm 1: all candidates of a few frames through the cascade, the pruner and
-the metric.
+"""Numba kernels of Lie-X Algorithm 1: cascaded regression of all candidates, pruning, metric.
 
-A thread takes `FRAMES` frames at once. Their candidates walk down each tree together, LANES at a
-time, so that a tree stays in the cache and no vector register idles.
+Joint by joint, base first, and round by round, g_{1:j} <- g_{1:j} exp(r) with r from a regression
+forest (Eq. 10). A forest predicts the mean of its trees' votes or their mean-shift mode (the
+paper's Hough votes). A thread takes `FRAMES` frames at once. Their candidates walk down each tree
+together, LANES at a time, so that a tree stays in the cache and no vector register idles.
 """
 
 from __future__ import annotations
@@ -30,8 +31,14 @@ _SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these
 
 
 class Chain(NamedTuple):
-    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3), axes (J, 3) bool, solved
-    joints in order.
+    """A kinematic tree.
+
+    Attributes:
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        axes: (J, 3) bool, the free axes.
+        solved: the joints with regressors, in order, base first.
     """
 
     parents: Any
@@ -42,8 +49,14 @@ class Chain(NamedTuple):
 
 
 class Trees(NamedTuple):
-    """Forests in one node array: nodes (N, 4), roots (F, T), leaves flat, and of each forest where
-    its leaves begin bases (F,) and how many values a leaf has widths (F,).
+    """Several forests in one node array.
+
+    Attributes:
+        nodes: (N, 4) int32 packed nodes, see `forests._kernels`.
+        roots: (F, T) root of each tree of each forest.
+        leaves: float32 leaf values of all forests, in one row.
+        bases: (F,) where each forest's leaves begin.
+        widths: (F,) number of values of a leaf.
     """
 
     nodes: Any
@@ -54,9 +67,15 @@ class Trees(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Rounds C, of the base and of the other joints; reach (J,) mm of the offsets from each joint;
-    levers (3,) of base, joints and scale; bandwidth mm of the mean shift, 0 for the mean; how many
-    candidates outlive the base joint.
+    """The method's numbers for the cascade.
+
+    Attributes:
+        base_rounds: regression rounds of the base joint.
+        rounds: regression rounds C of the other joints.
+        reach: (J,) how far feature offsets reach from each joint, mm at home size.
+        levers: (3,) lever arms of the base's rotation, the other joints and the log scale, mm.
+        bandwidth: of the mean shift over tree votes, in label units; 0 takes the mean.
+        keep: candidates that are kept after the base joint.
     """
 
     base_rounds: int
@@ -68,8 +87,9 @@ class Tuning(NamedTuple):
 
 
 class _Lanes(NamedTuple):
-    """What n candidates, one to a lane, see: see `forests._walk`. frame (n,) and pose (n,) say
-    whose they are.
+    """Inputs of the forests for n candidates, one to a lane, see `forests._walk`.
+
+    frame (n,) and pose (n,) say which candidate of which frame a lane holds.
     """
 
     pixels: Any
@@ -84,7 +104,13 @@ class _Lanes(NamedTuple):
 
 @njit(cache=True)
 def mode_of_votes(votes, bandwidth, out):
-    """Mean-shift mode of votes (T, D) from their mean, with a Gaussian kernel, into out (D,)."""
+    """Mean-shift mode of votes with a Gaussian kernel (Comaniciu and Meer 2002), in four steps.
+
+    Args:
+        votes: (T, D) votes.
+        bandwidth: of the kernel, in units of the votes.
+        out: (D,) the start, usually the mean of the votes; moved to the mode in place.
+    """
     n, d = votes.shape
     for _ in range(_SHIFTS):
         total = 0.0
@@ -105,7 +131,10 @@ def mode_of_votes(votes, bandwidth, out):
 
 @njit(cache=True)
 def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
-    """A forest's prediction for n lanes into out (n, width)."""
+    """A forest's prediction for n lanes into out (n, width): mean or mean-shift mode of the votes.
+
+    n_views: number of views of a lane; 0 where all nodes use the only one.
+    """
     width = trees.widths[forest]
     leaf_base = trees.bases[forest]
     n_trees = trees.roots.shape[1]
@@ -160,7 +189,7 @@ def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
 
 @njit(cache=True)
 def _write_scalars(lanes, k, first, scalars):
-    """Put a lane's scalars behind the pixels, from number `first` on, rounded down."""
+    """Write a lane's scalars behind the pixels, from number `first` on, rounded down."""
     at = lanes.scalar_base[k] + first
     for c in range(scalars.size):
         lanes.pixels[at + c] = np.int16(
@@ -169,8 +198,8 @@ def _write_scalars(lanes, k, first, scalars):
 
 
 @njit(cache=True)
-def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, scales):
-    """Fill the lanes' only view, from a joint, and their scalars."""
+def _see(lanes, n, joint, crop_cameras, moments, size, reach, rotations, positions, scales):
+    """Fill the lanes' only view, as seen from one joint, and their scalars."""
     n_lanes = lanes.base.size
     view = np.empty(VIEW, np.float32)
     scalars = np.empty(N_SCALARS, np.float32)
@@ -178,7 +207,12 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
         i = lanes.frame[s]
         k = lanes.pose[s]
         fill_view(
-            rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view
+            rotations[i, k, joint],
+            positions[i, k, joint],
+            crop_cameras[i],
+            size,
+            reach[joint],
+            view,
         )
         for c in range(VIEW):
             lanes.views[c * n_lanes + s] = view[c]
@@ -189,10 +223,10 @@ def _see(lanes, n, joint, looks, moments, size, reach, rotations, positions, sca
 
 
 @njit(cache=True)
-def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, positions, scales):
-    """Fill the lanes' views from all joints, and their scalars from the base and from the posed
-    body.
-    """
+def _see_all(
+    lanes, n, heights, crop_cameras, moments, size, reach, body, rotations, positions, scales
+):
+    """Fill the lanes' views from all joints, their scalars, and the residuals of the posed body."""
     n_joints = positions.shape[2]
     view = np.empty(VIEW, np.float32)
     scalars = np.empty(N_SCALARS, np.float32)
@@ -202,7 +236,12 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
         k = lanes.pose[s]
         for joint in range(n_joints):
             fill_view(
-                rotations[i, k, joint], positions[i, k, joint], looks[i], size, reach[joint], view
+                rotations[i, k, joint],
+                positions[i, k, joint],
+                crop_cameras[i],
+                size,
+                reach[joint],
+                view,
             )
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
@@ -213,7 +252,7 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
         if body.radius.size > 0:
             explain_pose(
                 heights[i],
-                looks[i],
+                crop_cameras[i],
                 moments[i, 5],
                 rotations[i, k],
                 positions[i, k],
@@ -227,8 +266,9 @@ def _see_all(lanes, n, heights, looks, moments, size, reach, body, rotations, po
 
 @njit(cache=True)
 def _lanes_for(heights, frames, n_poses, n_joints, size):
-    """Lanes for n_poses candidates of each of the frames, with the frames' height maps beside one
-    another.
+    """Lanes for n_poses candidates of each of the frames.
+
+    The frames' height maps lie one after the other in the lanes' pixels.
     """
     side = heights.shape[1]
     n = frames.size * n_poses
@@ -259,11 +299,15 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
 
 @njit(cache=True)
 def choose_survivors(rotations, scores, chosen):
-    """Which candidates (n_keep,) of K go on, best first: those with the lowest scores (K,), and in
-    any case the best one that points the other way, for the whole chain tells head from tail better
-    than the base alone.
+    """Choose which candidates are kept after the base joint.
 
-    rotations (K, 3, 3) of the base.
+    They are those with the lowest scores, and in any case the best one that points the other way,
+    for the whole chain tells head from tail better than the base alone.
+
+    Args:
+        rotations: (K, 3, 3) rotations of the base.
+        scores: (K,) predicted errors.
+        chosen: (n_keep,) int64, filled with the candidates to keep, best first.
     """
     keep = chosen.size
     order = np.empty(scores.size, np.int64)
@@ -298,7 +342,7 @@ def _solve_joint(
     lanes,
     n,
     side,
-    looks,
+    crop_cameras,
     moments,
     size,
     rotations,
@@ -306,7 +350,7 @@ def _solve_joint(
     scales,
     values,
 ):
-    """All rounds of one joint, the j-th solved one, for n lanes."""
+    """All regression rounds of one joint, the j-th solved one, for n lanes."""
     for s in range(n):
         if joint > 0:
             i = lanes.frame[s]
@@ -323,7 +367,9 @@ def _solve_joint(
     first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
     for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
         forest = first + c
-        _see(lanes, n, joint, looks, moments, size, tuning.reach, rotations, positions, scales)
+        _see(
+            lanes, n, joint, crop_cameras, moments, size, tuning.reach, rotations, positions, scales
+        )
         _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
         for s in range(n):
             i = lanes.frame[s]
@@ -344,7 +390,7 @@ def _solve_joint(
 @njit(cache=True)
 def _estimate_block(
     heights,
-    looks,
+    crop_cameras,
     moments,
     frames,
     size,
@@ -357,8 +403,10 @@ def _estimate_block(
     starts,
     poses,
 ):
-    """Candidates of a few frames: `starts` (rotations, positions, scales) of their bases in,
-    `poses` and scores out.
+    """Run the candidates of a few frames through cascade, pruner and metric.
+
+    `starts` (rotations, positions, scales) holds their bases and is changed; `poses` gets the
+    surviving candidates and their scores.
     """
     start_rotations, start_positions, start_scales = starts
     rotations, positions, scales, scores = poses
@@ -380,7 +428,7 @@ def _estimate_block(
         lanes,
         n,
         side,
-        looks,
+        crop_cameras,
         moments,
         size,
         start_rotations,
@@ -393,7 +441,7 @@ def _estimate_block(
             lanes,
             n,
             0,
-            looks,
+            crop_cameras,
             moments,
             size,
             tuning.reach,
@@ -428,7 +476,7 @@ def _estimate_block(
             lanes,
             n,
             side,
-            looks,
+            crop_cameras,
             moments,
             size,
             rotations,
@@ -449,7 +497,17 @@ def _estimate_block(
             positions[i, k],
         )
     _see_all(
-        lanes, n, heights, looks, moments, size, tuning.reach, body, rotations, positions, scales
+        lanes,
+        n,
+        heights,
+        crop_cameras,
+        moments,
+        size,
+        tuning.reach,
+        body,
+        rotations,
+        positions,
+        scales,
     )
     _predict(metric, first, lanes, n, n_joints, side, 0.0, values)
     for s in range(n):
@@ -459,7 +517,7 @@ def _estimate_block(
 @njit(cache=True, parallel=True, nogil=True)
 def estimate_all(
     heights,
-    looks,
+    crop_cameras,
     moments,
     seen,
     size,
@@ -472,18 +530,31 @@ def estimate_all(
     starts,
     poses,
 ):
-    """Algorithm 1 for the frames `seen`, in which an animal was found.
+    """Run Lie-X Algorithm 1 for all frames in which an animal was found, in parallel.
 
-    starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) and scales (n, K), which it
-    moves; poses: rotations (n, P, J, 3, 3), positions (n, P, J, 3), scales (n, P) and scores (n, P)
-    of the P survivors, which it fills.
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        moments: (n, 9) moments of the height maps.
+        seen: (m,) the frames in which an animal was found.
+        size: the animal's size over home size.
+        chain: the kinematic tree.
+        regressors: one forest per solved joint and round, in order.
+        pruner: one forest, which scores candidates by the base joint alone.
+        metric: one forest, the learned metric.
+        tuning: the method's numbers.
+        body: sphere model whose residuals the metric sees; empty where it does not.
+        starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) mm and scales (n, K); changed
+            in place.
+        poses: rotations (n, P, J, 3, 3), positions (n, P, J, 3) mm, scales (n, P) and scores (n, P)
+            of the P kept candidates; filled, except in frames not seen.
     """
     n_blocks = (seen.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):
         frames = seen[b * FRAMES : (b + 1) * FRAMES]
         _estimate_block(
             heights,
-            looks,
+            crop_cameras,
             moments,
             frames,
             size,

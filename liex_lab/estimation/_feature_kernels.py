@@ -1,15 +1,23 @@
-"""Numba kernels of the estimation: what a candidate sees, and how a correction moves it.
+"""Numba kernels of the features and of the pose updates on SE(3) in the cascade.
 
-A look, 17 float64, is how one height map was cut: fx fy cx cy, rotation (9, row-major) of
-T_view_camera, distance of the camera above the view's origin (its translation is (0, 0, distance)),
-crop origin u v, and crop step. Candidates live in that view frame: the arena frame, or the upright
-camera frame of the paper's variant.
+Features: the linearised pinhole projection of a joint's frame into its height map, from which Lie-X
+Eq. 15 is evaluated, and scalars of the whole animal. Updates: g <- g exp(r) (Eq. 10) by the
+exponential map of SE(3) (Eq. 4, 5) and Rodrigues' formula,
+
+    exp(w^) = I + sin(th)/th w^ + (1 - cos(th))/th^2 w^^2,   th = |w|.
+
+A packed crop camera, 17 float64, states how one height map was cut: fx fy cx cy, rotation (9,
+row-major) of T_view_camera, distance of the camera above the view's origin (its translation is (0,
+0, distance)), crop origin u v, and crop step. Candidates live in that view frame: the arena frame,
+or the upright camera frame of the paper's variant.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
+
+from liex_lab.foreground._crop_camera_kernels import crop_camera, to_camera
 
 LOOK = 17
 N_SCALARS = 11
@@ -19,26 +27,30 @@ _MM_UNIT = 16.0
 
 
 @njit(cache=True)
-def fill_view(rotation, position, look, size, reach, view):
-    """View (9,) of a joint with rotation (3, 3) and position (3,) mm; reach mm of the offsets at
-    home size.
+def fill_view(rotation, position, packed_camera, size, reach, view):
+    """Linearise the projection of a joint's frame into a height map.
+
+    Args:
+        rotation: (3, 3) of the joint, view frame.
+        position: (3,) of the joint, mm, view frame.
+        packed_camera: (17,) packed crop camera.
+        size: the animal's size over home size.
+        reach: how far offsets reach, mm at home size.
+        view: (9,) float32, filled: crop pixel (column, row) of the joint, 2x3 matrix from offsets
+            (1/127 of the reach) to crop pixels, and the joint's height, 1/16 mm at home size.
     """
-    x0 = position[0]
-    y0 = position[1]
-    z0 = position[2] - look[13]
-    x = look[4] * x0 + look[7] * y0 + look[10] * z0
-    y = look[5] * x0 + look[8] * y0 + look[11] * z0
-    z = max(look[6] * x0 + look[9] * y0 + look[12] * z0, 1.0)
-    per_px = 1.0 / look[16]
-    iu = look[0] / z * per_px
-    iv = look[1] / z * per_px
-    view[0] = (look[0] * x / z + look[2] - look[14]) * per_px
-    view[1] = (look[1] * y / z + look[3] - look[15]) * per_px
+    camera = crop_camera(packed_camera)
+    x, y, z = to_camera(camera, position[0], position[1], position[2])
+    per_px = 1.0 / camera.step
+    iu = camera.fx / z * per_px
+    iv = camera.fy / z * per_px
+    view[0] = (camera.fx * x / z + camera.cx - camera.u0) * per_px
+    view[1] = (camera.fy * y / z + camera.cy - camera.v0) * per_px
     unit = reach * size / 127.0
     for k in range(3):
-        ax = look[4] * rotation[0, k] + look[7] * rotation[1, k] + look[10] * rotation[2, k]
-        ay = look[5] * rotation[0, k] + look[8] * rotation[1, k] + look[11] * rotation[2, k]
-        az = look[6] * rotation[0, k] + look[9] * rotation[1, k] + look[12] * rotation[2, k]
+        ax = camera.r00 * rotation[0, k] + camera.r10 * rotation[1, k] + camera.r20 * rotation[2, k]
+        ay = camera.r01 * rotation[0, k] + camera.r11 * rotation[1, k] + camera.r21 * rotation[2, k]
+        az = camera.r02 * rotation[0, k] + camera.r12 * rotation[1, k] + camera.r22 * rotation[2, k]
         view[2 + k] = unit * iu * (ax - x / z * az)
         view[5 + k] = unit * iv * (ay - y / z * az)
     view[8] = 16.0 * position[2] / size
@@ -46,7 +58,21 @@ def fill_view(rotation, position, look, size, reach, view):
 
 @njit(cache=True)
 def fill_scalars(rotation, position, scale, moments, size, scalars):
-    """Numbers (N_SCALARS,) that describe the whole animal as a joint sees it, at home size."""
+    """Numbers that describe the whole animal as a joint sees it, at home size.
+
+    In order: log area, log volume, spread along and across the long axis, the centroid (x, y) in
+    the joint's frame, the joint's height, its pitch over the back's slope, its roll, the sine of
+    twice the angle to the long axis times the elongation, log scale. Lengths are 1/16 mm;
+    logarithms and sines are times 500, since thresholds are integers.
+
+    Args:
+        rotation: (3, 3) of the joint, view frame.
+        position: (3,) of the joint, mm, view frame.
+        scale: of the candidate's bones.
+        moments: (9,) moments of the height map.
+        size: the animal's size over home size.
+        scalars: (N_SCALARS,) float32, filled.
+    """
     area = max(moments[1], 1.0)
     volume = max(moments[2], 1.0)
     scalars[0] = _LOG_UNIT * np.log(area / (size * size))
@@ -77,7 +103,14 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
 
 @njit(cache=True)
 def so3_exp(wx, wy, wz, out):
-    """Rotation (3, 3) of a rotation vector, rad; the scalar twin of geometry.so3.exp."""
+    """Rotation matrix of a rotation vector (Rodrigues), the scalar twin of `geometry.so3.exp`.
+
+    Args:
+        wx: x component, rad.
+        wy: y component, rad.
+        wz: z component, rad.
+        out: (3, 3), filled.
+    """
     th2 = wx * wx + wy * wy + wz * wz
     if th2 < 1e-8:
         a = 1.0 - th2 / 6.0
@@ -99,8 +132,13 @@ def so3_exp(wx, wy, wz, out):
 
 @njit(cache=True)
 def turn(rotation, wx, wy, wz):
-    """Rotation (3, 3) <- rotation exp(w): on the right, for a correction lives in the joint's own
-    frame.
+    """Rotate a frame about its own axes: rotation <- rotation exp(w), for corrections are local.
+
+    Args:
+        rotation: (3, 3), changed in place.
+        wx: x component of w, rad.
+        wy: y component, rad.
+        wz: z component, rad.
     """
     step = np.empty((3, 3))
     so3_exp(wx, wy, wz, step)
@@ -114,8 +152,17 @@ def turn(rotation, wx, wy, wz):
 
 @njit(cache=True)
 def correct_base(rotation, position, scale, twist, size):
-    """G <- g exp(twist) (Eq. 10) for the base; twist (7,) rad, mm at home size, log scale. Returns
-    the new scale.
+    """Move the base by a twist: g <- g exp(twist) (Lie-X Eq. 10, with A of Eq. 5).
+
+    Args:
+        rotation: (3, 3) of the base, changed in place.
+        position: (3,) of the base, mm, changed in place.
+        scale: of the bones.
+        twist: (7,) rotation, rad; translation, mm at home size; change of the log scale.
+        size: the animal's size over home size.
+
+    Returns:
+        The new scale.
     """
     wx = twist[0]
     wy = twist[1]
@@ -146,8 +193,13 @@ def correct_base(rotation, position, scale, twist, size):
 
 @njit(cache=True)
 def correct_joint(rotation, axes, values, lever):
-    """G <- g exp(r) for a joint that turns about its free axes (3,) only; values are lever * rad,
-    axis by axis.
+    """Rotate a joint about its free axes: g <- g exp(r) (Lie-X Eq. 10).
+
+    Args:
+        rotation: (3, 3) of the joint, changed in place.
+        axes: (3,) bool, the free axes.
+        values: rotation about each free axis in turn, rad times the lever arm.
+        lever: the lever arm, mm.
     """
     w = np.zeros(3)
     used = 0
@@ -160,7 +212,17 @@ def correct_joint(rotation, axes, values, lever):
 
 @njit(cache=True)
 def place_joint(j, parents, offsets, rest, scale, rotations, positions):
-    """Put joint j where its parent carries it, at its home angle."""
+    """Put a joint where its parent carries it, at its home angle.
+
+    Args:
+        j: number of the joint.
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        scale: of the bones.
+        rotations: (J, 3, 3) joint frames; that of j is filled.
+        positions: (J, 3) joints, mm; that of j is filled.
+    """
     p = parents[j]
     for i in range(3):
         total = positions[p, i]
@@ -176,7 +238,17 @@ def place_joint(j, parents, offsets, rest, scale, rotations, positions):
 
 @njit(cache=True)
 def place_rest(solved, parents, offsets, rest, scale, rotations, positions):
-    """Put every joint without a regressor where its parent carries it."""
+    """Put every joint without a regressor where its parent carries it.
+
+    Args:
+        solved: the joints with regressors, which stay.
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        scale: of the bones.
+        rotations: (J, 3, 3) joint frames, changed in place.
+        positions: (J, 3) joints, mm, changed in place.
+    """
     for j in range(1, parents.size):
         is_solved = False
         for s in solved:
@@ -187,17 +259,39 @@ def place_rest(solved, parents, offsets, rest, scale, rotations, positions):
 
 @njit(cache=True, parallel=True)
 def place_all(j, parents, offsets, rest, scale, rotations, positions):
-    """`place_joint` for a batch: scale (n,), rotations (n, J, 3, 3), positions (n, J, 3)."""
+    """`place_joint` for a batch of candidates.
+
+    Args:
+        j: number of the joint.
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        scale: (n,) of the bones.
+        rotations: (n, J, 3, 3) joint frames, changed in place.
+        positions: (n, J, 3) joints, mm, changed in place.
+    """
     for s in prange(scale.size):
         place_joint(j, parents, offsets, rest, scale[s], rotations[s], positions[s])
 
 
 @njit(cache=True, parallel=True)
 def look_all(
-    joints, looks, moments, image, size, reach, rotations, positions, scale, views, scalars
+    joints, crop_cameras, moments, image, size, reach, rotations, positions, scale, views, scalars
 ):
-    """Views (n, V, 9) of the given joints, offsets reaching `reach` (V,) mm from each, and scalars
-    (n, N_SCALARS) of the first of them, for a batch.
+    """Features of a batch of candidates: views from the given joints and scalars from the first.
+
+    Args:
+        joints: (V,) the joints.
+        crop_cameras: (m, 17) packed crop cameras of the height maps.
+        moments: (m, 9) moments of the height maps.
+        image: (n,) index of each candidate's height map.
+        size: (n,) the animals' size over home size.
+        reach: (V,) how far offsets reach from each of the joints, mm at home size.
+        rotations: (n, J, 3, 3) joint frames, view frame.
+        positions: (n, J, 3) joints, mm, view frame.
+        scale: (n,) of the bones.
+        views: (n, V, 9) float32, filled.
+        scalars: (n, N_SCALARS) float32, filled; left alone where it has no columns.
     """
     for s in prange(scale.size):
         i = image[s]
@@ -205,7 +299,7 @@ def look_all(
             fill_view(
                 rotations[s, joints[v]],
                 positions[s, joints[v]],
-                looks[i],
+                crop_cameras[i],
                 size[s],
                 reach[v],
                 views[s, v],
@@ -223,8 +317,15 @@ def look_all(
 
 @njit(cache=True, parallel=True)
 def correct_base_all(rotations, positions, scale, values, levers, size):
-    """`correct_base` for a batch; values (n, 6 or 7) in lever units, levers (2,) of rotation and
-    scale.
+    """`correct_base` for a batch of candidates.
+
+    Args:
+        rotations: (n, J, 3, 3) joint frames, changed in place.
+        positions: (n, J, 3) joints, mm, changed in place.
+        scale: (n,) of the bones, changed in place.
+        values: (n, 6 or 7) twist and, with 7, log scale, in lever units.
+        levers: (2,) lever arms of rotation and log scale, mm.
+        size: (n,) the animals' size over home size.
     """
     for s in prange(scale.size):
         twist = np.zeros(7)
@@ -238,6 +339,14 @@ def correct_base_all(rotations, positions, scale, values, levers, size):
 
 @njit(cache=True, parallel=True)
 def correct_joint_all(j, rotations, axes, values, lever):
-    """`correct_joint` of joint j for a batch; values (n, free axes)."""
+    """`correct_joint` of one joint for a batch of candidates.
+
+    Args:
+        j: number of the joint.
+        rotations: (n, J, 3, 3) joint frames, changed in place.
+        axes: (3,) bool, the joint's free axes.
+        values: (n, free axes) rotations, rad times the lever arm.
+        lever: the lever arm, mm.
+    """
     for s in prange(values.shape[0]):
         correct_joint(rotations[s, j], axes, values[s], lever)

@@ -1,26 +1,36 @@
-"""Numba kernel that lays a height map along an animal: what it looks like to one who looks the way
-that it points.
-"""
+"""Numba kernel of the head-tail classifier: resamples a height map along an animal's direction."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.estimation._profile_kernels import to_pixel
+from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel
 
 
 @njit(cache=True, parallel=True)
-def lay_along(heights, looks, rump, tip, middle, size, along, across, out):
-    """Fill `out` (n, A, B) with heights mm, 0 beside the animal, about the middles (n, 3) of
-    animals that point from their rump (n, 3) to their tip (n, 3), at places along (A,) their way
-    and across (B,) it to the left, mm at home size; size (n,) over it.
+def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out):
+    """Resample height maps on a grid that lies along the animals.
+
+    Grid point (a, b) is middle + size (along[a] d + across[b] d_left), d being the unit direction
+    from base to tip in the image plane; the nearest pixel is taken.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        rump: (n, 3) base joints, mm, view frame.
+        tip: (n, 3) joints that the animals point at, mm, view frame.
+        middle: (n, 3) centres of the grids, mm, view frame.
+        size: (n,) the animals' size over home size.
+        along: (A,) grid coordinates along the animal, mm at home size.
+        across: (B,) grid coordinates to its left, mm at home size.
+        out: (n, A, B) filled with heights, mm; 0 beside the animal.
     """
     last = heights.shape[1] - 1
     for i in prange(len(middle)):
         dx = tip[i, 0] - rump[i, 0]
         dy = tip[i, 1] - rump[i, 1]
-        at = np.empty(2)
+        camera = crop_camera(crop_cameras[i])
         length = max(np.sqrt(dx * dx + dy * dy), 1e-9)
         dx = dx / length
         dy = dy / length
@@ -28,8 +38,8 @@ def lay_along(heights, looks, rump, tip, middle, size, along, across, out):
             for b in range(len(across)):
                 x = middle[i, 0] + size[i] * (along[a] * dx - across[b] * dy)
                 y = middle[i, 1] + size[i] * (along[a] * dy + across[b] * dx)
-                to_pixel(looks[i], x, y, middle[i, 2], at)
-                column = int(np.floor(at[0] + 0.5))
-                row = int(np.floor(at[1] + 0.5))
+                u, v = to_pixel(camera, x, y, middle[i, 2])
+                column = int(np.floor(u + 0.5))
+                row = int(np.floor(v + 0.5))
                 inside = 0 <= row <= last and 0 <= column <= last
                 out[i, a, b] = heights[i, row, column] / 16.0 if inside else 0.0

@@ -1,9 +1,11 @@
-"""Numba kernels that move a pose until its body of balls lies in the readings: Gauss-Newton steps
-on the manifold.
+"""Numba kernels of the Gauss-Newton refinement: articulated ICP of a sphere model.
 
-The regressors say where a pose is about; this takes it into the picture. Readings pull the nearest
-ball's surface onto themselves, balls beside the animal are pulled back over it, balls in front of
-the readings are pushed behind them, and all of it is held near the pose it began with.
+On the pose manifold with p = (base twist, log scale, free angles), each step solves (J^T W J +
+prior) dp = -gradient with damping by Cholesky decomposition, and moves the pose by g <- g exp(dp).
+Residuals: depth readings pull the surface of the nearest sphere onto themselves, spheres in front
+of the readings are pushed behind them (both with Geman-McClure weights 1 / (1 + (d/robust)^2)^2),
+spheres beside the animal are pulled back over it, and all of it is held near the pose it began
+with.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from numba import njit, prange
 
 from liex_lab.estimation._feature_kernels import so3_exp
 from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
+from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
 
 _STRIDE = 4  # every so many crop pixels a reading pulls
 _ROOT = 7  # twist of the base and log of the scale come before the angles
@@ -25,9 +28,16 @@ _MOST_TURN = 0.5
 
 
 class Tree(NamedTuple):
-    """A skeleton's tree: parents (J,), offsets (J, 3) mm, rest (J, 3, 3); free (F, 2) joint and
-    axis of every angle, limits (F, 2) rad, moves (J, F) which of them turn which joint, turns (B,
-    M) those that move each ball, in order and -1 where there are no more.
+    """A kinematic tree with its free angles.
+
+    Attributes:
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) each joint in its parent's frame, mm at home.
+        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        free: (F, 2) joint and axis of every free angle.
+        limits: (F, 2) least and most of each angle, rad.
+        moves: (J, F) bool, which angles turn which joint.
+        turns: (B, M) the angles that move each sphere, in order, -1 where there are no more.
     """
 
     parents: Any
@@ -40,9 +50,13 @@ class Tree(NamedTuple):
 
 
 class Wishes(NamedTuple):
-    """What weighs how much. robust mm: readings this far off count a quarter; beside: of a ball
-    beside the animal; prior (4,): what a radian of the base, a millimetre of it, a unit of log
-    scale and a radian of a joint away from the start cost, in squared mm.
+    """Weights of the residuals.
+
+    Attributes:
+        robust: readings this far off count a quarter, mm.
+        beside: weight of a sphere beside the animal.
+        prior: (4,) cost of a radian of the base, a millimetre of it, a unit of log scale and a
+            radian of a joint away from the start, in squared mm.
     """
 
     robust: float
@@ -52,11 +66,16 @@ class Wishes(NamedTuple):
 
 @njit(cache=True)
 def nearest_reading(heights, r, c, known):
-    """The nearest pixel on the animal to a crop pixel off it: into known[r, c] (2,), row -2 where
-    there is none.
+    """Find the pixel on the animal that is nearest to a crop pixel off it.
 
-    Few pixels are ever asked for, so they are looked for in growing squares and remembered; known
-    (S, S, 2) comes in as -1.
+    Few pixels are ever asked for, so they are looked for in growing squares and remembered.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        r: row of the pixel.
+        c: column of the pixel.
+        known: (S, S, 2) int32, -1 where not yet asked; known[r, c] is set to the row and column
+            found, row -2 where there is none.
     """
     if known[r, c, 0] != -1:
         return
@@ -80,36 +99,35 @@ def nearest_reading(heights, r, c, known):
 
 
 @njit(cache=True)
-def point_of(heights, look, r, c, out):
-    """The point (3,) mm of the view frame that a crop pixel shows."""
-    dx = (look[14] + look[16] * c - look[2]) / look[0]
-    dy = (look[15] + look[16] * r - look[3]) / look[1]
+def point_of(heights, packed_camera, r, c, out):
+    """The point (3,) mm of the view frame that crop pixel (r, c) shows, into `out`."""
     h = heights[r, c] / 16.0
-    z = (h - look[13]) / (look[10] * dx + look[11] * dy + look[12])
-    out[0] = z * (look[4] * dx + look[5] * dy + look[6])
-    out[1] = z * (look[7] * dx + look[8] * dy + look[9])
+    out[0], out[1] = to_point(crop_camera(packed_camera), r, c, h)
     out[2] = h
 
 
 @njit(cache=True)
-def crop_pixel(look, p):
-    """Row and column (rounded) of a point of the view frame in the crop, and millimetres a crop
-    pixel there.
-    """
-    x0 = p[0]
-    y0 = p[1]
-    z0 = p[2] - look[13]
-    x = look[4] * x0 + look[7] * y0 + look[10] * z0
-    y = look[5] * x0 + look[8] * y0 + look[11] * z0
-    z = max(look[6] * x0 + look[9] * y0 + look[12] * z0, 1.0)
-    column = int((look[0] * x / z + look[2] - look[14]) / look[16] + 0.5)
-    row = int((look[1] * y / z + look[3] - look[15]) / look[16] + 0.5)
+def crop_pixel(packed_camera, p):
+    """Row and column (rounded) of a point (3,) mm of the view frame in the crop."""
+    u, v = to_pixel(crop_camera(packed_camera), p[0], p[1], p[2])
+    column = int(u + 0.5)
+    row = int(v + 0.5)
     return row, column
 
 
 @njit(cache=True)
 def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
-    """Joint frames of a pose, as `body.kinematics.forward_kinematics`."""
+    """Forward kinematics of one pose, as `body.kinematics.forward_kinematics`.
+
+    Args:
+        tree: the kinematic tree.
+        root_rotation: (3, 3) of the base.
+        root_position: (3,) of the base, mm.
+        angles: (J, 3) rotation vectors of the joints, rad.
+        scale: of the bones.
+        rotations: (J, 3, 3) joint frames, filled.
+        positions: (J, 3) joints, mm, filled.
+    """
     turn = np.empty((3, 3))
     local = np.empty((3, 3))
     for i in range(3):
@@ -138,8 +156,16 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
 
 @njit(cache=True)
 def turning_axes(free, angles, rotations, axes):
-    """World axes (F, 3) about which the free angles (F, 2: joint, axis) turn: R J_r(w) e, J_r the
-    right Jacobian.
+    """Axes in the view frame about which the free angles turn: R J_r(w) e.
+
+    J_r is the right Jacobian of SO(3) at the joint's rotation vector w, and e the axis of the
+    angle.
+
+    Args:
+        free: (F, 2) joint and axis of every free angle.
+        angles: (J, 3) rotation vectors of the joints, rad.
+        rotations: (J, 3, 3) joint frames.
+        axes: (F, 3) filled.
     """
     e = np.empty(3)
     for f in range(len(free)):
@@ -172,7 +198,19 @@ def turning_axes(free, angles, rotations, axes):
 
 @njit(cache=True)
 def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
-    """Derivative (3, P) of ball b's middle `ball` (3,) by base twist, log scale and free angles."""
+    """Jacobian of a sphere's centre by base twist, log scale and free angles.
+
+    Args:
+        b: number of the sphere.
+        ball: (3,) its centre, mm.
+        body: the sphere model.
+        tree: the kinematic tree.
+        axes: (F, 3) axes of the free angles, from `turning_axes`.
+        rotations: (J, 3, 3) joint frames.
+        positions: (J, 3) joints, mm.
+        scale: of the bones.
+        slope: (3, P) filled.
+    """
     slope[:] = 0.0
     x0 = ball[0] - positions[0, 0]
     y0 = ball[1] - positions[0, 1]
@@ -235,7 +273,7 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
 
 @njit(cache=True)
 def _add(row, residual, weight, gradient, curvature):
-    """One residual into the normal equations."""
+    """Add one residual to the normal equations (lower half of the curvature)."""
     n = row.size
     for i in range(n):
         if row[i] == 0.0:
@@ -248,8 +286,9 @@ def _add(row, residual, weight, gradient, curvature):
 
 @njit(cache=True)
 def _solve(curvature, gradient, step):
-    """Solve the positive definite system by Cholesky, lower half given; False where it is not
-    definite.
+    """Solve the positive definite system by Cholesky decomposition, given its lower half.
+
+    Returns False where it is not definite.
     """
     n = gradient.size
     for i in range(n):
@@ -278,8 +317,10 @@ def _solve(curvature, gradient, step):
 
 @njit(cache=True)
 def _pull(points, balls, radius, slopes, robust, gradient, curvature):
-    """What readings `points` (n, 3) mm want: each, that the surface of the nearest of the balls (B,
-    3) passes through it. slopes (n, 3, P) of the first n balls, which are the body's own.
+    """Residuals of readings (n, 3) mm: the surface of the nearest sphere shall pass through each.
+
+    slopes (n_own, 3, P) are of the body's own spheres, which come first; readings nearest to
+    another sphere are left out.
     """
     row = np.empty(gradient.size)
     gaps = np.empty(len(balls))
@@ -299,15 +340,18 @@ def _pull(points, balls, radius, slopes, robust, gradient, curvature):
 
 
 @njit(cache=True)
-def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient, curvature):
-    """What balls (n, 3) mm want: not to stick out of the readings, nor to lie beside the animal.
-    slopes (n, 3, P).
+def _push(
+    heights, packed_camera, known, balls, radius, slopes, robust, beside, gradient, curvature
+):
+    """Residuals of spheres: not to stick out of the readings, nor to lie beside the animal.
+
+    slopes (n_own, 3, P) are of the body's own spheres, which come first.
     """
     row = np.empty(gradient.size)
     target = np.empty(3)
     last = heights.shape[0] - 1
     for b in range(len(slopes)):
-        r, c = crop_pixel(look, balls[b])
+        r, c = crop_pixel(packed_camera, balls[b])
         r = min(max(r, 0), last)
         c = min(max(c, 0), last)
         if heights[r, c] > 0:
@@ -323,7 +367,7 @@ def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient,
         d = known[r, c, 1]
         if a < 0:
             continue
-        point_of(heights, look, a, d, target)
+        point_of(heights, packed_camera, a, d, target)
         for axis in range(2):
             off = balls[b, axis] - target[axis]
             weight = beside / (1.0 + (off / (2.0 * robust)) ** 2)
@@ -333,8 +377,9 @@ def _push(heights, look, known, balls, radius, slopes, robust, beside, gradient,
 
 @njit(cache=True)
 def _hold(tree, prior, moved, growth, turned, gradient, curvature):
-    """What the start wants: not to be left by a twist `moved` (6,), log scale `growth` and angles
-    `turned` (J, 3).
+    """Residuals of the prior: not to leave the start.
+
+    It is left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3).
     """
     for k in range(3):
         gradient[k] += prior[0] * moved[k]
@@ -352,7 +397,7 @@ def _hold(tree, prior, moved, growth, turned, gradient, curvature):
 
 @njit(cache=True)
 def _go(step, tree, root_rotation, root_position, angles, scale):
-    """Take a step (P,), in place; returns the new scale."""
+    """Take a step (P,) in place, angles and scale limited; returns the new scale."""
     turn = np.empty((3, 3))
     so3_exp(step[0], step[1], step[2], turn)
     for i in range(3):
@@ -371,7 +416,7 @@ def _go(step, tree, root_rotation, root_position, angles, scale):
 
 
 @njit(cache=True)
-def _readings(heights, look):
+def _readings(heights, packed_camera):
     """The points (n, 3) mm of the view frame that every `_STRIDE`-th crop pixel shows."""
     side = heights.shape[0]
     points = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3))
@@ -379,7 +424,7 @@ def _readings(heights, look):
     for r in range(_STRIDE // 2, side, _STRIDE):
         for c in range(_STRIDE // 2, side, _STRIDE):
             if heights[r, c] > 0:
-                point_of(heights, look, r, c, points[n])
+                point_of(heights, packed_camera, r, c, points[n])
                 n += 1
     return points[:n]
 
@@ -387,7 +432,7 @@ def _readings(heights, look):
 @njit(cache=True)
 def refine_one(
     heights,
-    look,
+    packed_camera,
     known,
     points,
     tree,
@@ -399,10 +444,24 @@ def refine_one(
     angles,
     scale,
 ):
-    """Refine one pose in place: root_rotation (3, 3), root_position (3,) mm, angles (J, 3); returns
-    the new scale.
+    """Refine one pose in place by Gauss-Newton steps.
 
-    known (S, S, 2) as in `nearest_reading`, points (n, 3) as `_readings` of the height map.
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        known: (S, S, 2) memory of `nearest_reading`.
+        points: (n, 3) readings, mm, view frame, from `_readings`.
+        tree: the kinematic tree.
+        body: the sphere model.
+        wishes: weights of the residuals.
+        n_steps: number of steps; fewer are taken where the system is not definite.
+        root_rotation: (3, 3) of the base, changed in place.
+        root_position: (3,) of the base, mm, changed in place.
+        angles: (J, 3) rotation vectors of the joints, rad, changed in place.
+        scale: of the bones.
+
+    Returns:
+        The new scale.
     """
     n_values = _ROOT + len(tree.free)
     n_joints = tree.parents.size
@@ -427,7 +486,7 @@ def refine_one(
         _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
         _push(
             heights,
-            look,
+            packed_camera,
             known,
             balls,
             radius,
@@ -457,16 +516,38 @@ def refine_one(
 
 @njit(cache=True, parallel=True)
 def refine_all(
-    heights, looks, tree, body, wishes, n_steps, root_rotations, root_positions, angles, scales
+    heights,
+    crop_cameras,
+    tree,
+    body,
+    wishes,
+    n_steps,
+    root_rotations,
+    root_positions,
+    angles,
+    scales,
 ):
-    """`refine_one` for the K poses of each of n frames."""
+    """`refine_one` for the K poses of each of n frames, in parallel.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        tree: the kinematic tree.
+        body: the sphere model.
+        wishes: weights of the residuals.
+        n_steps: number of steps.
+        root_rotations: (n, K, 3, 3), changed in place.
+        root_positions: (n, K, 3) mm, changed in place.
+        angles: (n, K, J, 3) rad, changed in place.
+        scales: (n, K), changed in place.
+    """
     for i in prange(len(scales)):
         known = np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32)
-        points = _readings(heights[i], looks[i])
+        points = _readings(heights[i], crop_cameras[i])
         for k in range(scales.shape[1]):
             scales[i, k] = refine_one(
                 heights[i],
-                looks[i],
+                crop_cameras[i],
                 known,
                 points,
                 tree,

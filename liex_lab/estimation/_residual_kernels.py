@@ -1,8 +1,9 @@
-"""Numba kernels that hold a posed body against a height map: what it leaves unexplained, and where
-it should not be.
+"""Numba kernels of the generative score: residuals of a posed sphere model against a height map.
 
-The body is a heap of balls (`body.spheres.Balls`). METHOD lesson 4: such numbers, beside the
-features of the learned metric, tell good candidates from bad ones.
+METHOD lesson 4 (ours): such numbers, beside the features of the learned metric, tell good
+candidates from bad ones. They measure what the posed body leaves unexplained, and where it should
+not be: signed distances d = |x - c| - r of depth readings x from the nearest sphere, and of the
+spheres' fronts from the readings under them. The body is that of `body.spheres.Spheres`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
+
 N_FIT = 8
 # of the fit: see `explain`
 BESIDE = 0
@@ -20,17 +23,25 @@ APART = 4
 # thresholds are integers
 SHARE_UNIT = 1000.0
 MM_UNIT = 50.0
-_MOST_MM = (
-    30.0  # in tenths of the balls' usual radius, as the next two: farther off is simply wrong
-)
+# in tenths of the balls' usual radius, as the next two: farther off is simply wrong
+_MOST_MM = 30.0
 _HIDDEN_MM = 12.0
 _APART_MM = 8.0
 _STRIDE = 6  # every so many crop pixels a reading is looked at
 
 
 class Body(NamedTuple):
-    """The body that poses are held against the picture with, see `body.spheres.Balls`; none: no
-    balls.
+    """The sphere model that poses are compared with the height map by, see `body.spheres.Spheres`.
+
+    It may have no spheres.
+
+    Attributes:
+        unit_mm: a tenth of the usual radius at scale 1, mm.
+        n_own: the first so many spheres are the body; the others lie where something may go on.
+        joints: (B, 2) the two joints that carry each sphere.
+        offsets: (B, 2, 3) points in these joints' frames, mm at scale 1.
+        share: (B,) of the distance from the first point to the second.
+        radius: (B,) mm at scale 1.
     """
 
     unit_mm: float
@@ -43,7 +54,15 @@ class Body(NamedTuple):
 
 @njit(cache=True)
 def place_balls(rotations, positions, scale, body, out):
-    """Middles (B, 3) mm of the balls of one pose: rotations (J, 3, 3), positions (J, 3)."""
+    """Centres of the spheres of one pose.
+
+    Args:
+        rotations: (J, 3, 3) joint frames, view frame.
+        positions: (J, 3) joints, mm, view frame.
+        scale: of the bones.
+        body: the sphere model.
+        out: (B, 3) filled, mm, view frame.
+    """
     for b in range(len(body.joints)):
         share = body.share[b]
         one = body.joints[b, 0]
@@ -59,12 +78,22 @@ def place_balls(rotations, positions, scale, body, out):
 
 @njit(cache=True, fastmath={"nnan", "nsz"})
 def nearest_ball(x, y, z, balls, radius, gaps):
-    """Signed distance mm of a point from the surface of the nearest of the balls (B, 3), and which
-    that is.
+    """Signed distance of a point from the surface of the nearest sphere.
 
-    gaps (B,) is scratch: the distances of all, then their least, then which it is, for each of
-    these three runs in vector registers, while one loop that keeps the least waits for a root with
-    every ball.
+    The distances of all come first, then their least, then which it is, for each of these three
+    loops runs in vector registers, while one loop that keeps the least waits for a root with every
+    sphere.
+
+    Args:
+        x: of the point, mm.
+        y: of the point, mm.
+        z: of the point, mm.
+        balls: (B, 3) centres of the spheres, mm.
+        radius: (B,) their radii, mm.
+        gaps: (B,) scratch.
+
+    Returns:
+        The distance, mm, negative inside, and the number of the sphere.
     """
     for b in range(len(balls)):
         off2 = (x - balls[b, 0]) ** 2 + (y - balls[b, 1]) ** 2 + (z - balls[b, 2]) ** 2
@@ -80,15 +109,26 @@ def nearest_ball(x, y, z, balls, radius, gaps):
 
 
 @njit(cache=True)
-def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
-    """Fill `out` (N_FIT,) for balls (B, 3) mm of radius (B,) mm in the view frame of a height map,
-    n_own of the body.
+def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
+    """Residuals of spheres against a height map.
 
-    size: of the animal over home size; unit_mm: as in `Balls`. Of the balls: share beside the
-    animal, mean distance of their fronts from the readings, mean by which they stick out of them,
-    share hidden behind them; of the readings: mean distance from the nearest ball, share far from
-    any, mean of the distances within balls.
+    In order, of the body's own spheres: share beside the animal, mean distance of their fronts from
+    the readings, mean by which they stick out of them, share hidden behind them; of the readings:
+    mean distance from the nearest sphere, share far from any, mean depth inside spheres. Shares are
+    in thousandths; distances are over size * unit_mm, times 50, and capped. Readings nearest to a
+    sphere that is not the body's own are left out.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        balls: (B, 3) centres of the spheres, mm, view frame.
+        radius: (B,) their radii, mm.
+        n_own: the first so many spheres are the body.
+        size: the animal's size over home size.
+        unit_mm: as in `Spheres`, mm.
+        out: (N_FIT,) float32; all but the last number are filled.
     """
+    camera = crop_camera(packed_camera)
     n = n_own
     per_mm = 1.0 / (size * unit_mm)
     beside = 0.0
@@ -97,14 +137,9 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
     hidden = 0.0
     last = heights.shape[0] - 1
     for b in range(n):
-        x0 = balls[b, 0]
-        y0 = balls[b, 1]
-        z0 = balls[b, 2] - look[13]
-        x = look[4] * x0 + look[7] * y0 + look[10] * z0
-        y = look[5] * x0 + look[8] * y0 + look[11] * z0
-        z = max(look[6] * x0 + look[9] * y0 + look[12] * z0, 1.0)
-        column = int((look[0] * x / z + look[2] - look[14]) / look[16] + 0.5)
-        row = int((look[1] * y / z + look[3] - look[15]) / look[16] + 0.5)
+        u, v = to_pixel(camera, balls[b, 0], balls[b, 1], balls[b, 2])
+        column = int(u + 0.5)
+        row = int(v + 0.5)
         here = heights[min(max(row, 0), last), min(max(column, 0), last)]
         if here == 0:
             beside += 1.0
@@ -128,12 +163,8 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
             if heights[r, c] == 0:
                 continue
             # the point of the view frame that this pixel shows
-            dx = (look[14] + look[16] * c - look[2]) / look[0]
-            dy = (look[15] + look[16] * r - look[3]) / look[1]
-            z = (heights[r, c] / 16.0 - look[13]) / (look[10] * dx + look[11] * dy + look[12])
-            px = z * (look[4] * dx + look[5] * dy + look[6])
-            py = z * (look[7] * dx + look[8] * dy + look[9])
             pz = heights[r, c] / 16.0
+            px, py = to_point(camera, r, c, pz)
             nearest, which = nearest_ball(px, py, pz, balls, radius, gaps)
             if which >= n_own:
                 continue
@@ -149,24 +180,52 @@ def explain(heights, look, balls, radius, n_own, size, unit_mm, out):
 
 
 @njit(cache=True)
-def explain_pose(heights, look, axis, rotations, positions, scale, size, body, out):
-    """`explain` for one pose. axis rad: of the animal's long axis, against which the last number
-    holds the base's x axis.
+def explain_pose(heights, packed_camera, axis, rotations, positions, scale, size, body, out):
+    """Residuals of one pose against a height map, see `explain`.
+
+    The last number is the cosine of the angle between the base's x axis and the animal's long axis
+    in the image plane, in thousandths.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        axis: angle of the animal's long axis, rad.
+        rotations: (J, 3, 3) joint frames, view frame.
+        positions: (J, 3) joints, mm, view frame.
+        scale: of the bones.
+        size: the animal's size over home size.
+        body: the sphere model.
+        out: (N_FIT,) float32, filled.
     """
     balls = np.empty((len(body.joints), 3))
     place_balls(rotations, positions, scale, body, balls)
-    explain(heights, look, balls, body.radius * scale, body.n_own, size, body.unit_mm, out)
+    explain(heights, packed_camera, balls, body.radius * scale, body.n_own, size, body.unit_mm, out)
     out[7] = SHARE_UNIT * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0])
 
 
 @njit(cache=True, parallel=True)
-def explain_all(heights, looks, moments, image, rotations, positions, scale, size, body, out):
-    """`explain_pose` for a batch of n poses on some of the images (n,); out (n, N_FIT)."""
+def explain_all(
+    heights, crop_cameras, moments, image, rotations, positions, scale, size, body, out
+):
+    """`explain_pose` for a batch of poses, in parallel.
+
+    Args:
+        heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (m, 17) packed crop cameras of the height maps.
+        moments: (m, 9) moments of the height maps.
+        image: (n,) index of each pose's height map.
+        rotations: (n, J, 3, 3) joint frames, view frame.
+        positions: (n, J, 3) joints, mm, view frame.
+        scale: (n,) of the bones.
+        size: (n,) the animals' size over home size.
+        body: the sphere model.
+        out: (n, N_FIT) float32, filled.
+    """
     for s in prange(len(image)):
         i = image[s]
         explain_pose(
             heights[i],
-            looks[i],
+            crop_cameras[i],
             moments[i, 5],
             rotations[s],
             positions[s],

@@ -1,5 +1,14 @@
-"""The cascade: regressors joint by joint and round by round, and the candidates they move (Lie-X
-Algorithm 1).
+"""Cascaded pose regression on a kinematic tree: the forests, their features and their labels.
+
+Lie-X Algorithms 1 and 2 (section 4.1). For joint j, base first, and round c, the forest R_j^(c)
+predicts the tangent vector r from features at the current pose, and
+
+    g_{1:j} <- g_{1:j} exp(r)                                                       (Eq. 10),
+    label = log(g_est^-1 g_true)                                                    (Eq. 11),
+
+so corrections live in the joint's own frame. A joint that is not the base corrects the rotation
+about its free axes only. Estimation runs the same steps in `_cascade_kernels`; this module is used
+in training, and to watch the cascade step by step.
 """
 
 from __future__ import annotations
@@ -13,7 +22,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.kinematics import aim
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.spheres import Balls
+from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation import _residual_kernels as explaining
 from liex_lab.estimation.method import Method
@@ -26,11 +35,14 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Candidates:
-    """Poses under way, n of them on a set of images: all joints' frames, in the view frame of their
-    image.
+    """Candidate poses in progress, n of them on a set of images, as frames of all joints.
 
-    image (n,) int32; rotations (n, J, 3, 3); positions (n, J, 3) mm; scale (n,) of the bones; size
-    (n,) of the animal over home size, by which features are normalised.
+    Attributes:
+        image: (n,) int32 index of each candidate's image.
+        rotations: (n, J, 3, 3) joint frames, in the view frame of the image.
+        positions: (n, J, 3) joints, mm, in the view frame of the image.
+        scale: (n,) scale of the bones over their home lengths.
+        size: (n,) the animal's size over home size, by which features are normalised.
     """
 
     image: NDArray[np.int32]
@@ -48,7 +60,16 @@ class Candidates:
         scale: Array,
         size: Array,
     ) -> Candidates:
-        """Candidates with only their base in place."""
+        """Make candidates of which only the base is in place.
+
+        Args:
+            skeleton: the animal's skeleton.
+            image: (n,) int32 index of each candidate's image.
+            rotation: (n, 3, 3) base rotation, view frame.
+            position: (n, 3) base position, mm, view frame.
+            scale: (n,) scale of the bones; copied.
+            size: (n,) the animal's size over home size; not copied.
+        """
         n = len(image)
         j = skeleton.n_joints
         rotations = np.zeros((n, j, 3, 3))
@@ -58,33 +79,42 @@ class Candidates:
         return Candidates(image, rotations, positions, scale.copy(), size)
 
     def __len__(self) -> int:
+        """Number of candidates."""
         return len(self.image)
 
 
 @dataclass(frozen=True)
 class ImageSet:
-    """Height maps and how they were cut: heights (m, S, S) int16, looks (m, 17), moments (m, 8)."""
+    """Height maps with their crop cameras and moments.
+
+    Attributes:
+        heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (m, 17) packed crop cameras, see `CropCamera`.
+        moments: (m, 9) moments of the animal's blob, see `HeightMaps`.
+    """
 
     heights: NDArray[np.int16]
-    looks: Array
+    crop_cameras: Array
     moments: Array
 
     def __getitem__(self, rows: NDArray[np.int64]) -> ImageSet:
-        """Some of them."""
-        return ImageSet(self.heights[rows], self.looks[rows], self.moments[rows])
+        """Some of the images.
 
-
-def mm_per_px(looks: Array) -> Array:
-    """How many mm (m,) a pixel of each height map covers at the distance of its view's origin;
-    looks (m, 17).
-    """
-    return looks[:, 16] * looks[:, 13] / looks[:, 0]
+        Args:
+            rows: (k,) rows to take.
+        """
+        return ImageSet(self.heights[rows], self.crop_cameras[rows], self.moments[rows])
 
 
 @dataclass(frozen=True)
 class Cascade:
-    """A skeleton, a method, and one forest per solved joint and round, in order; proposals say
-    where to start.
+    """A skeleton, a method, and one regression forest per solved joint and round.
+
+    Attributes:
+        skeleton: the animal's skeleton.
+        method: the variant of the method.
+        forests: the forests of every round of each solved joint, in order.
+        proposals: forest that proposes initial poses; None where they are drawn.
     """
 
     skeleton: Skeleton
@@ -93,15 +123,25 @@ class Cascade:
     proposals: Forest | None = None
 
     def n_values(self, joint: int) -> int:
-        """Length of a joint's correction: base 6, or 7 with the scale; others one for each free
-        axis.
+        """Length of a joint's correction.
+
+        Args:
+            joint: number of the joint.
+
+        Returns:
+            6 for the base, or 7 with the scale; otherwise the number of the joint's free axes.
         """
         if joint == 0:
             return 7 if self.method.regress_scale else 6
         return int(self.skeleton.axes[joint].sum())
 
     def place(self, candidates: Candidates, joint: int) -> None:
-        """Put a joint where its parent carries it."""
+        """Put a joint where its parent carries it, at its home angle.
+
+        Args:
+            candidates: the candidates, which are changed in place.
+            joint: number of the joint; its parent must be in place.
+        """
         s = self.skeleton
         kernels.place_all(
             joint,
@@ -114,8 +154,16 @@ class Cascade:
         )
 
     def steps(self, images: ImageSet, candidates: Candidates) -> Iterator[tuple[int, int]]:
-        """Algorithm 1 as it is written: move the candidates, each by itself, by one forest after
-        the other; yields the joint and the round of each.
+        """Run Algorithm 1 as it is written, one forest after the other.
+
+        Every candidate is moved by itself, without pruning. Yields after each forest.
+
+        Args:
+            images: the images that the candidates lie on.
+            candidates: candidates with their base in place, which are changed in place.
+
+        Yields:
+            The joint and the round of the forest that was just applied.
         """
         for joint, rounds in zip(self.skeleton.solved, self.forests, strict=True):
             if joint:
@@ -128,19 +176,32 @@ class Cascade:
         self.place_ends(candidates)
 
     def place_ends(self, candidates: Candidates) -> None:
-        """Put every joint that no regressor moves where its parent carries it."""
+        """Put every joint without a regressor where its parent carries it.
+
+        Args:
+            candidates: the candidates, which are changed in place.
+        """
         for joint in range(1, self.skeleton.n_joints):
             if joint not in self.skeleton.solved:
                 self.place(candidates, joint)
 
     def samples(self, images: ImageSet, candidates: Candidates, joints: list[int]) -> Samples:
-        """What forests see of the candidates at the given joints."""
+        """Features of the candidates, as forests see them from the given joints.
+
+        Args:
+            images: the images that the candidates lie on.
+            candidates: n candidates.
+            joints: the joints whose views are taken; the first one gives the scalars.
+
+        Returns:
+            n samples with one view per joint, on the height maps of the images.
+        """
         n = len(candidates)
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
         kernels.look_all(
             np.array(joints),
-            images.looks,
+            images.crop_cameras,
             images.moments,
             candidates.image,
             candidates.size,
@@ -155,13 +216,22 @@ class Cascade:
         return Samples(images.heights, candidates.image, inverse_size, views, scalars)
 
     @cached_property
-    def balls(self) -> Balls:
-        """The body that candidates are held against the picture with."""
-        return Balls.of(self.skeleton)
+    def balls(self) -> Spheres:
+        """The sphere model of the body that candidates are compared with the height map by."""
+        return Spheres.of(self.skeleton)
 
     def metric_samples(self, images: ImageSet, candidates: Candidates) -> Samples:
-        """What the learned metric sees of finished candidates: all joints, and how well they
-        explain the picture.
+        """Features of finished candidates, as the learned metric sees them.
+
+        They are taken from all joints; where the method asks, the residuals of the posed body
+        against the height map are appended to the scalars (METHOD lesson 4).
+
+        Args:
+            images: the images that the candidates lie on.
+            candidates: n candidates with all joints in place.
+
+        Returns:
+            n samples with J views.
         """
         samples = self.samples(images, candidates, list(range(self.skeleton.n_joints)))
         if not self.method.explains:
@@ -169,7 +239,7 @@ class Cascade:
         fit = np.empty((len(candidates), explaining.N_FIT), np.float32)
         explaining.explain_all(
             images.heights,
-            images.looks,
+            images.crop_cameras,
             images.moments,
             candidates.image,
             candidates.rotations,
@@ -182,7 +252,14 @@ class Cascade:
         return replace(samples, scalars=np.concatenate([samples.scalars, fit], axis=1))
 
     def apply(self, candidates: Candidates, joint: int, values: NDArray[np.float32]) -> None:
-        """Move the candidates by a forest's prediction (n, n_values), Eq. 10."""
+        """Move the candidates by a forest's prediction (Eq. 10).
+
+        Args:
+            candidates: n candidates, which are changed in place.
+            joint: number of the joint to correct.
+            values: (n, n_values) float32 correction, rotations times their lever arm, mm at home
+                size.
+        """
         method = self.method
         if joint == 0:
             levers = np.array([method.base_lever_mm, method.scale_lever_mm])
@@ -206,11 +283,20 @@ class Cascade:
     def labels(
         self, candidates: Candidates, joint: int, truth: Truth
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Corrections (n, n_values) that lead to the truth, in lever units, and which samples are
-        worth learning from.
+        """Corrections that lead to the truth, and which samples to learn from.
 
-        Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size. Other joints: the rotation
-        about the free axes that remains, or the one that aims the bone at the true next joint.
+        Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size and, where the method asks,
+        the logarithm of the ratio of scales. Other joints: the rotation about the free axes that
+        remains, or the one that aims the bone at the true next joint (METHOD lesson 7).
+
+        Args:
+            candidates: n candidates with the joint in place.
+            joint: number of the joint.
+            truth: true poses of the images.
+
+        Returns:
+            (n, n_values) labels, rotations and log scale times their lever arms, and (n,) bool, the
+            samples that lie near enough to the truth to be worth learning from (METHOD lesson 1).
         """
         method = self.method
         i = candidates.image
@@ -239,8 +325,12 @@ class Cascade:
         return turn * method.joint_lever_mm, keep
 
 
-def body_of(balls: Balls) -> explaining.Body:
-    """A body of balls as the kernels want it."""
+def body_of(balls: Spheres) -> explaining.Body:
+    """The body's spheres as the kernels want them.
+
+    Args:
+        balls: the sphere model of the body.
+    """
     return explaining.Body(
         balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius
     )
@@ -248,8 +338,12 @@ def body_of(balls: Balls) -> explaining.Body:
 
 @dataclass(frozen=True)
 class Truth:
-    """True poses of m images in their view frames: rotations (m, J, 3, 3), positions (m, J, 3) mm,
-    scale (m,).
+    """True poses of m images, in their view frames.
+
+    Attributes:
+        rotations: (m, J, 3, 3) joint frames.
+        positions: (m, J, 3) joints, mm.
+        scale: (m,) scale of the bones.
     """
 
     rotations: Array
@@ -258,11 +352,18 @@ class Truth:
 
 
 def aim_about(bone: Array, wanted: Array, axes: NDArray[np.bool_]) -> Array:
-    """Rotation vectors (n, 3) about the free axes that turn `bone` (3,) towards directions `wanted`
-    (n, 3).
+    """Rotation vectors about free axes that turn a bone towards given directions.
 
-    A hinge turns by the angle seen along its axis; a joint with more axes takes the smallest
-    rotation's share of them.
+    A hinge turns by the angle that is seen along its axis. A joint with more axes takes the
+    smallest rotation; components about its fixed axes are for the caller to drop.
+
+    Args:
+        bone: (3,) the bone at home, in the joint's frame.
+        wanted: (n, 3) directions to point at, in the joint's frame.
+        axes: (3,) bool, the free axes.
+
+    Returns:
+        (n, 3) rotation vectors, rad.
     """
     if axes.sum() > 1:
         return aim(bone, wanted)

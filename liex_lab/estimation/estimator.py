@@ -1,5 +1,15 @@
-"""PoseEstimator: depth frames in, a pose with its expected error for each of them out (Lie-X
-Algorithm 1).
+"""Pose estimation by a cascade of regression forests: depth frames in, poses with errors out.
+
+Lie-X Algorithm 1 (section 4.1). From several initial poses per animal, one regression forest per
+joint and round predicts a correction r in the joint's own frame, and the pose moves by the
+exponential map of SE(3),
+
+    g_{1:j} <- g_{1:j} exp(r)                                                       (Eq. 10);
+
+a learned metric scores the resulting candidates. Where the paper returns the candidate with the
+lowest score, the default method returns a weighted mean of the best ones (METHOD lesson 3),
+followed by a forest correction, a ridge correction or a Gauss-Newton refinement as the method asks.
+`PoseEstimator` is the class that users hold.
 """
 
 from __future__ import annotations
@@ -20,15 +30,16 @@ from liex_lab.estimation import _cascade_kernels as kernels
 from liex_lab.estimation._residual_kernels import Body
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.forest_correction import corrected
-from liex_lab.estimation.head_tail import Facing, both_ways
+from liex_lab.estimation.head_tail import HeadTailClassifier, both_ways
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.refine import Refiner
-from liex_lab.estimation.ridge_correction import SURE_SHARE, Settler
+from liex_lab.estimation.ridge_correction import SURE_SHARE, RidgeCorrection
 from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
 from liex_lab.estimation.training import base_at_front
-from liex_lab.foreground.height_maps import Crops, Foreground, view_of
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.foreground.height_maps import Foreground, HeightMaps
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
@@ -36,98 +47,142 @@ from liex_lab.runtime.threads import threads
 Array = NDArray[np.float64]
 
 _START_SEED = 20170125
-_SIZE_PASSES = (
-    8  # of estimating the size with the size just found; each goes about a third of the way
-)
-# what a squared standard deviation of area or volume weighs against the predicted error, at
+# of estimating the size with the size just found; each goes about a third of the way
+_SIZE_PASSES = 8
+# what a squared standard deviation of area or volume weighs against the predicted error, at the
+# reference length
 _MM_PER_MISFIT = 0.5
-# the reference length
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Poses of n frames in the camera frame; NaN rows where no animal was found. Fields as
-    `Chosen`; found (n,).
+    """Poses of n frames in the camera frame; rows are NaN where no animal was found.
+
+    Attributes:
+        chosen: the poses with their spreads, scores and expected errors, see `Chosen`.
+        found: (n,) bool, where an animal was found.
+        crops: the height maps that the poses were estimated from.
     """
 
     chosen: Chosen
     found: NDArray[np.bool_]
-    crops: Crops
+    crops: HeightMaps
 
     def __getitem__(self, rows: slice) -> Estimates:
+        """Some consecutive frames.
+
+        Args:
+            rows: the frames to take.
+        """
         return Estimates(self.chosen[rows], self.found[rows], self.crops[rows])
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """A thing in each of n frames and its candidates: looks (n, 17); rotations (n, K, J, 3, 3),
-    positions (n, K, J, 3) mm, scores (n, K), infinite where there is no such candidate.
+class Detection:
+    """One detected component in each of n frames, and its candidate poses.
+
+    Attributes:
+        crops: the height maps of the component.
+        crop_cameras: (n, 17) crop cameras of the height maps.
+        rotations: (n, K, J, 3, 3) joint frames of the candidates, in the view frame.
+        positions: (n, K, J, 3) joints of the candidates, mm, view frame.
+        scores: (n, K) predicted errors, mm at home size; infinite where there is no such candidate.
     """
 
-    crops: Crops
-    looks: Array
+    crops: HeightMaps
+    crop_cameras: Array
     rotations: Array
     positions: Array
     scores: Array
 
-    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> _Sight:
-        return _Sight(
+    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Detection:
+        """Some of the frames.
+
+        Args:
+            index: (m,) row numbers, or (n,) bool.
+        """
+        return Detection(
             self.crops[index],
-            self.looks[index],
+            self.crop_cameras[index],
             self.rotations[index],
             self.positions[index],
             self.scores[index],
         )
 
     @staticmethod
-    def join(parts: Sequence[_Sight]) -> _Sight:
-        """Those of several batches, one after the other."""
+    def join(parts: Sequence[Detection]) -> Detection:
+        """Concatenate the detections of several batches of frames.
+
+        Args:
+            parts: the batches, in order, with equally many candidates per frame.
+        """
         rest = (np.concatenate([getattr(p, name) for p in parts]) for name in _OF_SIGHT)
-        return _Sight(Crops.join([p.crops for p in parts]), *rest)
+        return Detection(HeightMaps.join([p.crops for p in parts]), *rest)
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(n,) where there is something, and a candidate for it."""
+        """(n,) bool: there is a component in the frame, and a candidate for it."""
         return self.crops.found & np.isfinite(self.scores).any(axis=1)
 
-    def put(self, rows: NDArray[np.int64], other: _Sight) -> None:
-        """Take these rows (m,) from another one of m frames."""
+    def put(self, rows: NDArray[np.int64], other: Detection) -> None:
+        """Overwrite some rows by another detection.
+
+        Args:
+            rows: (m,) rows to overwrite.
+            other: the detection of m frames that is copied into them.
+        """
         self.crops.put(rows, other.crops)
         for name in _OF_SIGHT:
             getattr(self, name)[rows] = getattr(other, name)
 
-    def nothing(self) -> _Sight:
-        """As many frames in which no such thing is."""
-        nothing = self[np.arange(len(self.looks))]
+    def nothing(self) -> Detection:
+        """A detection of as many frames in which nothing was found."""
+        nothing = self[np.arange(len(self.crop_cameras))]
         nothing.crops.n_px[:] = 0
         nothing.scores[:] = np.inf
         return nothing
 
-    def opposite(self, usable: NDArray[np.bool_], tip: int) -> _Sight:
-        """The same with only the candidates that point away from where the one with the lowest
-        score does, in frames `usable`, from base to `tip`; the best of them takes the others'
-        places, so that their number stays.
+    def opposite(self, usable: NDArray[np.bool_], tip: int) -> Detection:
+        """Keep only the candidates that point away from the best one, base to tip.
+
+        The best of them takes the positions of those that are left out, so that the number of
+        candidates stays.
+
+        Args:
+            usable: (n,) bool; in other frames no candidate is left.
+            tip: the joint that the direction from the base is taken to.
+
+        Returns:
+            The detection with scores that are infinite where no candidate points the other way.
         """
         _, other, _, away = both_ways(self.positions, self.scores, tip)
         rows = np.arange(len(self.scores))
         scores = np.where(away & usable[:, None], self.scores, np.inf)
         taken = np.where(away, np.arange(scores.shape[1]), other[:, None])
         some = away.any(axis=1) & usable
-        return _Sight(
+        return Detection(
             self.crops,
-            self.looks,
+            self.crop_cameras,
             self.rotations[rows[:, None], taken],
             self.positions[rows[:, None], taken],
             np.where(some[:, None], np.take_along_axis(scores, taken, axis=1), np.inf),
         )
 
 
-_OF_SIGHT = ("looks", "rotations", "positions", "scores")
+_OF_SIGHT = ("crop_cameras", "rotations", "positions", "scores")
 
 
 @dataclass(frozen=True)
 class PoseEstimator:
-    """A trained model at work."""
+    """A trained model that estimates poses from depth frames.
+
+    Attributes:
+        model: the trained model.
+        n_candidates: initial poses per animal (Kt of the paper); 0: as the model's method says.
+        unpruned: run all candidates through the whole kinematic tree instead of pruning them after
+            the base joint.
+        n_joints: move only so many joints, to see what each costs; 0: all that can be.
+    """
 
     model: Model
     n_candidates: int = 0  # 0: as the model's method says
@@ -136,8 +191,16 @@ class PoseEstimator:
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
-        """An estimator from a bundled model's name or the path of a model file. Raises
-        ModelError.
+        """Load an estimator.
+
+        Args:
+            name: name of a bundled model, or path of a model file.
+
+        Returns:
+            The estimator, with the number of candidates that its method asks for.
+
+        Raises:
+            ModelError: there is no such model, or the file is not a whole model file.
         """
         return PoseEstimator(Model.load(find_model(name)))
 
@@ -155,12 +218,14 @@ class PoseEstimator:
 
     @cached_property
     def _chain(self) -> kernels.Chain:
+        """The kinematic tree as the kernels want it."""
         s = self.skeleton
         return kernels.Chain(
             s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None])
         )
 
     def _tuning(self, n_starts: int) -> kernels.Tuning:
+        """The method's numbers as the kernels want them."""
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.Tuning(
@@ -174,7 +239,7 @@ class PoseEstimator:
 
     @cached_property
     def _body(self) -> Body:
-        """The body that candidates are held against the picture with."""
+        """The sphere model that candidates are compared with; empty unless the method asks."""
         if not self.model.method.explains:
             return Body(
                 1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0)
@@ -183,25 +248,39 @@ class PoseEstimator:
 
     @cached_property
     def _refiner(self) -> Refiner:
+        """The Gauss-Newton refinement for this skeleton."""
         return Refiner.of(self.skeleton, self.model.cascade.balls)
 
     @cached_property
     def _starts(self) -> Array:
+        """(1, K, 4) standard numbers of the initial poses, the same for every frame."""
         k = self.n_candidates or self.model.method.n_candidates
         if self.model.cascade.proposals is not None:
             k = N_WAYS * self.model.cascade.proposals.n_trees
         return draw_starts(np.random.default_rng(_START_SEED), 1, k)
 
     def candidates(
-        self, crops: Crops, looks: Array, size: float, parallel: bool = True
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> tuple[Array, Array, Array, Array]:
-        """The candidates of n frames that outlive the base joint, in their view frames: rotations
-        (n, K, J, 3, 3), positions (n, K, J, 3) mm, scales (n, K), and the metric's scores (n, K),
-        mm at home size.
+        """Run all initial poses through the cascade and score them (Lie-X Algorithm 1).
+
+        Candidates are pruned after the base joint where the model has a pruner; the head-tail
+        classifier adjusts the scores where the model has one.
+
+        Args:
+            crops: height maps of n frames.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: the animal's size over home size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            Of the K surviving candidates of each frame, in the view frame: rotations (n, K, J, 3,
+            3), positions (n, K, J, 3) mm, scales (n, K) of the bones, and the learned metric's
+            scores (n, K), mm at home size; the scores are infinite where no animal was found.
         """
         method = self.model.method
         skeleton = self.skeleton
-        n = len(looks)
+        n = len(crop_cameras)
         k = self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
@@ -215,7 +294,7 @@ class PoseEstimator:
             method.home_turn,
         )
         if self.model.cascade.proposals is not None:
-            images = ImageSet(crops.heights, looks, crops.moments)
+            images = ImageSet(crops.heights, crop_cameras, crops.moments)
             base_rotation, base_position = propose(
                 self.model.cascade.proposals, images, sizes[:, 0], method
             )
@@ -231,7 +310,7 @@ class PoseEstimator:
         with threads(parallel):
             kernels.estimate_all(
                 crops.heights,
-                looks,
+                crop_cameras,
                 crops.moments,
                 np.flatnonzero(crops.found),
                 size,
@@ -244,17 +323,27 @@ class PoseEstimator:
             )
             if self.model.facing is None or not n:
                 return poses
-            facing = Facing(skeleton, self.model.facing)
+            facing = HeadTailClassifier(skeleton, self.model.facing)
             scores = facing.judged(
-                ImageSet(crops.heights, looks, crops.moments), poses[1], poses[3], size
+                ImageSet(crops.heights, crop_cameras, crops.moments), poses[1], poses[3], size
             )
         return *poses[:3], scores
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> Estimates:
-        """Poses of frames (n, H, W) mm in the camera frame. size: the animal's spine over the home
-        length.
+        """Estimate one pose per frame.
+
+        Where two components have about the animal's size, the likelier of them is taken.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: the animal's spine over the home length; ignored by methods of fixed size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The poses in the camera frame, with expected errors.
         """
         size = size if self.model.method.session_size else 1.0
         return self._estimates(self._look(depths, scene, size, parallel)[0], size, parallel)
@@ -262,55 +351,92 @@ class PoseEstimator:
     def hypotheses(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
     ) -> tuple[Estimates, ...]:
-        """What else the frames (n, H, W) mm may show, each like `estimate`'s answer, which comes
-        first: the best pose that points the other way, and the same two of the second thing of
-        about the animal's size. Rows without such are not found.
+        """Estimate what else the frames may show besides the best pose.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: the animal's spine over the home length; ignored by methods of fixed size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            Four estimates in the camera frame: that of `estimate`, the best pose that points the
+            other way, and the same two of the second component of about the animal's size. Rows
+            without such a hypothesis are not found.
         """
         size = size if self.model.method.session_size else 1.0
         return self._ways(self._look(depths, scene, size, parallel), size, parallel)
 
-    def best_of(self, crops: Crops, looks: Array, size: float, parallel: bool = True) -> Estimates:
-        """The pose of each height map (n), camera frame; see `estimate`."""
+    def best_of(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
+    ) -> Estimates:
+        """Estimate one pose per height map, without segmentation.
+
+        Args:
+            crops: height maps of n frames.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: the animal's spine over the home length; ignored by methods of fixed size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The poses in the camera frame, as from `estimate`.
+        """
         size = size if self.model.method.session_size else 1.0
-        return self._estimates(self._sighted(crops, looks, size, parallel), size, parallel)
+        return self._estimates(self._sighted(crops, crop_cameras, size, parallel), size, parallel)
 
     def both_ways(
-        self, crops: Crops, looks: Array, size: float, parallel: bool = True
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> tuple[Estimates, Estimates]:
-        """The same, and the best pose that points the other way; see `hypotheses`."""
+        """Estimate the best pose per height map, and the best one that points the other way.
+
+        Args:
+            crops: height maps of n frames.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: the animal's spine over the home length; ignored by methods of fixed size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            Both estimates in the camera frame; rows of the second without such a pose are not
+            found.
+        """
         size = size if self.model.method.session_size else 1.0
-        best, turned = self._ways((self._sighted(crops, looks, size, parallel),), size, parallel)
+        best, turned = self._ways(
+            (self._sighted(crops, crop_cameras, size, parallel),), size, parallel
+        )
         return best, turned
 
-    def _sighted(self, crops: Crops, looks: Array, size: float, parallel: bool) -> _Sight:
-        """What was cut out of each frame, with its candidates."""
-        rotations, positions, _, scores = self.candidates(crops, looks, size, parallel)
-        return _Sight(crops, looks, rotations, positions, scores)
+    def _sighted(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool
+    ) -> Detection:
+        """The component that was cut out of each frame, with its candidates."""
+        rotations, positions, _, scores = self.candidates(crops, crop_cameras, size, parallel)
+        return Detection(crops, crop_cameras, rotations, positions, scores)
 
-    def _ways(self, sights: Sequence[_Sight], size: float, parallel: bool) -> tuple[Estimates, ...]:
-        """The chosen poses of each sight and those that point the other way, in turn.
+    def _ways(
+        self, sights: Sequence[Detection], size: float, parallel: bool
+    ) -> tuple[Estimates, ...]:
+        """The chosen poses of each detection and those that point the other way, in turn.
 
-        All are chosen in one go: a live frame's poses are few, and what a step costs is its call.
+        All are chosen in one go: the poses of a live frame are few, and the cost of a step is its
+        call.
         """
         both = [way for s in sights for way in (s, s.opposite(s.usable, self.skeleton.tip))]
-        whole = self._estimates(_Sight.join(both), size, parallel)
-        n = len(both[0].looks)
+        whole = self._estimates(Detection.join(both), size, parallel)
+        n = len(both[0].crop_cameras)
         return tuple(whole[k * n : (k + 1) * n] for k in range(len(both)))
 
     def _look(
         self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
-    ) -> tuple[_Sight, _Sight]:
-        """What was taken for the animal, with its candidates, and the next best thing; see
-        `estimate`.
-        """
+    ) -> tuple[Detection, Detection]:
+        """Detect the animal with its candidates, and the next likely component; see `estimate`."""
         camera_view = self.model.method.camera_view
         crops, others = scene.extract_both(depths, size, parallel, camera_view)
-        first = self._sighted(crops, scene.looks(crops, camera_view), size, parallel)
+        first = self._sighted(crops, scene.crop_cameras(crops, camera_view), size, parallel)
         second = first.nothing()
         unsure = np.flatnonzero(crops.n_blobs > 1)
         if len(unsure):
             others = others[unsure]
-            other = self._sighted(others, scene.looks(others, camera_view), size, parallel)
+            other = self._sighted(others, scene.crop_cameras(others, camera_view), size, parallel)
             better = self._is_animal(depths[unsure], scene, size, first[unsure], other)
             second.put(unsure, other)
             rows = unsure[better]
@@ -319,17 +445,19 @@ class PoseEstimator:
             second.put(rows, kept)
         return first, second
 
-    def _estimates(self, sight: _Sight, size: float, parallel: bool) -> Estimates:
-        """The chosen poses of what was seen, in the camera frame."""
+    def _estimates(self, sight: Detection, size: float, parallel: bool) -> Estimates:
+        """The chosen poses of a detection, in the camera frame."""
         crops = sight.crops
         usable = sight.usable
         seen = sight[np.flatnonzero(usable)]
-        images = ImageSet(seen.crops.heights, seen.looks, seen.crops.moments)
+        images = ImageSet(seen.crops.heights, seen.crop_cameras, seen.crops.moments)
         picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
-        picked = with_expected_error(picked, self.model, images.moments, images.looks, size)
+        picked = with_expected_error(picked, self.model, images.moments, images.crop_cameras, size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         return Estimates(
-            replace(whole, pose=whole.pose.moved(view_of(sight.looks).inverse())), usable, crops
+            replace(whole, pose=whole.pose.moved(view_of(sight.crop_cameras).inverse())),
+            usable,
+            crops,
         )
 
     def pick(
@@ -341,11 +469,23 @@ class PoseEstimator:
         scores: Array,
         parallel: bool = True,
     ) -> Chosen:
-        """One pose for each of n height maps out of its candidates, after the last correction, and
-        settled.
+        """Choose one pose per height map out of its candidates, and correct it.
 
-        Where the method takes poses into the picture, it is of the mean and the best ones the one
-        that then fits best.
+        The best candidates are averaged on the manifold (see `choose`). Where the method refines,
+        the mean and the best candidates are fitted to the height map by Gauss-Newton steps, and the
+        one that fits best is taken. The forest correction and the ridge correction follow where the
+        model has them.
+
+        Args:
+            images: height maps of n frames, with their crop cameras and moments.
+            size: the animal's size over home size.
+            rotations: (n, K, J, 3, 3) joint frames of the candidates, view frame.
+            positions: (n, K, J, 3) joints of the candidates, mm, view frame.
+            scores: (n, K) predicted errors, mm at home size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The chosen poses in the view frame; their expected error is still that of `choose`.
         """
         method = self.model.method
         picked = choose(
@@ -361,7 +501,9 @@ class PoseEstimator:
             picked = corrected(picked, self.model, images, size)
             if self.model.settler is None or not len(scores):
                 return picked
-            settled = Settler(self.skeleton, self.model.settler).settle(picked.pose, images, size)
+            settled = RidgeCorrection(self.skeleton, self.model.settler).settle(
+                picked.pose, images, size
+            )
         return replace(
             picked,
             pose=settled.pose,
@@ -374,13 +516,13 @@ class PoseEstimator:
         depths: NDArray[np.float32],
         scene: Foreground,
         size: float,
-        first: _Sight,
-        second: _Sight,
+        first: Detection,
+        second: Detection,
     ) -> NDArray[np.bool_]:
-        """Where (n,) the second of two things of about the animal's size is the animal, and not the
-        first.
+        """Whether (n,) the second of two components of about the animal's size is the animal.
 
-        Told by area and volume and, where the metric has learned what is no animal, by its scores.
+        The decision follows from area and volume and, where the metric has learned what is no
+        animal, from its scores.
         """
         weight = _MM_PER_MISFIT * self.skeleton.relative_size
         crops = first.crops, second.crops
@@ -392,12 +534,23 @@ class PoseEstimator:
         return second.scores.min(axis=1) + likeness[1] < first.scores.min(axis=1) + likeness[0]
 
     def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
-        """The animal's spine over the home length, estimated from a sample of frames (n, H, W) mm
-        of the recording.
+        """Estimate the animal's size from a sample of frames of the recording.
 
-        The area seen from above gives the first guess; the model then measures the spine in every
-        frame, the median of the frames that it trusts most becomes the next guess, a few times
-        over.
+        The area seen from above gives the first guess. The model then measures the spine in every
+        frame, and the median over the frames that it trusts most becomes the next guess; this is
+        repeated eight times, since each pass goes about a third of the way. The forest correction
+        is left out: it has learned how long animals of usual shape are and would pull this one's
+        size to theirs.
+
+        Args:
+            sample: (n, H, W) float32 frames, mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+
+        Returns:
+            The animal's spine over the home length; 1 for methods of fixed size.
+
+        Raises:
+            EstimationError: no animal was found in the sampled frames.
         """
         guess = self.size_from_area(scene.area_mm2)
         if not self.model.method.session_size:
@@ -415,8 +568,15 @@ class PoseEstimator:
         return guess
 
     def sizes_told(self, estimates: Estimates) -> Array:
-        """What frames tell of the animal's size over the home size, those of them that the model
-        trusts most.
+        """The animal's size over home size as single frames estimate it.
+
+        Args:
+            estimates: estimates of some frames.
+
+        Returns:
+            (m,) sizes of the frames that the model trusts most: two thirds of those with an animal,
+            or one third where the ridge correction tells the size, but at least 8 if there are as
+            many.
         """
         scale = estimates.chosen.told_scale
         trust = estimates.chosen.told_trust
@@ -427,13 +587,18 @@ class PoseEstimator:
         return np.asarray(scale[seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]])
 
     def size_from_area(self, area_mm2: float) -> float:
-        """A first guess of the size from the animal's usual area."""
+        """First guess of the animal's size over home size, the square root of a ratio of areas.
+
+        Args:
+            area_mm2: the animal's usual area seen from above, mm^2.
+        """
         return float(np.sqrt(area_mm2 / self.model.calibration.area_mm2))
 
 
 def _pack(forests: list[Forest]) -> kernels.Trees:
-    """Forests of equally many trees in one node array; their leaves, of different widths, in one
-    row of numbers.
+    """Pack forests of equally many trees into one node array.
+
+    Their leaves, of different widths, are stored in one row of numbers.
     """
     nodes = []
     roots = []
@@ -459,6 +624,7 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
     n = len(usable)
 
     def rows(values: Array, *shape: int) -> Array:
+        """The values as rows of all frames, NaN where the frame is not usable."""
         out = np.full((n, *shape), np.nan)
         out[usable] = values
         return out

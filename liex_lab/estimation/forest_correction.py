@@ -1,10 +1,14 @@
-"""The last correction: the chosen pose's joints, all at once, moved by what a forest has learned of
-chosen poses.
+"""Boosted regression forest that corrects all joints of the chosen pose at once (ours).
 
-Candidates are moved by forests that were trained on starts as they come; their weighted mean is not
-one of them, and is off in ways of its own. A small boosted forest that is trained on chosen poses
-of images that no other tree has seen takes out what of this can be foretold. It asks about one pose
-a frame and so costs next to nothing.
+Candidates are moved by forests that were trained on initial poses as they come; their weighted mean
+is not one of them, and is off in ways of its own. A small forest, grown by stochastic gradient
+boosting (Friedman 2002) on chosen poses of images that no other tree was grown on, predicts the
+residual
+
+    x_j - x_j_hat        of every joint j, in the base's frame, at home size,
+
+and takes out what of it can be foretold. It asks about one pose per frame and so costs next to
+nothing.
 """
 
 from __future__ import annotations
@@ -15,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.estimation.cascade import Candidates, ImageSet, mm_per_px
+from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen
+from liex_lab.foreground.crop_camera import mm_per_px
 from liex_lab.forests.forest import Samples, predict
 
 Array = NDArray[np.float64]
@@ -26,8 +31,16 @@ _LOG_UNIT = 500.0  # a threshold is an integer
 
 
 def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Chosen:
-    """The chosen poses of n frames, whose height maps are `images`, after the model's last
-    correction.
+    """Apply the model's forest correction to chosen poses.
+
+    Args:
+        chosen: n chosen poses, view frame.
+        model: the model; without a corrector the poses stay as they are.
+        images: the n height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        The choices with corrected poses; scores and errors are kept.
     """
     if model.corrector is None or not len(chosen.score):
         return chosen
@@ -40,9 +53,19 @@ def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Ch
 
 
 def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Samples:
-    """What a corrector sees of one pose for each of n height maps: what lies about every joint, and
-    beside the numbers that every forest sees how many mm a pixel covers, for an outline loses about
-    one of them all round.
+    """Features of one pose per height map, as the corrector sees them.
+
+    They are the views from all joints and, beside the scalars that every forest sees, the logarithm
+    of how many mm a pixel covers, for an outline loses about one of them all round.
+
+    Args:
+        pose: (n) poses, view frame.
+        model: gives the cascade whose features are taken.
+        images: the n height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        n samples with J views.
     """
     frames = pose.frames(model.skeleton)
     n = len(pose.scale)
@@ -54,14 +77,22 @@ def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Sam
         np.full(n, size),
     )
     samples = model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
-    pixel = mm_per_px(images.looks) / size
+    pixel = mm_per_px(images.crop_cameras) / size
     scalars = np.column_stack([samples.scalars, _LOG_UNIT * np.log(pixel)]).astype(np.float32)
     return replace(samples, scalars=scalars)
 
 
 def moves_to(pose: Pose, model: Model, joints: Array, size: float) -> Array:
-    """What a corrector should say (n, 3 J): from the joints of the poses (n) to the true ones (n,
-    J, 3) mm, seen from the base joint, at home size.
+    """Labels of the corrector: the moves from a pose's joints to the true ones.
+
+    Args:
+        pose: (n) poses, view frame.
+        model: gives the skeleton.
+        joints: (n, J, 3) true joints, mm, view frame.
+        size: the animal's size over home size.
+
+    Returns:
+        (n, 3 J) moves in the frame of the base joint, mm at home size.
     """
     frames = pose.frames(model.skeleton)
     moves = np.einsum("nji,nkj->nki", frames.rotation[:, 0], joints - frames.translation) / size

@@ -1,9 +1,12 @@
-"""Which way an animal faces, told by a small network that sees the whole of it laid along a
-candidate.
+"""Head-tail classifier: a multilayer perceptron on the height map laid along a candidate (ours).
 
 The learned metric sees two points at a time. On bodies unlike those that it has learned from, head
 and tail are what it confuses; all of the outline, the ears and the slope of the back at once tell
-them apart where it is unsure.
+them apart where it is unsure. With the log odds l of the network for the best candidate of either
+direction, the direction changes where
+
+    score_opposite - score_best + w (l_best - l_opposite) < 0,        w = 4 mm at the reference
+    length.
 """
 
 from __future__ import annotations
@@ -37,16 +40,28 @@ _WEIGHT_DECAY = 1e-2
 
 
 @dataclass(frozen=True)
-class Facing:
-    """A network on pictures of an animal laid along a pose of it."""
+class HeadTailClassifier:
+    """The head-tail classifier at work.
+
+    Attributes:
+        skeleton: the animal's skeleton.
+        network: the trained network on pictures from `laid_along`.
+    """
 
     skeleton: Skeleton
     network: Network
 
     @staticmethod
     def fit(pictures: NDArray[np.float32], right: NDArray[np.bool_], seed: int) -> Network:
-        """Learned from pictures (m, A, B), see `laid_along`, and whether the poses point the right
-        way (m,); what an animal looks like in a mirror is learned, too.
+        """Train the network.
+
+        Pictures are also learned from in the mirror. Weights are rounded to what the model file
+        holds.
+
+        Args:
+            pictures: (m, A, B) float32 pictures from `laid_along`.
+            right: (m,) bool, whether the poses point in the right direction.
+            seed: of the network's training.
         """
         inputs = np.concatenate([_flat(pictures), _flat(pictures[:, :, ::-1])])
         labels = np.concatenate([right, right])
@@ -70,11 +85,19 @@ class Facing:
         )
 
     def logits(self, images: ImageSet, joints: Array, size: float) -> Array:
-        """How much speaks for it (n,) that poses with these joints (n, J, 3) mm, view frame, point
-        the right way.
+        """Log odds that poses point in the right direction.
 
-        In double precision and then rounded: a product's last bits depend on how many frames are
-        asked about at once, and a frame's pose must not.
+        They are the mean over the picture and its mirror image, computed in double precision and
+        then rounded: the last bits of a product depend on how many frames are asked about at once,
+        and a frame's pose must not.
+
+        Args:
+            images: n height maps with their crop cameras.
+            joints: (n, J, 3) joints of the poses, mm, view frame.
+            size: the animal's size over home size.
+
+        Returns:
+            (n,) log odds, at most 6 either way.
         """
         pictures = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
         views = np.concatenate([pictures, pictures[:, :, ::-1]])
@@ -82,11 +105,20 @@ class Facing:
         return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(_DECIMALS)
 
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
-        """The scores (n, K) mm at home size of candidates (n, K, J, 3) mm after the network's word.
+        """Adjust the candidates' scores by the network where the metric is unsure of the direction.
 
-        Where both ways have a candidate and their best scores are near, and what the network says
-        outweighs the difference, the candidates of the way that was ahead fall behind, by as much
-        as it is outweighed.
+        The metric is unsure where both directions have a candidate and their best scores are within
+        15 mm at the reference length. Where the network outweighs the difference, the candidates of
+        the direction that was ahead fall behind, by as much as it is outweighed.
+
+        Args:
+            images: n height maps with their crop cameras.
+            positions: (n, K, J, 3) joints of the candidates, mm, view frame.
+            scores: (n, K) predicted errors, mm at home size.
+            size: the animal's size over home size.
+
+        Returns:
+            (n, K) scores, mm at home size.
         """
         unit = self.skeleton.relative_size
         best, opposite, ahead, away = both_ways(positions, scores, self.skeleton.tip)
@@ -107,9 +139,17 @@ class Facing:
 def both_ways(
     positions: Array, scores: Array, tip: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Of candidates (n, K, J, 3) mm with scores (n, K): which (n,) is best, which is best of those
-    that point the other way, from base to `tip`, by how much (n,) it is behind, infinite or NaN
-    where there is none, and which (n, K) do.
+    """Best candidate of each frame, and the best one that points the other way.
+
+    Args:
+        positions: (n, K, J, 3) joints of the candidates, mm.
+        scores: (n, K) predicted errors; infinite where there is no such candidate.
+        tip: the joint that the direction from the base is taken to.
+
+    Returns:
+        The index (n,) of the best candidate; the index (n,) of the best one that points the other
+        way; by how much (n,) its score is worse, infinite or NaN where there is none; and (n, K)
+        bool, which candidates point the other way.
     """
     rows = np.arange(len(scores))
     best = scores.argmin(axis=1)
@@ -124,11 +164,17 @@ def both_ways(
 def laid_along(
     skeleton: Skeleton, images: ImageSet, joints: Array, size: Array
 ) -> NDArray[np.float32]:
-    """Pictures (n, A, B) of animals laid along poses with joints (n, J, 3) mm, view frame; size
-    (n,) over home size.
+    """Resample height maps along poses: the direction from base to tip is the first axis.
 
-    The way from base to tip goes up the picture's first axis; heights in units of `_HEIGHT_MM` at
-    home size.
+    Args:
+        skeleton: the animal's skeleton.
+        images: n height maps with their crop cameras.
+        joints: (n, J, 3) joints of the poses, mm, view frame.
+        size: (n,) the animals' size over home size.
+
+    Returns:
+        (n, A, B) float32 heights in units of 10 mm at home size, for the reference length; 0 beside
+        the animal.
     """
     unit = skeleton.relative_size
     along = np.arange(-_ALONG_MM, _ALONG_MM + 1e-6, _STEP_MM) * unit
@@ -136,7 +182,7 @@ def laid_along(
     out = np.empty((len(joints), len(along), len(across)))
     kernels.lay_along(
         images.heights,
-        images.looks,
+        images.crop_cameras,
         joints[:, 0],
         joints[:, skeleton.tip],
         joints.mean(axis=1),
@@ -149,8 +195,10 @@ def laid_along(
 
 
 def _flat(pictures: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pictures (n, A, B) as rows (n, A B)."""
     return np.ascontiguousarray(pictures).reshape(len(pictures), -1)
 
 
 def _rounded(values: Array) -> NDArray[np.float32]:
+    """Values rounded to float16, as float32."""
     return values.astype(np.float16).astype(np.float32)

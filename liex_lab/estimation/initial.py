@@ -1,4 +1,11 @@
-"""Initial poses: where a candidate starts (Lie-X section 4, Preprocessing and Initial Poses)."""
+"""Initial poses from the moments of the foreground: PCA initialisation, or the paper's.
+
+Lie-X section 4, preprocessing and initial poses. The paper places the home pose at the centroid and
+the mean depth of the foreground, turns it in the image plane by an angle uniform in (-pi, pi), and
+scales all bones by a factor uniform in [0.9, 1.1]; this is repeated Kt times. The default method
+starts along the principal axis of the foreground in both directions, with small jitter (PCA
+initialisation, METHOD lesson 8).
+"""
 
 from __future__ import annotations
 
@@ -24,8 +31,17 @@ _JITTER_MM = 2.0  # of the places, for an animal of the reference length
 
 
 def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> Array:
-    """Standard numbers (n_images, n_candidates, 4): heading, size and position of each start; see
-    `start_poses`.
+    """Draw the standard numbers that initial poses are made from.
+
+    Args:
+        rng: source of the numbers.
+        n_images: number of images.
+        n_candidates: number of initial poses per image.
+
+    Returns:
+        (n_images, n_candidates, 4): three standard normal numbers, for heading and position (the
+        second also for the paper's scale), and one uniform in (-1, 1), for the paper's heading and
+        the rise; see `start_poses`.
     """
     starts = rng.standard_normal((n_images, n_candidates, 4))
     starts[..., 3] = rng.uniform(-1.0, 1.0, (n_images, n_candidates))
@@ -42,16 +58,27 @@ def start_poses(
     camera_view: bool = False,
     home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array]:
-    """Base rotation (n, K, 3, 3), position (n, K, 3) mm and scale (n, K) of K starts for each of n
-    animals.
+    """Base poses of K candidates for each of n animals.
 
-    moments (n, 9) of the height map; starts (n or 1, K, 4) drawn by `draw_starts`; size (n, K) of
-    the animal over home. axis_start: along the animal's long axis, every other start the other way
-    round, the more spread out the rounder the animal looks (METHOD lesson 8). Otherwise the paper's
-    start: any heading in (-pi, pi), the base at the centroid and at the animal's mean height, bones
-    scaled by 0.9 to 1.1. camera_view: heights are not those above a floor, and such an animal,
-    started along its axis, rises or sinks as its back does. home_turn: rotation vector by which the
-    home pose lies otherwise than seen from above, as a palm that is shown.
+    Along the long axis, every other start points the other way, and the headings are the more
+    spread out the rounder the animal looks (METHOD lesson 8). The paper's start has any heading in
+    (-pi, pi), the base at the centroid and at the animal's mean height, and bones scaled by 0.9 to
+    1.1.
+
+    Args:
+        moments: (n, 9) moments of the height map, see `HeightMaps`.
+        starts: (n or 1, K, 4) numbers drawn by `draw_starts`.
+        size: (n, K) the animal's size over home size.
+        home_length: spine length at home, mm.
+        base_at_front: the base joint is the animal's front; else its rear.
+        axis_start: start along the long axis; else as the paper does.
+        camera_view: heights are not those above a floor; such an animal, started along its axis,
+            rises or sinks as its back does.
+        home_turn: (3,) rotation vector, rad, by which the home pose lies otherwise than seen from
+            above, as a palm that is shown.
+
+    Returns:
+        Base rotation (n, K, 3, 3), base position (n, K, 3) mm and scale (n, K), view frame.
     """
     n, k = size.shape
     starts = np.broadcast_to(starts, (n, k, 4))

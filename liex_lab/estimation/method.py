@@ -1,5 +1,9 @@
-"""The variants of the method: the paper's, and ours. One code reads these numbers; nothing else
-tells them apart.
+"""Hyperparameters of the pose estimation: the paper's variant of Lie-X, and ours.
+
+The same code runs both variants and reads these numbers; nothing else tells them apart. The paper's
+values (C rounds, Kt initial poses, trees, depths, learned metric) are those of Lie-X sections 4 and
+5.2 where it states them; what differs in the default variant follows the lessons of METHOD, whose
+numbers stand in brackets.
 """
 
 from __future__ import annotations
@@ -19,7 +23,51 @@ from liex_lab.forests.grow import GrowthPlan
 class Method:
     """Everything that training and estimation do differently from variant to variant.
 
-    Angles rad; lengths mm of an animal of home size; METHOD lessons in brackets.
+    Angles are in rad; lengths are in mm of an animal of home size. METHOD lessons are in brackets.
+    The names of the fields are keys of the model files.
+
+    Attributes:
+        variant: 'default' or 'paper'.
+        rounds: C, the regression rounds per joint.
+        n_candidates: Kt, the initial poses per animal.
+        training_candidates: K, the initial poses per training image.
+        regressors: plan of the regressors' forests.
+        metric: plan of the learned metric.
+        reach_mm: offsets of the features reach this far from the joint, mm.
+        axis_start: start along the animal's long axis in both directions [8]; else at any heading.
+        camera_view: heights are measured along the optical axis, as in the paper; else above the
+            floor.
+        session_size: the animal's size is estimated over the recording; else it is the home size.
+        regress_scale: the base joint also corrects the scale of the bones.
+        point_at: labels aim the bone at the true next joint [7].
+        keep_turned: the base learns from samples that are turned by less than this, rad [1].
+        keep_bent: other joints learn from corrections smaller than this, rad [1].
+        keep_off_mm: other joints learn from samples no farther off than this, mm [1].
+        out_of_bag: move a training sample only with trees that were not grown on its image [6].
+        metric_on_own: train the metric on the cascade's own candidates [6]; else on perturbed
+            truth.
+        metric_shrinkage: shrinkage of the metric's boosting; 0 grows a plain forest.
+        mean_shift_mm: bandwidth of the mode over tree votes, mm; 0 averages them.
+        top_k: number of candidates that are averaged [3]; 1 takes the best one.
+        top_tau: averaging weights decay with the predicted error by this, mm.
+        top_radius_mm: only candidates within this of the best one are averaged, mm.
+        base_lever_mm: lever arm of the base, at which rotations weigh as much as translations, mm.
+        joint_lever_mm: lever arm of the other joints' rotations, mm.
+        scale_lever_mm: lever arm of the logarithm of the scale, mm.
+        survivors: candidates that are kept after the base joint [9]; 0: all of them.
+        pruner: plan of the small metric that chooses them; None: no such metric is trained.
+        settle: the chosen pose of an unbranched animal undergoes the ridge correction.
+        base_reach_mm: offsets reach this far from the base joint, mm; 0: as far as from the others.
+        corrector: plan of the forest correction of the chosen pose; None: it stays as chosen.
+        home_turn: (3,) rotation vector by which initial poses are turned out of the home pose, rad.
+        proposals: plan of the forest that proposes initial poses, for an animal of any orientation.
+        proposal_reach_mm: offsets of its features reach this far from the animal's centre, mm.
+        base_rounds: rounds of the base joint where they differ from the others'; 0: as many.
+        refine_steps: Gauss-Newton steps that fit a pose to the height map; 0: none.
+        refined: candidates that are fitted beside the mean of the best; the one that fits is
+            chosen.
+        explains: the metric also sees the residuals of the posed body against the height map [4].
+        tells_facing: a head-tail classifier decides where the metric is unsure, see `head_tail`.
     """
 
     variant: str
@@ -50,53 +98,57 @@ class Method:
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
     survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
-    pruner: GrowthPlan | None = (
-        None  # of the small metric that chooses them; None: no such metric is trained
-    )
-    settle: bool = (
-        False  # the chosen pose of an animal that is one chain settles under its back, see `settle`
-    )
-    base_reach_mm: float = (
-        0.0  # offsets reach this far from the base joint; 0: as far as from the others
-    )
-    corrector: GrowthPlan | None = (
-        None  # of the last correction, of the chosen pose; None: it stays as chosen
-    )
+    # of the small metric that chooses them; None: no such metric is trained
+    pruner: GrowthPlan | None = None
+    # the chosen pose of an animal that is one chain settles under its back, see `settle`
+    settle: bool = False
+    # offsets reach this far from the base joint; 0: as far as from the others
+    base_reach_mm: float = 0.0
+    # of the last correction, of the chosen pose; None: it stays as chosen
+    corrector: GrowthPlan | None = None
     home_turn: tuple[float, ...] = (
         0.0,
         0.0,
         0.0,
     )  # rotation vector by which starts are turned out of the home pose
-    proposals: GrowthPlan | None = (
-        None  # trees that say where a start may be, for an animal of any orientation
-    )
-    proposal_reach_mm: float = (
-        0.0  # offsets of their features reach this far from the animal's centre
-    )
-    base_rounds: int = (
-        0  # rounds of the base joint where they are not as many as the others'; 0: as many
-    )
+    # trees that say where a start may be, for an animal of any orientation
+    proposals: GrowthPlan | None = None
+    # offsets of their features reach this far from the animal's centre
+    proposal_reach_mm: float = 0.0
+    # rounds of the base joint where they are not as many as the others'; 0: as many
+    base_rounds: int = 0
     refine_steps: int = 0  # of taking a pose into the picture
     # candidates that are taken there beside the mean of the best; the one that fits is chosen
     refined: int = 0
     explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
-    tells_facing: bool = (
-        False  # a network tells head from tail where the metric is unsure, see `facing`
-    )
+    # a network tells head from tail where the metric is unsure, see `facing`
+    tells_facing: bool = False
 
     def rounds_of(self, joint: int) -> int:
-        """Rounds of a joint."""
+        """Number of regression rounds of a joint.
+
+        Args:
+            joint: number of the joint.
+        """
         return self.base_rounds or self.rounds if joint == 0 else self.rounds
 
     def reaches(self, n_joints: int) -> NDArray[np.float64]:
-        """How far (J,) mm offsets reach from each joint."""
+        """How far feature offsets reach from each joint.
+
+        Args:
+            n_joints: number of joints, J.
+
+        Returns:
+            (J,) mm at home size.
+        """
         reach = np.full(n_joints, self.reach_mm)
         reach[0] = self.base_reach_mm or self.reach_mm
         return reach
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the model file and its card; what only some animals have is left out
-        where it is unset.
+        """Plain values, for the model file and its card.
+
+        Fields that only some animals have are left out where they are unset.
         """
         return {
             name: value
@@ -106,7 +158,11 @@ class Method:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Method:
-        """The method of a model file."""
+        """The method of a model file.
+
+        Args:
+            values: plain values, as from `to_dict`.
+        """
         plain = dict(values)
         plain["regressors"] = GrowthPlan(**plain["regressors"])
         plain["metric"] = GrowthPlan(**plain["metric"])
@@ -262,10 +318,17 @@ _LENGTHS = (
 
 
 def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
-    """The method of a variant's name for an animal; None is the mouse.
+    """The method of a variant for an animal.
 
-    Lengths are the mouse's over its home length times the animal's, unless the animal has its own;
-    where the animal is looked at along the optical axis, every variant does so.
+    Lengths are the mouse's over its home length times the animal's, unless the animal has its own.
+    Where the animal is looked at along the optical axis, every variant does so.
+
+    Args:
+        variant: 'default' or 'paper'.
+        skeleton: the animal's skeleton; None is the mouse.
+
+    Raises:
+        PlanError: there is no such variant.
     """
     if variant not in METHODS:
         raise PlanError(f"there is no variant '{variant}'; known are {', '.join(METHODS)}")

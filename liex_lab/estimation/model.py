@@ -1,5 +1,9 @@
-"""A trained model: skeleton, method, forests, metric and calibration, as one .npz file without
-pickle.
+"""Model files: skeleton, method, forests, metric and calibration as one .npz without pickle.
+
+The file is a ZIP archive (LZMA) of .npy arrays: `head` is JSON as bytes; each forest is stored as
+six arrays `NNN_tests`, `_threshold`, `_kind`, `_is_leaf`, `_roots` and `_leaves` (float16), the
+child pointers being implied by the order of growth; `settler` holds the ridge correction and
+`facing_*` the head-tail classifier. Loading never runs code, and equal models give equal bytes.
 """
 
 from __future__ import annotations
@@ -50,13 +54,20 @@ _EPOCH = (
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the metric's score means, learned on images that no tree has seen.
+    """What the metric's score means, learned on images that no tree was grown on.
 
-    error = offset + slope * score + spread_slope * spread, mm at home size; quantiles (2,): the
-    ratio of true to predicted error that 5 % and 95 % of the images stay below; joint_share (J,):
-    each joint's error over the mean; doubtful_mm: a predicted error above this, at home size, is
-    flagged; area_mm2: usual area of a home-sized animal seen from above; logarithmic: the
-    expectation forest predicts LOG_UNIT times the logarithm of the error.
+        error = offset + slope * score + spread_slope * spread        (mm at home size)
+
+    Attributes:
+        offset: mm at home size.
+        slope: mm of error per mm of score.
+        spread_slope: mm of error per mm of spread of the averaged candidates.
+        quantiles: (2,) ratios of true to predicted error that 5 % and 95 % of the images stay
+            below.
+        joint_share: (J,) each joint's error over the mean; empty: 1 for every joint.
+        doubtful_mm: a predicted error above this, mm at home size, is flagged.
+        area_mm2: usual area of a home-sized animal seen from above, mm^2.
+        logarithmic: the expectation forest predicts LOG_UNIT times the logarithm of the error.
     """
 
     offset: float = 0.0
@@ -71,12 +82,21 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Model:
-    """Everything an estimator needs.
+    """Everything that a pose estimator needs.
 
-    expectation turns what is known of a chosen pose into its expected error; card says how the
-    model was made; pruner is the small metric that sees the base joint only; corrector moves the
-    joints of the chosen pose once more; settler: the table of `settle.Settler`, where the method
-    settles; facing: what tells head from tail, see `facing`.
+    Attributes:
+        cascade: skeleton, method and regressors.
+        metric: the learned metric R_m, which predicts a candidate's mean joint error.
+        expectation: forest that predicts the expected error of a chosen pose from what is known of
+            it; None: the calibration's line is used.
+        skeleton_table: the skeleton's TOML as a table.
+        calibration: what the metric's score means in mm.
+        card: how the model was made.
+        pruner: the small metric that sees the base joint only; None: nothing is pruned.
+        corrector: forest that moves the joints of the chosen pose once more, see
+            `forest_correction`.
+        settler: (F, J + 4) table of the ridge correction, where the method has one.
+        facing: network of the head-tail classifier, where the method has one.
     """
 
     cascade: Cascade
@@ -102,11 +122,11 @@ class Model:
 
     @property
     def proposals(self) -> Forest | None:
-        """What says where starts may be."""
+        """The forest that proposes initial poses; None where they are drawn."""
         return self.cascade.proposals
 
     def to_bytes(self) -> bytes:
-        """The model file's content; equal models give equal bytes."""
+        """The content of the model file; equal models give equal bytes."""
         extra = [name for name in _FORESTS if getattr(self, name) is not None]
         head = {
             "schema": 2 if self.facing is None else SCHEMA,
@@ -139,8 +159,14 @@ class Model:
 
     @staticmethod
     def load(path: Path) -> Model:
-        """Read a model file. Raises ModelError where it is not one, is damaged, or is newer than
-        this program.
+        """Read a model file.
+
+        Args:
+            path: path of an .npz that `to_bytes` made.
+
+        Raises:
+            ModelError: there is no such file, it is no whole model file, or a newer program made
+                it.
         """
         try:
             # opened here, for numpy leaves a damaged archive open
@@ -202,7 +228,7 @@ class Model:
         )
 
     def digest(self) -> str:
-        """SHA-256 of the model file."""
+        """SHA-256 of the model file, as hexadecimal digits."""
         return hashlib.sha256(self.to_bytes()).hexdigest()
 
 
@@ -236,8 +262,9 @@ _PARTS = ("tests", "threshold", "kind", "is_leaf", "roots", "leaves")
 
 
 def _split(forest: Forest) -> dict[str, NDArray[Any]]:
-    """A forest as arrays that compress well: the child pointers follow from which nodes are
-    leaves.
+    """A forest as arrays that compress well.
+
+    The child pointers are left out, for they follow from which nodes are leaves.
     """
     words = forest.nodes
     inner = words[:, 2] >= 0

@@ -1,8 +1,9 @@
-"""Initial poses that are seen and not drawn: every tree of a forest says how the animal may lie,
-from one look at it.
+"""Initial poses proposed by a regression forest, for an animal of any orientation (ours).
 
-An animal that turns any side to the camera has no usual orientation to start from. Trees are asked
-one by one and their answers never averaged: two orientations that look alike have no useful mean,
+An animal that turns any side to the camera has no usual orientation to start from. One forest
+regresses the base's rotation matrix and position from a view along the principal axis of the
+foreground. Each tree's vote, projected onto SO(3) (orthogonal Procrustes), is one initial pose of
+Lie-X Algorithm 1. Votes are never averaged: two orientations that look alike have no useful mean,
 but both are worth a candidate.
 """
 
@@ -28,10 +29,16 @@ _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 def views_along_axis(
     images: ImageSet, size: Array, reach_mm: float
 ) -> tuple[Samples, Array, Array]:
-    """Each of m animals as seen from its centre, x along its long axis, one way and the other.
+    """Features of each animal from its centre, with x along its long axis in both directions.
 
-    size (m,) over home size. Samples (2 m), an image's two in a row, and the frames: (2 m, 3, 3)
-    and (2 m, 3) mm.
+    Args:
+        images: m images.
+        size: (m,) the animals' size over home size.
+        reach_mm: offsets reach this far from the centre, mm at home size.
+
+    Returns:
+        2 m samples, an image's two in a row, and the frames they are taken in: rotations (2 m, 3,
+        3) and centres (2 m, 3) mm, view frame.
     """
     m = len(size)
     image = np.repeat(np.arange(m, dtype=np.int32), N_WAYS)
@@ -48,7 +55,7 @@ def views_along_axis(
     ways = (1000.0 - 2000.0 * (np.arange(N_WAYS * m) % N_WAYS)).astype(np.float32)
     kernels.look_all(
         np.zeros(1, np.int64),
-        images.looks,
+        images.crop_cameras,
         images.moments,
         image,
         each,
@@ -76,10 +83,20 @@ def train_proposals(
     method: Method,
     rng: np.random.Generator,
 ) -> tuple[Forest, NDArray[np.bool_]]:
-    """A forest from the true bases of m images, (m, 3, 3) and (m, 3) mm, and which images each tree
-    saw (T, m).
+    """Train the forest that proposes base poses.
 
-    keep (m,): the images to learn from.
+    Args:
+        images: m images.
+        rotations: (m, 3, 3) true base rotations, view frame.
+        positions: (m, 3) true base positions, mm, view frame.
+        size: (m,) the animals' true size over home size; the forest sees it with an error.
+        keep: (m,) bool, the images to learn from.
+        method: states the plan, the reach of the features and the lever arm of rotations.
+        rng: source of bags, seeds and size errors.
+
+    Returns:
+        The forest, with leaves of float16 precision, and (T, m) bool, which images each tree was
+        grown on.
     """
     assert method.proposals is not None
     guess = size * np.exp(_SIZE_SD * rng.standard_normal(len(size)))
@@ -97,9 +114,17 @@ def train_proposals(
 
 
 def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tuple[Array, Array]:
-    """What every tree says of m animals from both sides: bases (m, 2 T, 3, 3) and (m, 2 T, 3) mm.
+    """Base poses that each tree votes for, from both directions of the long axis.
 
-    Candidate 2 t + w is tree t's, with the axis taken in way w.
+    Args:
+        forest: the forest of T trees.
+        images: m images.
+        size: (m,) the animals' size over home size.
+        method: the method that the forest was trained for.
+
+    Returns:
+        Rotations (m, 2 T, 3, 3) and positions (m, 2 T, 3) mm, view frame; candidate 2 t + w is tree
+        t's, with the axis taken in direction w.
     """
     samples, frame, centre = views_along_axis(images, size, method.proposal_reach_mm)
     votes = predict_each(forest, samples).astype(float)
@@ -109,6 +134,7 @@ def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tu
     position = centre[:, None] + off
 
     def in_order(values: Array) -> Array:
+        """`values` (2 m, T, ...) reordered to (m, 2 T, ...), the tree varying more slowly."""
         by_way = values.reshape(len(size), N_WAYS, forest.n_trees, *values.shape[2:])
         return np.swapaxes(by_way, 1, 2).reshape(
             len(size), N_WAYS * forest.n_trees, *values.shape[2:]

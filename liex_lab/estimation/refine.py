@@ -1,5 +1,15 @@
-"""A pose taken into the picture: the last step, after the regressors and the learned metric have
-said about where.
+"""Gauss-Newton refinement of a pose against the height map: articulated ICP with a sphere model.
+
+The last step, after the regressors and the learned metric (ours; METHOD sections 2.3 and 2.4). The
+body is a set of spheres carried by the kinematic tree. With p the tangent vector of the base, the
+logarithm of the scale and the free angles, each step minimises
+
+    sum_i w_i d_i(p)^2 + w_b sum_k b_k(p)^2 + (p - p0)^T diag(prior) (p - p0)
+
+over signed distances d_i of depth readings to the nearest sphere and of spheres to the readings in
+front of which they stick out, both with robust Geman-McClure weights, distances b_k of spheres
+beside the animal to its nearest pixel, and a prior at the pose that the regressors found. The
+kernels are in `_refine_kernels`.
 """
 
 from __future__ import annotations
@@ -11,7 +21,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.spheres import Balls
+from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation import _residual_kernels as explaining
 from liex_lab.estimation.cascade import ImageSet, body_of
@@ -26,22 +36,32 @@ _FIRST_STEPS = 1
 _GO_ON = 2
 _BESIDE_MM = 4.0  # in that unit: what it weighs in the choice, if all balls were beside it
 # what it costs to leave the pose that the regressors found, in squares of that unit: a radian of
-# the base, a unit of
-# place, of log scale, and a radian of a joint
+# the base, a unit of place, of log scale, and a radian of a joint
 _PRIOR = np.array([1e4, 0.5, 1e4, 60.0])
 
 
 @dataclass(frozen=True)
 class Refiner:
-    """A skeleton and its body as the kernels want them."""
+    """The Gauss-Newton refinement of poses of one skeleton.
+
+    Attributes:
+        skeleton: the animal's skeleton.
+        tree: the kinematic tree as the kernels want it.
+        body: the sphere model as the kernels want it.
+    """
 
     skeleton: Skeleton
     tree: kernels.Tree
     body: explaining.Body
 
     @staticmethod
-    def of(skeleton: Skeleton, balls: Balls) -> Refiner:
-        """For a skeleton of any shape."""
+    def of(skeleton: Skeleton, balls: Spheres) -> Refiner:
+        """The refinement for a skeleton of any shape.
+
+        Args:
+            skeleton: the animal's skeleton.
+            balls: the sphere model of its body.
+        """
         s = skeleton
         free = np.array(
             [(j, k) for j in range(1, s.n_joints) for k in range(3) if s.axes[j, k]], np.int64
@@ -63,10 +83,19 @@ class Refiner:
         )
 
     def refine(
-        self, pose: Pose, heights: NDArray[np.int16], looks: Array, size: float, n_steps: int
+        self, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array, size: float, n_steps: int
     ) -> Pose:
-        """Poses (n, K) in their view frames, each moved into its height map (n, S, S) cut as looks
-        (n, 17) say.
+        """Fit poses to the height maps by Gauss-Newton steps.
+
+        Args:
+            pose: (n, K) poses in their view frames; not changed.
+            heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+            crop_cameras: (n, 17) packed crop cameras of the height maps.
+            size: the animal's size over home size.
+            n_steps: number of Gauss-Newton steps.
+
+        Returns:
+            (n, K) refined poses.
         """
         unit = self.body.unit_mm * size
         rotation = pose.root.rotation.copy()
@@ -77,19 +106,44 @@ class Refiner:
             _ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2])
         )
         kernels.refine_all(
-            heights, looks, self.tree, self.body, wishes, n_steps, rotation, position, angles, scale
+            heights,
+            crop_cameras,
+            self.tree,
+            self.body,
+            wishes,
+            n_steps,
+            rotation,
+            position,
+            angles,
+            scale,
         )
         return Pose(SE3(rotation, position), angles, scale)
 
     def fit(
-        self, pose: Pose, heights: NDArray[np.int16], looks: Array, moments: Array, size: float
+        self,
+        pose: Pose,
+        heights: NDArray[np.int16],
+        crop_cameras: Array,
+        moments: Array,
+        size: float,
     ) -> Array:
-        """How well poses (n, K) explain the picture (n, K, N_FIT); see `_explain.explain`."""
+        """Residuals of poses against the height maps.
+
+        Args:
+            pose: (n, K) poses in their view frames.
+            heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+            crop_cameras: (n, 17) packed crop cameras of the height maps.
+            moments: (n, 9) moments of the height maps.
+            size: the animal's size over home size.
+
+        Returns:
+            (n, K, N_FIT) residuals, see `_residual_kernels.explain`.
+        """
         frames, (n, k), j = pose.frames(self.skeleton), pose.scale.shape, self.skeleton.n_joints
         out = np.empty((n * k, explaining.N_FIT), np.float32)
         explaining.explain_all(
             heights,
-            looks,
+            crop_cameras,
             moments,
             np.repeat(np.arange(n, dtype=np.int32), k),
             frames.rotation.reshape(-1, j, 3, 3),
@@ -102,16 +156,24 @@ class Refiner:
         return out.reshape(n, k, -1).astype(float)
 
     def best(self, poses: Pose, images: ImageSet, size: float, n_steps: int) -> tuple[Pose, Array]:
-        """The one of poses (n, K) that lies best in the picture once it was taken there (n), and
-        its fit (n, N_FIT).
+        """Refine poses and choose the one that fits each height map best.
 
-        A first step tells which are worth the others.
+        One step is taken with all K poses; the two that then fit best take the others.
+
+        Args:
+            poses: (n, K) poses in their view frames.
+            images: n height maps with their crop cameras and moments.
+            size: the animal's size over home size.
+            n_steps: number of Gauss-Newton steps in all.
+
+        Returns:
+            (n) poses, and their residuals (n, N_FIT).
         """
         kept = poses
         rows = np.arange(len(poses.scale))[:, None]
         for n_more in (min(_FIRST_STEPS, n_steps), max(n_steps - _FIRST_STEPS, 0)):
-            moved = self.refine(kept, images.heights, images.looks, size, n_more)
-            fit = self.fit(moved, images.heights, images.looks, images.moments, size)
+            moved = self.refine(kept, images.heights, images.crop_cameras, size, n_more)
+            fit = self.fit(moved, images.heights, images.crop_cameras, images.moments, size)
             order = rows, np.argsort(_apart(fit), axis=1, kind="stable")[:, :_GO_ON]
             kept = moved[order]
             fit = fit[order]
@@ -119,6 +181,6 @@ class Refiner:
 
 
 def _apart(fit: Array) -> Array:
-    """How far (n, K) mm poses are from what the picture shows, of their fit (n, K, N_FIT)."""
+    """Distance (n, K) mm of poses from the readings, out of their residuals (n, K, N_FIT)."""
     off = (fit[..., explaining.OUT_OF] + fit[..., explaining.APART]) / explaining.MM_UNIT
     return np.asarray(off + _BESIDE_MM * fit[..., explaining.BESIDE] / explaining.SHARE_UNIT)

@@ -1,10 +1,13 @@
-"""The last step of an animal that is one chain, seen along the optical axis: its pose settles under
-its back.
+"""Ridge regression that corrects the chosen pose of an unbranched animal by the back above it.
 
-The regressors see a long animal's depth from its base joint, at one end of it. Once the whole chain
-is in place, all of its back can be held against it: a linear map, fitted on pictures that no tree
-has seen, takes what is seen along the mid-line to how much deeper each joint lies, how far the
-chain has slid along itself, and how much larger the animal is.
+The animal is one seen along the optical axis. The regressors see a long animal's depth from its
+base joint, at one end of it. Once the whole spine is in place, all of its back can be compared with
+it (ours). A linear map fitted by ridge regression (Hoerl and Kennard 1970),
+
+    W = (X^T X + lambda n I)^-1 X^T Y        on standardised features X, lambda = 0.01,
+
+on images that no tree was grown on, takes what is seen along the mid-line to how much deeper each
+joint lies, how far the spine has slid along itself, and how much larger the animal is.
 """
 
 from __future__ import annotations
@@ -17,7 +20,8 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _profile_kernels as kernels
-from liex_lab.estimation.cascade import ImageSet, mm_per_px
+from liex_lab.estimation.cascade import ImageSet
+from liex_lab.foreground.crop_camera import mm_per_px
 
 Array = NDArray[np.float64]
 
@@ -36,10 +40,15 @@ _SIZE_LOG = 0.25
 
 
 @dataclass(frozen=True)
-class Settler:
-    """table (F, J + 4): the least and most of each of the `clues`, and the weights that lead from
-    them to the rise of each joint, the slide along the chain (both over the animal's length) and
-    the logarithm of the true over the assumed size.
+class RidgeCorrection:
+    """The fitted correction.
+
+    Attributes:
+        skeleton: the animal's skeleton, one unbranched chain.
+        table: (F, J + 4), by columns: the least and the most of each feature of `clues` (beyond
+            which it is clipped), then the weights that lead from the features to the rise of each
+            joint (J), the slide along the spine (both over the animal's length), and the logarithm
+            of the true over the assumed size.
     """
 
     skeleton: Skeleton
@@ -47,7 +56,11 @@ class Settler:
 
     @staticmethod
     def serves(skeleton: Skeleton) -> bool:
-        """Whether the animal is one chain."""
+        """Whether the correction applies: the skeleton is one unbranched chain.
+
+        Args:
+            skeleton: the animal's skeleton.
+        """
         return bool((skeleton.parents[1:] == np.arange(skeleton.n_joints - 1)).all())
 
     @staticmethod
@@ -58,9 +71,19 @@ class Settler:
         size: Array,
         true_joints: Array,
         true_size: Array,
-    ) -> Settler:
-        """From chosen poses (n) with their assumed sizes (n,) and the truth, all in the
-        view frame.
+    ) -> RidgeCorrection:
+        """Fit the correction to chosen poses with known truth.
+
+        Poses that are off by a tenth of the length or more, or by 0.25 in the logarithm of the
+        size, are left out. Features are clipped to their 1 % and 99 % quantiles.
+
+        Args:
+            skeleton: the animal's skeleton, one unbranched chain.
+            pose: (n) chosen poses, view frame.
+            images: n height maps with their crop cameras and moments.
+            size: (n,) assumed size over home size.
+            true_joints: (n, J, 3) true joints, mm, view frame.
+            true_size: (n,) true size over home size.
         """
         joints = pose.joints(skeleton)
         features = clues(skeleton, pose, joints, images, size)
@@ -78,10 +101,19 @@ class Settler:
         x = np.clip(x, *bounds)
         # from all of them: those that see its far end best were mostly taken for smaller than they
         # are
-        return Settler(skeleton, np.column_stack([*bounds, _linear(x, y)]))
+        return RidgeCorrection(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
     def settle(self, pose: Pose, images: ImageSet, size: float) -> Settled:
-        """Poses (n) put right, and what each of them says about the animal's size."""
+        """Correct poses, and estimate the animal's size from each of them.
+
+        Args:
+            pose: (n) chosen poses, view frame.
+            images: n height maps with their crop cameras and moments.
+            size: assumed size over home size.
+
+        Returns:
+            The corrected poses with their estimates of the size.
+        """
         skeleton = self.skeleton
         n = len(pose.scale)
         joints = pose.joints(skeleton)
@@ -101,9 +133,13 @@ class Settler:
 
 @dataclass(frozen=True)
 class Settled:
-    """Poses (n) under their backs; grown (n,): the logarithm of the animal's true over its assumed
-    size as each tells; clear (n,): how much of the animal's far end it sees, without which no one
-    knows its size.
+    """Corrected poses and what each tells about the animal's size.
+
+    Attributes:
+        pose: (n) poses, view frame.
+        grown: (n,) logarithm of the animal's true over its assumed size, as each pose estimates it.
+        clear: (n,) in [0, 1], how much of the animal's far end is seen, without which nothing tells
+            its size.
     """
 
     pose: Pose
@@ -112,8 +148,9 @@ class Settled:
 
 
 def _linear(x: Array, y: Array) -> Array:
-    """Ridge regression: weights (F, K) from clues (n, F), of which the first is constant, to labels
-    (n, K).
+    """Ridge regression from features (n, F), of which the first is constant, to labels (n, K).
+
+    Returns the weights (F, K) for features that are not standardised.
     """
     middle = x.mean(axis=0)
     spread = x.std(axis=0)
@@ -130,31 +167,55 @@ def _linear(x: Array, y: Array) -> Array:
 
 
 def far_end_seen(seen: Array) -> Array:
-    """How much (n,) is seen of the last quarter of a chain, out of `clues` (n, F)."""
+    """How much is seen of the last quarter of a chain of joints.
+
+    Args:
+        seen: (n, F) features of `clues`.
+
+    Returns:
+        (n,) in [0, 1].
+    """
     j = (seen.shape[1] - N_OTHERS) // 2
     return np.asarray(seen[:, 1 + j + 3 * j // 4 : 1 + 2 * j].mean(axis=1))
 
 
 def tangents(joints: Array) -> Array:
-    """Unit vectors (n, J, 3) along chains (n, J, 3), in the picture's plane."""
+    """Unit tangents of chains of joints, in the image plane.
+
+    Args:
+        joints: (n, J, 3) joints, mm, view frame.
+
+    Returns:
+        (n, J, 3) unit vectors from base to tip with z = 0.
+    """
     way = np.gradient(joints, axis=1)
     way[..., 2] = 0.0
     return np.asarray(way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
 
 
 def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size: Array) -> Array:
-    """What is seen along the mid-lines of poses (n) with joints (n, J, 3) mm, (n, F), lengths over
+    """Features of a pose against the height map along its mid-line.
+
+    They are a constant, the height of the back over each joint (J) and how much of it is seen (J),
+    how far the animal reaches past the ends of the chain and the square of that, the slope and roll
+    of the base, the total bend, the size of a pixel, and the scale of the bones. Lengths are over
     the animal's own.
 
-    A constant, the height of the back over each joint and how much of it is seen, how far the
-    animal reaches past the chain's ends, how the base lies, how much the animal is bent, how large
-    a pixel is, and the bones' scale.
+    Args:
+        skeleton: the animal's skeleton, one unbranched chain.
+        pose: (n) poses, view frame.
+        joints: (n, J, 3) their joints, mm.
+        images: n height maps with their crop cameras and moments.
+        size: (n,) assumed size over home size.
+
+    Returns:
+        (n, F) features, F = 2 J + N_OTHERS.
     """
     n, j = joints.shape[:2]
     length = skeleton.length * size
     seen = np.empty((n, 2 * j + 2))
     kernels.look_along(
-        images.heights, images.looks, np.ascontiguousarray(joints), length, _MOST_SHARE, seen
+        images.heights, images.crop_cameras, np.ascontiguousarray(joints), length, _MOST_SHARE, seen
     )
     share = np.minimum(seen[:, j : 2 * j] * 2.0, 1.0)
     back = np.clip(seen[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (share > 0)
@@ -162,7 +223,7 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     rise = pose.root.rotation[:, 2, 0]
     roll = pose.root.rotation[:, 2, 1]
     bent = np.abs(pose.angles[..., 2]).sum(axis=1)
-    pixel = mm_per_px(images.looks) / length
+    pixel = mm_per_px(images.crop_cameras) / length
     return np.column_stack(
         [
             np.ones(n),

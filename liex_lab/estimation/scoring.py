@@ -1,5 +1,13 @@
-"""From many candidates to one pose: the learned metric's choice, its average, and how far it may be
-off.
+"""Candidate selection: weighted mean of the best-scored poses on the manifold; expected error.
+
+Lie-X Algorithm 1 returns the candidate with the lowest score of the learned metric. Here the best k
+candidates near that one are averaged (METHOD lesson 3) with weights
+
+    w_i ~ exp(-(score_i - score_best) / tau);
+
+rotations take the chordal mean, the polar projection of sum_i w_i R_i, or follow from the mean
+joints. A boosted forest then predicts the mean joint error of the chosen pose from its scores, its
+spread and the posture (the "expectation forest", ours).
 """
 
 from __future__ import annotations
@@ -11,9 +19,9 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation.cascade import mm_per_px
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import Calibration, Model
+from liex_lab.foreground.crop_camera import mm_per_px
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.geometry import SE3, so3
@@ -22,23 +30,32 @@ Array = NDArray[np.float64]
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
 # at the reference length: the least error that is ever expected, and what stands for the score of
-# the opposite
-# direction where no candidate points there
+# the opposite direction where no candidate points there
 LEAST_MM = 0.1
 _NO_OPPOSITE_MM = 40.0
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """One pose for each of n frames, in the view frame of the frame, NaN where no animal was found.
+    """One pose for each of n frames, in the view frame of the frame; NaN where no animal was found.
 
-    pose (n); sd_root (n, 6) rad and mm in the root's own frame; sd_angles (n, J, 3) rad; sd_mm (n,
-    J) of each joint; error_mm (n,) expected mean joint error; score (n,) and spread (n,) mm at home
-    size behind it; doubts (n, 4) mm at home size: best score, the best score of a candidate that
-    points the other way, the spread of the good scores, and how far the candidates of all scores
-    lie from the chosen pose; fit (n, F): how well the pose explains the picture, where that is
-    asked, see `_explain`; told_scale (n,): the animal's size over home size as this frame alone
-    tells it, and told_trust (n,), the higher the better.
+    Attributes:
+        pose: (n) poses.
+        sd_root: (n, 6) standard deviation of the root over candidates, rad and mm, in its own
+            frame.
+        sd_angles: (n, J, 3) standard deviation of the joints' rotation vectors over candidates,
+            rad.
+        sd_mm: (n, J) expected standard deviation of each joint along one axis, mm.
+        error_mm: (n,) expected mean joint error, mm.
+        score: (n,) weighted mean of the scores, mm at home size.
+        spread: (n,) spread of the averaged candidates about the chosen pose, mm at home size.
+        doubts: (n, 4) mm at home size: best score, the best score of a candidate that points the
+            other way, the standard deviation of the good scores, and the mean distance of all
+            candidates from the chosen pose.
+        fit: (n, F) residuals of the pose against the height map where the method asks, F = 0
+            otherwise, see `_residual_kernels.explain`.
+        told_scale: (n,) the animal's size over home size as this frame alone estimates it.
+        told_trust: (n,) how far that size can be trusted, the higher the better.
     """
 
     pose: Pose
@@ -54,7 +71,11 @@ class Chosen:
     told_trust: Array
 
     def __getitem__(self, rows: slice) -> Chosen:
-        """Some consecutive frames."""
+        """Some consecutive frames.
+
+        Args:
+            rows: the frames to take.
+        """
         return Chosen(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
@@ -67,13 +88,24 @@ def choose(
     positions: Array,
     scores: Array,
 ) -> Chosen:
-    """The weighted mean of the best candidates, on the manifold.
+    """Average the best candidates of each frame on the manifold.
 
-    rotations (n, K, J, 3, 3), positions (n, K, J, 3) mm, scores (n, K) mm at home size. The `top_k`
-    candidates with the lowest predicted error that lie near the best one are averaged with weights
-    exp(-(score - best) / tau) (METHOD lesson 3). In a chain each bone then turns by the smallest
-    rotation onto its mean direction, and the scale follows from the total length; a tree is
-    averaged joint by joint, see `mean_pose`.
+    The `top_k` candidates with the lowest predicted error that lie near the best one are averaged
+    with weights exp(-(score - best) / tau) (METHOD lesson 3). In an unbranched skeleton each bone
+    then turns by the smallest rotation onto its mean direction, and the scale follows from the
+    total length; a branched one is averaged joint by joint, see `mean_pose`.
+
+    Args:
+        skeleton: the animal's skeleton.
+        method: states top_k, tau and the radius within which candidates are averaged.
+        calibration: turns score and spread into an expected error.
+        size: the animal's size over home size.
+        rotations: (n, K, J, 3, 3) joint frames of the candidates, view frame.
+        positions: (n, K, J, 3) joints of the candidates, mm, view frame.
+        scores: (n, K) predicted errors, mm at home size.
+
+    Returns:
+        The chosen poses with spreads and expected errors.
     """
     order = np.argsort(scores, axis=1, kind="stable")[:, : method.top_k]
     score = np.take_along_axis(scores, order, axis=1)
@@ -121,12 +153,20 @@ def choose(
 
 
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
-    """The weighted mean of poses of a tree, on the group: n means over k poses each.
+    """Weighted mean of poses of a kinematic tree, on the group.
 
-    turned (n, k, J, 3, 3), joints (n, k, J, 3) mm, weight (n, k), of sum 1. The base takes the
-    chordal mean rotation and the mean place; every other joint the mean of its turns relative to
-    its parent about the axes that are free, so bones keep their lengths and hinges their axes; the
-    scale is the mean scale.
+    The base takes the chordal mean rotation and the mean position. Every other joint takes the mean
+    of its rotation vectors relative to its parent about its free axes, so bones keep their lengths
+    and hinges their axes; the scale is the mean scale.
+
+    Args:
+        skeleton: the animal's skeleton.
+        turned: (n, k, J, 3, 3) joint frames of the k poses of each mean.
+        joints: (n, k, J, 3) their joints, mm.
+        weight: (n, k) weights of sum 1.
+
+    Returns:
+        (n) mean poses.
     """
     root = SE3(
         so3.nearest_rotation(np.einsum("nk,nkab->nab", weight, turned[:, :, 0])),
@@ -151,8 +191,18 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
 def with_best(
     skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array
 ) -> Pose:
-    """Poses (n, 1 + k): the given ones (n), and the k candidates with the lowest scores (n, K) of
-    each frame.
+    """Put the best-scored candidates of each frame beside given poses.
+
+    Args:
+        skeleton: the animal's skeleton.
+        pose: (n) poses.
+        k: number of candidates to add per frame.
+        rotations: (n, K, J, 3, 3) joint frames of the candidates, view frame.
+        positions: (n, K, J, 3) joints of the candidates, mm, view frame.
+        scores: (n, K) predicted errors.
+
+    Returns:
+        (n, 1 + k) poses: the given one, then the k candidates with the lowest scores.
     """
     order = np.argsort(scores, axis=1, kind="stable")[:, :k]
     n, k, j = *order.shape, skeleton.n_joints
@@ -163,6 +213,7 @@ def with_best(
     best = mean_pose(skeleton, turned, joints, np.ones((n * k, 1)))
 
     def beside(first: Array, others: Array) -> Array:
+        """`first` (n, ...) and `others` (n k, ...) as one array (n, 1 + k, ...)."""
         return np.concatenate([first[:, None], others.reshape(n, k, *first.shape[1:])], axis=1)
 
     root = SE3(
@@ -175,8 +226,9 @@ def with_best(
 def _doubts(
     positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float
 ) -> Array:
-    """The last field of `Chosen` from all candidates, the chosen joints (n, J, 3) and the good
-    scores (n, k).
+    """`Chosen.doubts` of all candidates.
+
+    It follows from the chosen joints (n, J, 3) and the scores (n, k) of the averaged candidates.
     """
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
@@ -186,15 +238,24 @@ def _doubts(
 
 
 def with_expected_error(
-    chosen: Chosen, model: Model, moments: Array, looks: Array, size: float
+    chosen: Chosen, model: Model, moments: Array, crop_cameras: Array, size: float
 ) -> Chosen:
-    """The same poses with the error that the model's expectation forest predicts for them, from its
-    clues.
+    """Replace the expected errors by those that the model's expectation forest predicts.
+
+    Args:
+        chosen: n chosen poses.
+        model: the model; without an expectation forest nothing changes.
+        moments: (n, 9) moments of the height maps.
+        crop_cameras: (n, 17) crop cameras of the height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        The same poses with new error_mm, and sd_mm scaled alike.
     """
     if model.expectation is None or not len(chosen.score):
         return chosen
     n = len(chosen.score)
-    samples = clue_samples(chosen, model.skeleton, moments, looks, size)
+    samples = clue_samples(chosen, model.skeleton, moments, crop_cameras, size)
     least = LEAST_MM * model.skeleton.relative_size
     said = predict(model.expectation, samples)[:n, 0].astype(float)
     error = (
@@ -205,14 +266,23 @@ def with_expected_error(
 
 
 def clue_samples(
-    chosen: Chosen, skeleton: Skeleton, moments: Array, looks: Array, size: float
+    chosen: Chosen, skeleton: Skeleton, moments: Array, crop_cameras: Array, size: float
 ) -> Samples:
-    """What the expectation forest sees of n frames: no picture, only numbers, in units of about a
-    hundredth.
+    """Features of chosen poses, as the expectation forest sees them: numbers only, no depth.
 
-    Lengths are those of an animal of the reference length. Scores and doubts; the posture; how
-    large, round and high the animal looks; how many millimetres a pixel covers; how well the pose
-    explains the picture.
+    They are scores and doubts, the posture, how large, round and high the animal looks, how many mm
+    a pixel covers, the spreads over candidates, and the residuals against the height map. Lengths
+    are those of an animal of the reference length; all numbers are in hundredths.
+
+    Args:
+        chosen: n chosen poses.
+        skeleton: the animal's skeleton.
+        moments: (n, 9) moments of the height maps.
+        crop_cameras: (n, 17) crop cameras of the height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        n samples whose scalars hold the features, on a blank height map.
     """
     pose = chosen.pose
     unit = skeleton.relative_size
@@ -230,7 +300,7 @@ def clue_samples(
             5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
             moments[:, 6] / whole,
             moments[:, 7] / whole,
-            10 * (mm_per_px(looks) / whole),
+            10 * (mm_per_px(crop_cameras) / whole),
             *chosen.sd_root.T[:3] * 10,
             *chosen.sd_root.T[3:] / whole,
             10 * chosen.sd_angles.sum(axis=(1, 2)),
@@ -246,8 +316,9 @@ def clue_samples(
 def _spread_of_coordinates(
     skeleton: Skeleton, pose: Pose, turned: Array, joints: Array, weight: Array
 ) -> tuple[Array, Array]:
-    """Standard deviations of the root's twist (n, 6) and of the joints' rotation vectors (n, J, 3)
-    over candidates.
+    """Standard deviations of candidates about the chosen pose.
+
+    Of the root's twist (n, 6) and of the joints' rotation vectors (n, J, 3).
     """
     root = SE3(pose.root.rotation[:, None], pose.root.translation[:, None])
     twist = (root.inverse() @ SE3(turned[:, :, 0], joints[:, :, 0])).log()

@@ -1,5 +1,13 @@
-"""Training of the cascade and of its learned metric (Lie-X Algorithm 2 and the internal evaluation
-metric).
+"""Training of the cascaded regressors (Lie-X Algorithm 2) and of the learned internal metric.
+
+Each forest is trained on the state that its predecessors left: after round c of joint j its
+prediction moves all training candidates, and the label of the next round is again log(g_est^-1
+g_true) (Eq. 11). Where the method says so, a candidate is moved only by trees that were not grown
+on its image (METHOD lesson 6).
+
+The learned metric R_m (section 4.1) is a forest that predicts the mean joint error of a pose
+without the truth. The paper trains it on perturbed true poses; the default method trains it on the
+cascade's own final candidates, and boosts it.
 """
 
 from __future__ import annotations
@@ -31,11 +39,15 @@ _SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """Images with their true poses in the view frame, and the true size (m,) of each animal over
-    home size.
+    """Images with their true poses in the view frame.
 
-    animal (m,): False where the height map shows something else of about the animal's size; such an
-    image teaches the learned metric what is no animal, and the regressors nothing.
+    Attributes:
+        images: m images.
+        truth: true poses of the m images.
+        size: (m,) the true size of each animal over home size.
+        animal: (m,) bool, False where the height map shows something else of about the animal's
+            size; such an image teaches the learned metric what is no animal, and the regressors
+            nothing.
     """
 
     images: ImageSet
@@ -45,7 +57,11 @@ class TrainingSet:
 
     @staticmethod
     def join(parts: list[TrainingSet]) -> TrainingSet:
-        """The images of several sets, one after the other."""
+        """Concatenate the images of several sets.
+
+        Args:
+            parts: the sets, in order.
+        """
         images = [p.images for p in parts]
         truths = [p.truth for p in parts]
         return TrainingSet(
@@ -67,22 +83,35 @@ class TrainingSet:
 
 
 def base_at_front(skeleton: Skeleton) -> bool:
-    """Whether the base joint is the animal's front, as the fish's head, and not its rear, as the
-    mouse's rump.
+    """Whether the base joint is the animal's front, as the fish's head, not its rear.
+
+    Args:
+        skeleton: the animal's skeleton; the mouse's base is its rump.
     """
     return bool(skeleton.offsets[skeleton.next_joint[0], 0] < 0)
 
 
 @dataclass(frozen=True)
 class Proposals:
-    """A forest that says where a start may be, and which images each of its trees saw (T, m)."""
+    """A forest that proposes initial poses, and which images each of its trees was grown on.
+
+    Attributes:
+        forest: the forest.
+        in_bag: (T, m) bool.
+    """
 
     forest: Forest
     in_bag: NDArray[np.bool_]
 
     @staticmethod
     def train(data: TrainingSet, method: Method, rng: np.random.Generator) -> Proposals:
-        """Learned from the bases of the images that show the animal."""
+        """Train the proposals on the bases of the images that show the animal.
+
+        Args:
+            data: m training images with truth.
+            method: the variant, which states the plan of the forest.
+            rng: source of bags, seeds and size errors.
+        """
         truth = data.truth
         return Proposals(
             *train_proposals(
@@ -97,8 +126,17 @@ class Proposals:
         )
 
     def draw(self, rng: np.random.Generator, m: int, k: int) -> NDArray[np.int64]:
-        """K different candidates (m, k) for every image, of trees that have not seen it as far as
-        these go.
+        """Draw K different proposals for every image.
+
+        Out-of-bag trees come first, so in-bag ones are taken only where these do not suffice.
+
+        Args:
+            rng: source of the draw.
+            m: number of images, as many as the forest was trained on.
+            k: number of proposals per image.
+
+        Returns:
+            (m, k) numbers of proposals, as `propose` orders them.
         """
         order = rng.random((m, N_WAYS * self.forest.n_trees))
         order += np.repeat(self.in_bag, N_WAYS, axis=0).T
@@ -112,10 +150,18 @@ def start_candidates(
     rng: np.random.Generator,
     seen: Proposals | None = None,
 ) -> Candidates:
-    """K starts for every training image, each with its own guess of the animal's size.
+    """Initial poses for every training image, each with its own guess of the animal's size.
 
-    seen: proposals, where the method starts from them; each start is what a tree says that has not
-    seen the image.
+    Args:
+        data: m training images.
+        skeleton: the animal's skeleton.
+        method: the variant, which states K, the number of initial poses per image.
+        rng: source of the poses and of the size errors.
+        seen: proposals, where the method starts from them; each initial pose is then that of a tree
+            that was not grown on the image.
+
+    Returns:
+        m K candidates with their base in place, those of an image in a row.
     """
     m = len(data.size)
     k = method.training_candidates
@@ -153,8 +199,17 @@ def start_candidates(
 def train_cascade(
     data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator, tell: Tell
 ) -> tuple[Cascade, Candidates]:
-    """Algorithm 2: every forest is trained on the state its predecessors left. Also returns that
-    final state.
+    """Train all regressors joint by joint and round by round (Lie-X Algorithm 2).
+
+    Args:
+        data: m training images with truth.
+        skeleton: the animal's skeleton.
+        method: the variant of the method.
+        rng: source of all randomness.
+        tell: called before each forest with the share done and what is being trained.
+
+    Returns:
+        The cascade, and the training candidates as its last forest left them.
     """
     seen = Proposals.train(data, method, rng) if method.proposals is not None else None
     cascade = Cascade(skeleton, method, [], seen.forest if seen is not None else None)
@@ -184,14 +239,29 @@ def train_cascade(
 
 
 def quantised(forest: Forest) -> Forest:
-    """The forest with its leaves rounded to what the model file holds, so that training moves what
-    a user will get.
+    """Round a forest's leaves to float16, as the model file holds them.
+
+    Training then moves candidates by what a user will get.
+
+    Args:
+        forest: the forest as it was grown.
+
+    Returns:
+        The forest with float32 leaves of float16 precision.
     """
     return Forest(forest.nodes, forest.roots, forest.leaves.astype(np.float16).astype(np.float32))
 
 
 def joint_error(candidates: Candidates, truth: Truth) -> Array:
-    """Mean joint error (n,) of the candidates, mm at home size."""
+    """Mean joint error of candidates.
+
+    Args:
+        candidates: n candidates with all joints in place.
+        truth: true poses of the images.
+
+    Returns:
+        (n,) mm at home size.
+    """
     off = np.linalg.norm(candidates.positions - truth.positions[candidates.image], axis=2)
     return off.mean(axis=1) / candidates.size
 
@@ -199,8 +269,20 @@ def joint_error(candidates: Candidates, truth: Truth) -> Array:
 def perturbed_truth(
     data: TrainingSet, cascade: Cascade, rng: np.random.Generator, n_each: int = 8
 ) -> Candidates:
-    """Randomly perturbed true poses, the paper's metric examples: a twist of the base and a turn of
-    every joint.
+    """Randomly perturbed true poses, the paper's training examples of the learned metric.
+
+    The base moves by a random twist, every other joint turns about its free axes; the strength is
+    drawn uniformly for each pose. The paper leaves the distribution open; a long chain bends no
+    more as a whole than a short one.
+
+    Args:
+        data: training images with truth; only those of animals are used.
+        cascade: gives skeleton and method.
+        rng: source of the perturbations.
+        n_each: poses per image.
+
+    Returns:
+        The perturbed poses as candidates.
     """
     skeleton = cascade.skeleton
     j = skeleton.n_joints
@@ -232,10 +314,20 @@ def perturbed_truth(
 def train_metric(
     data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
 ) -> Forest:
-    """The learned metric: a forest that predicts the mean joint error (mm at home size) of a pose
-    without the truth.
+    """Train the learned metric, which predicts a pose's mean joint error without the truth.
 
-    Trained on the cascade's own final candidates, or on perturbed truth as the paper has it.
+    Examples are the cascade's own final candidates, or perturbed true poses as the paper has it, as
+    the method says. Errors are capped at 30 mm at the reference length: how wrong a wrong pose is,
+    is not worth learning.
+
+    Args:
+        data: training images with truth.
+        cascade: the trained cascade.
+        candidates: its final training candidates.
+        rng: source of bags, seeds and perturbations.
+
+    Returns:
+        The forest; its prediction is in mm at home size.
     """
     if not cascade.method.metric_on_own:
         candidates = perturbed_truth(data, cascade, rng)
@@ -255,11 +347,19 @@ def train_metric(
 def train_pruner(
     data: TrainingSet, cascade: Cascade, candidates: Candidates, rng: np.random.Generator
 ) -> Forest | None:
-    """The small metric that tells from the base joint alone how far off the whole pose will be
-    (METHOD lesson 9).
+    """Train the small metric that predicts the error of the whole pose from the base joint alone.
 
-    The base has not moved since its own rounds, so the cascade's final candidates are its examples,
-    too.
+    METHOD lesson 9. The base has not moved since its own rounds, so the cascade's final candidates
+    are its examples, too.
+
+    Args:
+        data: training images with truth.
+        cascade: the trained cascade.
+        candidates: its final training candidates.
+        rng: source of bags and seeds.
+
+    Returns:
+        The boosted forest, mm at home size; None where the method has no pruner.
     """
     plan = cascade.method.pruner
     if plan is None:

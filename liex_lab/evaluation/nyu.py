@@ -1,4 +1,10 @@
-"""Errors by the protocol of the NYU hand data: fourteen points, and what is known of the root."""
+"""Mean joint error by the protocol of the NYU hand dataset: 14 points, root estimated or given.
+
+The dataset is that of Tompson et al. (2014); the 14-point subset and the published answers are
+those that Lie-X section 5.2 compares with. With x the estimate and y the truth of n frames,
+
+    error = 1/(14 n) sum_ij |x_ij - y_ij|        or, root given, of x_ij - x_i,palm + y_i,palm.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +29,17 @@ _MEAN_BELOW_MM = (5, 10, 15, 20, 30, 40)
 
 
 def nyu_errors(answer: Array, truth: Array) -> dict[str, Any]:
-    """The figures of an answer against the truth, points (n, 14, 3) mm; rows with NaN count as
-    lost.
+    """Errors of an estimate of hands against the truth.
+
+    Args:
+        answer: (n, 14, 3) estimated points, mm; frames with NaN count as lost.
+        truth: (n, 14, 3) true points, mm, in the order of `POINTS`.
+
+    Returns:
+        The figures under their names, see `NYU_PROTOCOL`: number of frames, rate of lost ones, mean
+        errors with the root estimated and given, over 14 points and over 13 without the palm, the
+        median error of a point, mean error of each point, and shares of frames whose largest and
+        mean error are below given limits; only the first two where every frame is lost.
     """
     seen = np.asarray(np.isfinite(answer).all(axis=(1, 2)))
     if not seen.any():

@@ -1,4 +1,13 @@
-"""The numbers by which a measurement is judged, and the protocol that goes beside each of them."""
+"""Pose error metrics: mean joint error, flip rate, rank correlation and interval coverage.
+
+Lie-X section 5 judges a frame by its mean per-joint position error,
+
+    e = 1/J sum_j |x_j - y_j|        (mm),
+
+averaged over frames. Beside it stand the share of flipped poses, the share of lost frames, and how
+well the predicted error tells the true one: Spearman's rank correlation, and the coverage of the
+predicted 90 % interval. `POSE_PROTOCOL` states them all.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +41,15 @@ _FIGURES = (
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Measured against true poses, n frames: error_mm (n,) mean joint error, NaN where lost;
-    joint_mm (n, J); flipped (n,); predicted_mm (n,), NaN where none is predicted; low_mm and
-    high_mm (n,) the predicted 90 % interval of the error.
+    """Errors of measured against true poses in n frames.
+
+    Attributes:
+        error_mm: (n,) mean joint error, mm; NaN where the animal was lost.
+        joint_mm: (n, J) error of each joint, mm.
+        flipped: (n,) bool, the base-to-tip direction is more than 90 degrees off.
+        predicted_mm: (n,) predicted error, mm; NaN where none is predicted.
+        low_mm: (n,) lower bound of the predicted 90 % interval of the error, mm.
+        high_mm: (n,) upper bound of that interval, mm.
     """
 
     error_mm: Array
@@ -48,8 +63,14 @@ class PoseErrors:
     def compare(
         joints: Array, true_joints: Array, tip: int, predicted_mm: Array, quantiles: Array
     ) -> PoseErrors:
-        """Errors of joints (n, J, 3) mm, NaN where lost; `tip` is the joint that the base's heading
-        points at.
+        """Compare measured with true joints.
+
+        Args:
+            joints: (n, J, 3) measured joints, mm; NaN where lost.
+            true_joints: (n, J, 3) true joints, mm, in the same frame.
+            tip: the joint that the base's heading points at.
+            predicted_mm: (n,) predicted mean joint error, mm.
+            quantiles: (2,) ratios of true to predicted error that bound the 90 % interval.
         """
         joint_mm = np.linalg.norm(joints - true_joints, axis=-1)
         measured = joints[:, tip] - joints[:, 0]
@@ -66,7 +87,11 @@ class PoseErrors:
 
     @staticmethod
     def join(parts: list[PoseErrors]) -> PoseErrors:
-        """The errors of several recordings as one."""
+        """Concatenate the errors of several recordings.
+
+        Args:
+            parts: the errors, in order.
+        """
         return PoseErrors(
             *(
                 np.concatenate([getattr(p, name) for p in parts])
@@ -75,7 +100,11 @@ class PoseErrors:
         )
 
     def summary(self) -> dict[str, Any]:
-        """The figures of `liex evaluate pose`; None for those of a prediction that was not made."""
+        """The figures of `liex evaluate pose`, under their names.
+
+        Figures of a prediction that was not made are None; where every frame is lost, all are None
+        but the rate of lost frames.
+        """
         seen = np.isfinite(self.error_mm)
         if not seen.any():
             return dict.fromkeys(_FIGURES) | {"lost_rate": 1.0}
@@ -95,28 +124,51 @@ class PoseErrors:
 
 
 def rank_correlation(a: Array, b: Array) -> float:
-    """Spearman's rank correlation of two series (n,)."""
+    """Spearman's rank correlation of two series.
+
+    Args:
+        a: (n,) the first series.
+        b: (n,) the second series.
+    """
     from scipy.stats import spearmanr
 
     return float(spearmanr(a, b).statistic)
 
 
 def angle_between_axes(a: Array, b: Array) -> Array:
-    """Difference (n,) of two undirected axes given by angles (n,) rad, in [0, pi / 2]."""
+    """Angle between undirected axes.
+
+    Args:
+        a: (n,) angles of the first axes, rad.
+        b: (n,) angles of the second axes, rad.
+
+    Returns:
+        (n,) rad in [0, pi / 2].
+    """
     off = np.mod(a - b, np.pi)
     return np.minimum(off, np.pi - off)
 
 
 def count_reversals(heading: Array) -> int:
-    """How often a heading (n,) rad turns by more than a right angle between frames; NaN frames are
-    skipped.
+    """Count how often a heading turns by more than a right angle between frames.
+
+    Args:
+        heading: (n,) rad; NaN frames are skipped.
     """
     seen = heading[np.isfinite(heading)]
     return int((np.cos(np.diff(seen)) < 0).sum())
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold: NumPy's numbers as Python's, and None for what is not a finite number."""
+    """Convert to what JSON can hold.
+
+    Args:
+        value: any nesting of dicts, lists, tuples, NumPy arrays and numbers.
+
+    Returns:
+        The same with NumPy's numbers and arrays as Python's, and None for what is not a finite
+        number.
+    """
     if isinstance(value, dict):
         return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -1,5 +1,9 @@
-"""How well an animal was followed over a sequence with truth, and the protocol that goes beside the
-numbers.
+"""Tracking metrics over a sequence with truth: error ratios, lost rate, flips, coverage, recovery.
+
+The error of a frame is the mean per-joint position error of Lie-X section 5.3, e = 1/J sum_j |x_j -
+y_j| (mm); the tracker's figures are set against those of single frames. Coverage is the share of
+joint coordinates within 1.645 standard deviations of the truth (nominal 90 %). `TRACKING_PROTOCOL`
+states every figure.
 """
 
 from __future__ import annotations
@@ -40,10 +44,14 @@ _Z90 = 1.645
 
 @dataclass(frozen=True)
 class Followed:
-    """What was made of n frames: joints and true joints (n, J, 3) mm in one frame, sd_mm (n, J)
-    along an axis.
+    """One tracked sequence of n frames with its truth.
 
-    tip: the joint that the base's heading points at.
+    Attributes:
+        joints: (n, J, 3) estimated joints, mm; NaN where there is no pose.
+        truth: (n, J, 3) true joints, mm, in the same frame.
+        sd_mm: (n, J) estimated standard deviation of each joint along one axis, mm.
+        frames_per_s: speed of the tracker, reading excluded.
+        tip: the joint that the base's heading points at.
     """
 
     joints: Array
@@ -54,7 +62,7 @@ class Followed:
 
     @property
     def error_mm(self) -> Array:
-        """(n,) mean joint error, NaN where there is no pose."""
+        """(n,) mean joint error, mm; NaN where there is no pose."""
         return np.asarray(np.linalg.norm(self.joints - self.truth, axis=-1).mean(axis=1))
 
     @property
@@ -69,13 +77,20 @@ class Followed:
 
     @property
     def covered(self) -> NDArray[np.bool_]:
-        """Of every known joint coordinate, whether it lies within its 90 % interval."""
+        """(m,) bool, whether each known joint coordinate lies within its 90 % interval."""
         inside = np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm[..., None]
         return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)[..., None]]
 
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
-        """Errors, mm, of the frames in which at least half of the animal is seen; half its length
-        without a pose.
+        """Errors of the frames in which at least half of the animal is seen.
+
+        Args:
+            events: what happens in the sequence; frames of kind 'hidden' are left out.
+            length_mm: length of the animal, mm; a frame without a pose counts as an error of half
+                of it.
+
+        Returns:
+            (m,) errors, mm.
         """
         seen = np.ones(len(self.joints), np.bool_)
         for event in events:
@@ -84,8 +99,15 @@ class Followed:
         return np.nan_to_num(self.error_mm, nan=_LOST * length_mm)[seen]
 
     def recovery(self, events: Sequence[Event], length_mm: float) -> list[int]:
-        """After each time that something passed over the animal, or hid it, how many frames until
-        it is found again.
+        """Frames until the animal is found again after each occlusion.
+
+        Args:
+            events: what happens in the sequence; those of kind 'hidden' and 'occluder' count.
+            length_mm: length of the animal, mm; it is found where the error is below 0.12 of it.
+
+        Returns:
+            Frames from the end of each occlusion on; to the end of the sequence where it is not
+            found.
         """
         near = self.error_mm < _NEAR * length_mm
         found = []
@@ -102,7 +124,18 @@ def figures(
     events: Sequence[Sequence[Event]],
     length_mm: float,
 ) -> dict[str, Any]:
-    """The figures of one row over some sequences; single: the same sequences frame by frame."""
+    """Figures of one tracker over some sequences.
+
+    Args:
+        rows: the tracked sequences.
+        single: the same sequences, estimated frame by frame.
+        events: what happens in each of them.
+        length_mm: length of the animal, mm.
+
+    Returns:
+        The figures under their names, see `TRACKING_PROTOCOL`; only a lost_rate of 1 where no frame
+        has a pose in both.
+    """
     error, alone = (np.concatenate([row.error_mm for row in some]) for some in (rows, single))
     seen = np.isfinite(error)
     both = np.isfinite(error) & np.isfinite(alone)

@@ -1,5 +1,6 @@
-"""What other programs read: one writer per format, each checked with the other program's own
-reader.
+"""Exports of a session to other programs' formats: NWB, BORIS, DeepLabCut, movement, SLEAP, CSV.
+
+One writer per format, each checked with the other program's own reader.
 """
 
 from liex_lab.exchange.export import TARGETS, export

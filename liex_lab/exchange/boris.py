@@ -1,8 +1,8 @@
-"""A BORIS project with one observation: the session's ethogram. Field by field as BORIS 9 writes
-it, version 7.0.
+"""BORIS project file (JSON, format version 7.0) with a session's ethogram as one observation.
 
-A state event is two rows of the same subject and behaviour, start and stop. BORIS refuses a project
-that is newer than itself, so the oldest version that has all of this is written.
+The fields are those that BORIS 9 writes. A state event is two rows of the same subject and
+behaviour, start and stop. BORIS refuses a project that is newer than itself, so the oldest version
+that has all of this is written.
 """
 
 from __future__ import annotations
@@ -19,14 +19,23 @@ _KEYS = "abcdefghijklmnopqrstuvwxyz0123456789"
 
 
 def write(session: Session, path: Path) -> None:
-    """The project at `path`."""
+    """Write the project.
+
+    Args:
+        session: the session.
+        path: the .boris file to write.
+    """
     path.write_text(
         json.dumps(project(session), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
     )
 
 
 def project(session: Session) -> dict[str, Any]:
-    """The project as BORIS keeps it."""
+    """The project as BORIS keeps it, ready for JSON.
+
+    Args:
+        session: the session.
+    """
     about = session.metadata
     subject = about["individual"]
     bouts = session.bouts

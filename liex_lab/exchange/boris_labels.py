@@ -1,7 +1,7 @@
-"""What people labelled or corrected in BORIS, as labels: from its projects and from its exports.
+"""Reader of human labels from BORIS project files (JSON) and from its aggregated-events exports.
 
-A project is JSON; state events are pairs of rows, start and stop. `liex export SESSION --to boris`
-writes one.
+In a project, state events are pairs of rows, start and stop. `liex export SESSION --to boris`
+writes a project that can be corrected in BORIS and read back.
 """
 
 from __future__ import annotations
@@ -24,7 +24,14 @@ _MOST_BYTES = 1 << 28  # unpacked
 
 
 def read_boris_project(path: str | Path) -> dict[str, Any]:
-    """The content of a project, .boris or .boris.gz. Raises LiexError where it is none."""
+    """Read the content of a BORIS project.
+
+    Args:
+        path: a .boris file, or one packed with gzip (.boris.gz), of up to 256 MB unpacked.
+
+    Raises:
+        LiexError: the file is no such project.
+    """
     source = Path(path)
     try:
         raw = source.read_bytes()
@@ -42,11 +49,19 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
 
 
 def boris_labels(path: str | Path) -> pd.DataFrame:
-    """The state events of a project as labels: session_id (the observation), individual, action,
-    start_s, stop_s.
+    """State events of a project as labels.
 
-    The observation's time offset is taken off. An event without its end raises a LiexError that
-    names it; point events have no length and are left out.
+    The observation's time offset is taken off. Point events have no length and are left out.
+
+    Args:
+        path: a .boris or .boris.gz file.
+
+    Returns:
+        A table with session_id (the observation), individual, action, start_s, stop_s (s) and
+        source.
+
+    Raises:
+        LiexError: the file is no BORIS project, or an event has no end; the message names it.
     """
     document = read_boris_project(path)
     points = {
@@ -69,7 +84,14 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
 
 
 def boris_export_labels(path: str | Path) -> pd.DataFrame:
-    """The labels of BORIS's export 'aggregated events' (TSV or CSV); see `boris_labels`."""
+    """Labels of BORIS's export 'aggregated events'; see `boris_labels`.
+
+    Args:
+        path: a TSV file, by its ending .tsv, else a CSV file.
+
+    Raises:
+        LiexError: the file is no such export.
+    """
     source = Path(path)
     try:
         table = pd.read_csv(source, sep="\t" if source.suffix == ".tsv" else ",")
@@ -94,13 +116,17 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
 
 
 def is_boris_export(path: str | Path) -> bool:
-    """Whether a table's first line is that of BORIS's exports."""
+    """Whether a table's first line is that of BORIS's aggregated-events exports.
+
+    Args:
+        path: a text file.
+    """
     with Path(path).open(encoding="utf-8", errors="replace") as file:
         return file.readline().lstrip("\ufeff").startswith(("Observation id", '"Observation id"'))
 
 
 def _unpacked(raw: bytes) -> bytes:
-    """What gzip packed, up to the size of any project."""
+    """What gzip packed. Raises ValueError where it is more than 256 MB."""
     with gzip.open(io.BytesIO(raw)) as file:
         text = file.read(_MOST_BYTES + 1)
     if len(text) > _MOST_BYTES:

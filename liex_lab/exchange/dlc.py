@@ -1,7 +1,7 @@
-"""DeepLabCut's tables: three header rows, then one row for every frame.
+"""DeepLabCut's CSV tables: three header rows (scorer, bodyparts, coords), then one row per frame.
 
-poses_3d.csv has x, y, z in millimetres of the arena, without likelihood, as DeepLabCut's own 3D
-tables; poses_2d.csv has x, y in pixels of the depth picture and a likelihood. The format has no
+poses_3d.csv has x, y, z in millimetres of the arena frame, without likelihood, as DeepLabCut's own
+3D tables; poses_2d.csv has x, y in pixels of the depth picture and a likelihood. The format has no
 times: they are in times.csv, row by row; the actions are in bouts.csv.
 """
 
@@ -19,7 +19,12 @@ SCORER = "liex_lab"
 
 
 def write(session: Session, path: Path) -> None:
-    """The folder `path` with both tables, the times and the bouts."""
+    """Write a folder with both tables, the times and the bouts.
+
+    Args:
+        session: the session.
+        path: the folder to make.
+    """
     poses = Poses.of(session)
     path.mkdir()
     table(poses, poses.xyz_mm, "xyz").to_csv(path / "poses_3d.csv", lineterminator="\n")
@@ -30,7 +35,16 @@ def write(session: Session, path: Path) -> None:
 
 
 def table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.DataFrame:
-    """Values (n, J, k) with DeepLabCut's columns: scorer, bodyparts, coords."""
+    """Data frame with DeepLabCut's columns: scorer, bodyparts, coords.
+
+    Args:
+        poses: the session's poses, for joints and frame index.
+        values: (n, J, k) values.
+        coords: names of the k coordinates; a str is one letter each.
+
+    Returns:
+        (n, J k) table, indexed by the camera's frame count.
+    """
     columns = pd.MultiIndex.from_product(
         [[SCORER], list(poses.joints), list(coords)], names=["scorer", "bodyparts", "coords"]
     )

@@ -1,4 +1,4 @@
-"""The one door to all formats: a session's folder in, a file or folder of another program out."""
+"""Registry of export formats and the one function that writes them."""
 
 from __future__ import annotations
 
@@ -45,9 +45,16 @@ def export(
 ) -> Path:
     """Write a session in another program's format; returns the file or folder.
 
-    to: a word of `TARGETS`; out: the folder it goes into, by default the session's own. Nothing
-    half-written stays. Raises a SessionError where the format is not known, a file is there
-    already, or packages are missing.
+    It is written under another name and renamed, so nothing half-written stays.
+
+    Args:
+        session: the session.
+        to: the format, a word of `TARGETS`.
+        out: the folder it goes into, made if needed; None takes the session's own.
+        overwrite: replace what is there already.
+
+    Raises:
+        SessionError: the format is not known, a file is there already, or packages are missing.
     """
     if to not in TARGETS:
         near = difflib.get_close_matches(to, TARGETS, 1)

@@ -1,7 +1,7 @@
-"""movement's poses: an xarray data set, and the same as netCDF (`movement.io` and xarray open it).
+"""Poses data set of the Python package movement: xarray in memory, netCDF on disk.
 
-movement's own loaders make times from one frame rate; here the time coordinate is the frames' true
-one.
+`movement.io` and xarray open it. movement's own loaders make times from one frame rate; here the
+time coordinate holds the frames' true times.
 """
 
 from __future__ import annotations
@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 
 
 def to_movement(session: Session) -> xarray.Dataset:
-    """The session as a movement poses data set: millimetres of the arena, seconds; actions in
-    attrs["actions"].
+    """The session as a movement poses data set.
+
+    The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame), keypoints
+    and individuals; the variables position, confidence, sd_mm and action.
+
+    Args:
+        session: the session.
     """
     import xarray
 
@@ -65,5 +70,10 @@ def _actions(session: Session, poses: Poses) -> np.ndarray[Any, Any]:
 
 
 def write(session: Session, path: Path) -> None:
-    """NetCDF 4 at `path`."""
+    """Write netCDF 4.
+
+    Args:
+        session: the session.
+        path: the .nc file to write.
+    """
     to_movement(session).to_netcdf(path, engine="h5netcdf")

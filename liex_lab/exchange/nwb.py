@@ -1,8 +1,8 @@
-"""Neurodata Without Borders: one animal per file, poses as ndx-pose, true times, actions and gaps
-as intervals.
+"""Neurodata Without Borders (NWB) file: poses by the extension ndx-pose, rotations, actions, gaps.
 
-There is no type for rotations in NWB: each joint's is a TimeSeries of rotation vectors, in radians.
-Times count from the session's beginning, which NWB wants with its time zone.
+One animal per file. There is no type for rotations in NWB: each joint's is a TimeSeries of rotation
+vectors, rad. Actions and gaps are time intervals. Times are true ones, s since the session's
+beginning, which NWB wants with its time zone.
 """
 
 from __future__ import annotations
@@ -30,7 +30,15 @@ _CONFIDENCE = "probability that the joint lies within 10 % of the spine's length
 
 
 def write(session: Session, path: Path) -> None:
-    """The file at `path`. Raises a SessionError where the session does not say when it began."""
+    """Write the NWB file.
+
+    Args:
+        session: the session.
+        path: the .nwb file to write.
+
+    Raises:
+        SessionError: the session does not say when it began, with time zone.
+    """
     from pynwb import NWBHDF5IO
 
     made = build(
@@ -41,7 +49,14 @@ def write(session: Session, path: Path) -> None:
 
 
 def build(session: Session) -> NWBFile:
-    """The session as an NWB file in memory."""
+    """The session as an NWB file in memory.
+
+    Args:
+        session: the session.
+
+    Raises:
+        SessionError: the session does not say when it began, with time zone.
+    """
     from pynwb import NWBFile
 
     about = session.metadata

@@ -1,4 +1,4 @@
-"""A session's poses as arrays, which every other program's format is made of."""
+"""A session's poses as plain arrays, from which every other program's format is made."""
 
 from __future__ import annotations
 
@@ -27,10 +27,19 @@ _COLUMNS = [
 
 @dataclass(frozen=True)
 class Poses:
-    """One row for every recorded frame: frame_index (n,), time_s (n,); NaN where there is no pose.
+    """Poses of one animal, one row for every recorded frame; NaN where there is no pose.
 
-    joints: their names; xyz_mm (n, J, 3) in the arena; uv_px (n, J, 2) in the depth picture; score
-    and sd_mm (n, J).
+    Attributes:
+        individual: the animal's name.
+        joints: names of the J joints.
+        bones: pairs of joint indices, parent and child.
+        frame_index: (n,) int64, the camera's frame count.
+        time_s: (n,) s since the first frame.
+        xyz_mm: (n, J, 3) mm, arena frame.
+        uv_px: (n, J, 2) px of the depth picture; (0, 0) is the centre of the top-left pixel.
+        score: (n, J) probability that the joint lies within 10 % of the spine's length of the
+            truth.
+        sd_mm: (n, J) standard deviation of the joint along one axis, mm.
     """
 
     individual: str
@@ -45,7 +54,11 @@ class Poses:
 
     @staticmethod
     def of(session: Session) -> Poses:
-        """Those of a session."""
+        """The poses of a session.
+
+        Args:
+            session: the session.
+        """
         about = session.metadata
         joints = tuple(about["animal"]["joints"])
         table = session.table("poses", _COLUMNS)
@@ -70,7 +83,12 @@ class Poses:
 
 
 def write_times(path: Path, poses: Poses) -> None:
-    """A CSV with the true time of each row, for formats that have no room for it."""
+    """Write a CSV with the true time of each row, for formats that do not hold times.
+
+    Args:
+        path: the CSV file to write: frame_index, time_s with nine decimals.
+        poses: the session's poses.
+    """
     lines = [
         f"{index},{time:.9f}" for index, time in zip(poses.frame_index, poses.time_s, strict=True)
     ]

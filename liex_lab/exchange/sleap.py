@@ -1,7 +1,8 @@
 """SLEAP's analysis file (HDF5), in its own order of axes, which is Matlab's.
 
 The format has two coordinates: joints are in pixels of the depth picture. It has no times and no
-actions: true times stand beside SLEAP's own data sets as `time_s`, which its readers leave alone.
+actions: true times stand beside SLEAP's own data sets as `time_s` (s), which its readers leave
+alone.
 """
 
 from __future__ import annotations
@@ -16,8 +17,13 @@ from liex_lab.sessions import Session
 
 
 def write(session: Session, path: Path) -> None:
-    """One track, every recorded frame; pixels as SLEAP counts them, from the centre of the top-left
-    one.
+    """Write one track with every recorded frame.
+
+    Pixels are counted as SLEAP counts them, from the centre of the top-left one.
+
+    Args:
+        session: the session.
+        path: the .analysis.h5 file to write.
     """
     import h5py
 

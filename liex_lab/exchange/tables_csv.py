@@ -1,5 +1,6 @@
-"""Every table of a session as CSV, for those who would rather not read parquet. Units are in the
-columns' names.
+"""Every table of a session as CSV, for those who would rather not read Parquet.
+
+Units are in the columns' names; columns.json describes every column.
 """
 
 from __future__ import annotations
@@ -11,7 +12,12 @@ from liex_lab.sessions import Session
 
 
 def write(session: Session, path: Path) -> None:
-    """The folder `path` with one file per table, numbers in full precision, and columns.json."""
+    """Write a folder with one file per table, numbers in full precision, and columns.json.
+
+    Args:
+        session: the session.
+        path: the folder to make.
+    """
     path.mkdir()
     for name in sorted(
         {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)

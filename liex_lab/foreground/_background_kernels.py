@@ -1,4 +1,4 @@
-"""Numba kernels of the background: the farthest depth that keeps coming back in a pixel."""
+"""Kernels of the per-pixel background model: the farthest mode of a pixel's sorted readings."""
 
 from __future__ import annotations
 
@@ -8,12 +8,19 @@ from numba import njit, prange
 
 @njit(cache=True)
 def far_mode(values, window):
-    """Depth and spread of the farthest cluster in sorted readings (n,) mm; (0, 0) without one.
+    """Depth and spread of the farthest cluster in sorted readings; (0, 0) without one.
 
     An animal is always nearer than what it covers, so the background is the farthest depth that
     comes back, not the most frequent: a pixel covered nine tenths of the time still shows it. A
     cluster needs a twentieth of the readings (at least 3) within `window` mm, which lone outliers
     beyond the floor do not reach.
+
+    Args:
+        values: (n,) readings of one pixel, mm, ascending.
+        window: how far apart the readings of one surface lie, mm.
+
+    Returns:
+        The cluster's median, mm, and half of its range from 16 to 84 %, mm.
     """
     n = values.size
     need = max(3, (n + 19) // 20)
@@ -43,9 +50,19 @@ def far_mode(values, window):
 
 @njit(cache=True, parallel=True, nogil=True)
 def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
-    """`far_mode` of every pixel of `stack` (n, H, W) mm, 0 = unread, into depth and spread (H, W).
+    """Background depth, its spread and the nearest usual depth of every pixel.
 
-    near (H, W) gets the depth that only `near_share` of a pixel's readings are nearer than.
+    Runs `far_mode` in every pixel, rows in parallel.
+
+    Args:
+        stack: (n, H, W) float32 mm, 0 where unread.
+        window_share: width of a cluster, of the pixel's farthest reading.
+        window_mm: width of a cluster at least, mm.
+        near_share: share of a pixel's readings that are nearer than `near`.
+        depth: (H, W) float32 mm, out: the farthest mode, 0 without one.
+        spread: (H, W) float32 mm, out: its standard deviation.
+        near: (H, W) float32 mm, out: the depth that only `near_share` of the readings are nearer
+            than, 0 where never read.
     """
     for row in prange(stack.shape[1]):
         values = np.empty(stack.shape[0], np.float32)

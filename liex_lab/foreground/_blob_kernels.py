@@ -1,4 +1,13 @@
-"""Numba kernels of the foreground: blobs, and the height map of one animal."""
+"""Kernels of connected components, height maps and image moments of one frame.
+
+- Components: flood fill over blocks of 4 x 4 pixels, 8-connected; within a crop, run-length
+  labelling with union-find.
+- Smoothing: box filter by a summed-area table (Crow 1984).
+- Moments: area, volume, centroid and covariance of the foreground points; the long axis at angle
+  1/2 atan2(2 cov_xy, cov_xx - cov_yy) (Hu 1962).
+- Slope of the back: line fit by iteratively reweighted least squares with Geman and McClure's
+  weights w = 1 / (1 + (r / s)^2)^2.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +27,22 @@ _LEVEL_PASSES = 3
 
 @njit(cache=True)
 def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
-    """Connected blobs of pixels nearer than `limit` (H, W), in blocks; up to `bridge` blocks
-    without readings do not part them.
+    """Connected components of the pixels nearer than a limit, in blocks.
 
-    labels (H // BLOCK, W // BLOCK) int32 gets the blob of each block, -1 for none. blobs
-    (MAX_BLOBS, 7) gets pixels, first and last block row and column, the sum of depths, and the
-    pixels that cover the floor `on_floor` (H, W). Returns the number of blobs (the largest ones
-    when there are more than fit).
+    Every other row is looked at; a block counts where 3 of the 8 pixels do. Up to `bridge` blocks
+    without readings do not part a component.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor.
+        bridge: blocks without readings that may lie between the parts of one component.
+        labels: (H // BLOCK, W // BLOCK) int32, out: the component of each block, -1 for none.
+        blobs: (MAX_BLOBS, 7), out: pixels, first and last block row, first and last block column,
+            the sum of depths mm, and the pixels on the floor.
+
+    Returns:
+        The number of components, the largest ones where there are more than fit.
     """
     n_rows, n_columns = labels.shape
     hits = np.empty(n_columns * BLOCK, np.uint8)
@@ -59,10 +77,22 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
 
 @njit(cache=True)
 def layers(depth, limit, labels, slot, blob, apart):
-    """The depth mm that parts a blob into a near and a far layer which nothing joins for `apart`
-    mm, 0 for none; and the sums of the squared depths of the pixels in each.
+    """The depth that parts a component into a near and a far layer, and the extent of both.
 
-    Blocks count with their middle depth: one that an edge goes through belongs to one side of it.
+    The largest gap in the sorted depths of its blocks that is wider than `apart`. Blocks count with
+    their middle depth: one that an edge goes through belongs to one side of it.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        slot: the component.
+        blob: (7,) as `label_blobs` fills it.
+        apart: least width of the gap, mm.
+
+    Returns:
+        The depth mm in the middle of the gap, 0 for none; and the sums of the squared depths of the
+        pixels in the near and in the far layer, mm^2.
     """
     found = np.empty(labels.size, np.float32)
     values = np.empty(BLOCK * BLOCK, np.float32)
@@ -97,6 +127,7 @@ def layers(depth, limit, labels, slot, blob, apart):
 
 @njit(cache=True)
 def forget(labels, slot):
+    """Make background, -1, of the blocks labelled `slot` in labels (h, w)."""
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if labels[i, j] == slot:
@@ -115,9 +146,7 @@ def _is_unread(depth, row, column):
 
 @njit(cache=True)
 def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
-    """Give every block connected with (i, j) the label `slot`, and count the blob's pixels into
-    `blob` (7,).
-    """
+    """Flood fill: blocks connected with (i, j) get the label `slot`, `blob` (7,) the counts."""
     blob[0] = 0
     blob[1] = i
     blob[2] = i
@@ -162,7 +191,14 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
 
 @njit(cache=True)
 def is_animal_block(labels, row, column, slot):
-    """Whether a block belongs to the blob or borders it without belonging to another one."""
+    """Whether a block belongs to the component or borders it without belonging to another one.
+
+    Args:
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        row: of the block; may lie outside.
+        column: of the block; may lie outside.
+        slot: the component.
+    """
     if row < 0 or column < 0 or row >= labels.shape[0] or column >= labels.shape[1]:
         return False
     if labels[row, column] >= 0:
@@ -178,13 +214,22 @@ def is_animal_block(labels, row, column, slot):
 
 @njit(cache=True)
 def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
-    """Height above the floor, mm, of the blob's pixels into raw (S, S) float32: -1 background, -2
-    without a reading.
+    """Heights above a plane of a component's pixels, on a crop.
 
-    plane (3,): 1 / z of the floor = a u + b v + c; distance mm of the camera from it. A point at
-    depth z seen at (u, v) is `distance * (1 - z (a u + b v + c))` high. Crop pixel (r, c) is
-    picture pixel origin + step * (c, r). The outermost ring stays background, so a probe clamped to
-    the border reads what lies outside.
+    A point at depth z seen at (u, v) is `distance * (1 - z (a u + b v + c))` high. Crop pixel (r,
+    c) is picture pixel origin + step * (c, r). The outermost ring stays background, so a probe
+    clamped to the border reads what lies outside.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        slot: the component.
+        plane: (3,) a, b, c of the plane, 1 / z = a u + b v + c.
+        distance: of the camera from it, mm.
+        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: picture pixels a crop pixel.
+        raw: (S, S) float32 mm, out: heights, -1 background, -2 without a reading.
     """
     size = raw.shape[0]
     height, width = depth.shape
@@ -208,7 +253,12 @@ def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
 
 @njit(cache=True)
 def find_root(parent, k):
-    """The root of k, halving the way there."""
+    """The root of k in a union-find forest, with path halving.
+
+    Args:
+        parent: (n,) parents; a root is its own.
+        k: the element.
+    """
     while parent[k] != k:
         parent[k] = parent[parent[k]]
         k = parent[k]
@@ -217,12 +267,15 @@ def find_root(parent, k):
 
 @njit(cache=True)
 def keep_largest(raw, runs):
-    """Erase from raw (S, S) all pixels but the largest group, in which no gap is wider than a
-    pixel.
+    """Erase all pixels of a crop but the largest group, in which no gap is wider than a pixel.
 
     Blocks join what is a few pixels apart; pixel by pixel a neighbour is told from the animal. Rows
-    are taken as runs of pixels, and runs join those that they touch, or nearly, in the two rows
-    above. runs (S * S, 5) int32 is scratch: row, first and last column, readings, parent.
+    are taken as runs of pixels, and union-find joins the runs that touch, or nearly, those in the
+    two rows above.
+
+    Args:
+        raw: (S, S) float32, -1 background; changed in place.
+        runs: (S * S, 5) int32, scratch: row, first and last column, readings, parent.
     """
     size = raw.shape[0]
     n = 0
@@ -269,8 +322,16 @@ def keep_largest(raw, runs):
 
 @njit(cache=True)
 def level_heights(raw, behind_mm):
-    """Lift all heights of raw (S, S) so that their mean, without what lies farther than behind_mm
-    from it, becomes behind_mm; what is then not above 0 is background. Returns the lift, mm.
+    """Lift all heights so that their mean becomes behind_mm, and erase what is then not above 0.
+
+    The mean leaves out what lies farther than behind_mm from it (three passes).
+
+    Args:
+        raw: (S, S) float32 mm; changed in place.
+        behind_mm: height of the mean.
+
+    Returns:
+        The lift, mm.
     """
     mean = 0.0
     reach = np.inf
@@ -296,13 +357,17 @@ def level_heights(raw, behind_mm):
 
 @njit(cache=True)
 def smooth_heights(raw, radius, out):
-    """Box-filtered heights in 1/16 mm, int16, into out (S, S): background 0, holes filled from what
-    surrounds them.
+    """Box-filtered heights, with holes filled from what surrounds them.
 
     A pixel of the animal becomes the mean of the animal's pixels within `radius`; a pixel without
     reading becomes that mean within one pixel more where at least 5 of the pixels there are the
     animal and more than twice as many of them as are background. Sums over boxes are differences of
-    running sums.
+    running sums (a summed-area table).
+
+    Args:
+        raw: (S, S) float32 mm, -1 background, -2 without a reading.
+        radius: of the box, px; its side is 2 radius + 1.
+        out: (S, S) int16, 1/16 mm, out: 0 background, at most 32000.
     """
     size = raw.shape[0]
     top = size
@@ -348,13 +413,19 @@ def smooth_heights(raw, radius, out):
 
 @njit(cache=True)
 def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments):
-    """Mass, area and axes of an animal from its height map, in the arena frame, into moments
-    (N_MOMENTS,).
+    """Mass, area and principal axes of an animal from its height map, in the view frame.
 
-    moments: pixels, area mm^2 (seen from above), volume mm^3, x, y mm of the centroid, angle rad of
-    the long axis (mod pi), the standard deviations mm along and across it, and 0, where
-    `back_slope` may go. intrinsics (fx, fy, cx, cy); rotation (3, 3) of T_arena_camera, whose
-    translation is (0, 0, distance).
+    Args:
+        heights: (S, S) int16, 1/16 mm, 0 background.
+        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: picture pixels a crop pixel.
+        plane: (3,) a, b, c of the reference plane, 1 / z = a u + b v + c.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        rotation: (3, 3) of T_view_camera, whose translation is (0, 0, distance).
+        distance: of the camera from the plane, mm.
+        moments: (N_MOMENTS,), out: pixels, area mm^2 (seen from the camera), volume mm^3, x, y mm
+            of the centroid, angle rad of the long axis (mod pi), the standard deviations mm along
+            and across it, and 0, where `back_slope` may go. All 0 for an empty map.
     """
     n = 0
     area = 0.0
@@ -413,12 +484,21 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
 
 @njit(cache=True)
 def back_slope(heights, origin, step, intrinsics, distance, moments):
-    """How steeply the back rises along the long axis, of a height map that was cut along the
-    optical axis.
+    """How steeply the back rises along the long axis, in a height map cut along the optical axis.
 
     A straight line through the heights, in which readings far off it count less with every pass
-    (Geman and McClure's weights), for a light field errs grossly in patches. moments: see
-    `blob_moments`.
+    (Geman and McClure's weights), for a light field errs grossly in patches.
+
+    Args:
+        heights: (S, S) int16, 1/16 mm, 0 background.
+        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: picture pixels a crop pixel.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        distance: of the camera from the reference plane, mm.
+        moments: (N_MOMENTS,) of the map, see `blob_moments`.
+
+    Returns:
+        Height mm a mm along the axis.
     """
     size = heights.shape[0]
     along = np.empty(size * size)

@@ -1,8 +1,14 @@
-"""Numba kernels that find where surfaces end that come into the picture, as an arm does in a hand.
+"""Kernels of geodesic extrema: where surfaces end that come into the picture, as an arm in a hand.
 
-Arrays that all of them share: blocks (h, w) float32, the depth in mm of what is nearest in every
-block of BLOCK x BLOCK pixels, 0 = nothing within range; labels (h, w) int32, which surface a block
-belongs to, -1 none.
+The geodesic distance from where a surface leaves the picture is found by breadth-first search over
+its blocks; its maxima are the extrema (accumulative geodesic extrema, Plagemann et al., ICRA 2010).
+A maximum counts by its persistence (Edelsbrunner et al. 2002): added from the far end inwards,
+blocks make islands that a union-find merges, and the lower of two islands that meet has stuck out
+by the difference.
+
+Arrays that all kernels share: blocks (h, w) float32, the depth in mm of what is nearest in every
+block of BLOCK x BLOCK pixels, 0 for nothing within range; labels (h, w) int32, which surface a
+block belongs to, -1 none.
 """
 
 from __future__ import annotations
@@ -20,9 +26,8 @@ AROUND_MM = 190.0
 _MIN_IN_BLOCK = 5
 _THICK_MM = 25.0  # readings of one block this far behind its nearest belong to something else
 _JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
-_STICKS_OUT_MM = (
-    90.0  # of a home-sized hand: an end of a surface stands out by this, which an elbow does not
-)
+# of a home-sized hand: an end of a surface stands out by this, which an elbow does not
+_STICKS_OUT_MM = 90.0
 # sticking out once more as far is worth being nearer by this, up to so often
 _WORTH_MM = 60.0
 _MOST_OUT = 3.0
@@ -32,7 +37,16 @@ _MARGIN = 2  # blocks: many cameras read nothing along the borders of their pict
 
 @njit(cache=True)
 def block_depths(depth, near, far, blocks):
-    """Fill `blocks` from depth (H, W) mm."""
+    """The depth of what is nearest in every block.
+
+    The mean of the readings up to 25 mm behind the block's second nearest.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        near: nearer than this nothing counts, mm.
+        far: farther than this nothing counts, mm.
+        blocks: (h, w) float32 mm, out; 0 where fewer than 5 readings agree.
+    """
     nothing = np.float32(1e9)
     for i in range(blocks.shape[0]):
         for j in range(blocks.shape[1]):
@@ -60,10 +74,19 @@ def block_depths(depth, near, far, blocks):
 
 @njit(cache=True)
 def label_surfaces(blocks, labels, focal2, least_mm2, areas):
-    """Connected surfaces of at least `least_mm2`: labels, and areas (MAX_SURFACES,) mm^2. Returns
-    how many.
+    """Connected surfaces: flood fill over blocks whose depths differ by less than 50 mm.
 
-    focal2: fx * fy. Where there are more than fit, the largest are kept.
+    Where there are more than fit, the largest are kept.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32, out: the surface of each block, -1 none.
+        focal2: fx * fy, px^2.
+        least_mm2: smaller surfaces are dropped.
+        areas: (MAX_SURFACES,) mm^2, out.
+
+    Returns:
+        The number of surfaces.
     """
     n_rows, n_columns = blocks.shape
     for i in range(n_rows):
@@ -112,12 +135,22 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
 
 @njit(cache=True)
 def walk(blocks, labels, slot, position, order, hops):
-    """All blocks of a surface in the order of their distance, in steps, from where it leaves the
-    picture.
+    """All blocks of a surface by geodesic distance from where it leaves the picture.
 
-    A surface that does not leave it is walked from its farthest block. order (n, 2) gets the
-    blocks, hops (n,) their distances, position (h, w) where in the order a block is; it comes in as
-    -1. Returns how many blocks there are.
+    Breadth-first search in steps of one block. Of the border, only the farther part counts as the
+    arm, since a hand may touch it, too. A surface that does not leave the picture is walked from
+    its farthest block.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        slot: the surface.
+        position: (h, w) int32, out: where in the order a block is; comes in as -1.
+        order: (n_blocks, 2) int32, out: row and column of the blocks.
+        hops: (n_blocks,) int32, out: their distances in blocks.
+
+    Returns:
+        The number of blocks reached.
     """
     n = 0
     deepest = np.float32(0.0)
@@ -155,7 +188,21 @@ def walk(blocks, labels, slot, position, order, hops):
 
 @njit(cache=True)
 def walk_from(blocks, labels, slot, i, j, position, order, hops):
-    """`walk` from one block of the surface."""
+    """`walk` from one block of the surface.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        slot: the surface.
+        i: row of the block.
+        j: column of the block.
+        position: (h, w) int32, out; comes in as -1.
+        order: (n_blocks, 2) int32, out.
+        hops: (n_blocks,) int32, out.
+
+    Returns:
+        The number of blocks reached.
+    """
     order[0, 0] = i
     order[0, 1] = j
     hops[0] = 0
@@ -165,7 +212,7 @@ def walk_from(blocks, labels, slot, i, j, position, order, hops):
 
 @njit(cache=True)
 def _spread(blocks, labels, slot, n, position, order, hops):
-    """Go on with a walk from its first n blocks. Returns how many there are in the end."""
+    """Breadth-first search from the first n blocks; returns how many there are in the end."""
     at = 0
     while at < n:
         i = order[at, 0]
@@ -185,12 +232,26 @@ def _spread(blocks, labels, slot, n, position, order, hops):
 
 @njit(cache=True)
 def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
-    """The ends of a walked surface, where it stops after having stuck out by `least_mm`: rows of
-    tips (MAX_TIPS, 4).
+    """The geodesic extrema of a walked surface whose persistence is at least `least_mm`.
 
     From the far end of the walk inwards, islands appear and grow together; the lower of two islands
-    that meet has stuck out by the difference (its persistence). A row is depth, less for what
-    sticks out far, block row, block column, depth. Returns how many there are now.
+    that meet has stuck out by the difference (its persistence). The farthest block of the walk is
+    an extremum in any case.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        order: (n, 2) int32, blocks in the order of the walk.
+        hops: (n,) int32, their distances in blocks.
+        position: (h, w) int32, where in the order a block is.
+        n: blocks of the walk.
+        focal: px.
+        least_mm: by how much an extremum stands out, mm.
+        tips: (MAX_TIPS, 4), out: depth mm, less for what sticks out far; block row; block column;
+            depth mm.
+        n_tips: rows that are filled already.
+
+    Returns:
+        The number of rows filled now.
     """
     parent = np.arange(n)
     for k in range(n - 1, -1, -1):
@@ -226,7 +287,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
 
 @njit(cache=True)
 def _note(tips, n_tips, z, out, block):
-    """Add an end at depth z mm that sticks out `out` times as far as an end must."""
+    """Add an extremum at depth z mm that sticks out `out` times as far as one must."""
     if n_tips == MAX_TIPS:
         return n_tips
     tips[n_tips, 0] = z - _WORTH_MM * min(out, _MOST_OUT)
@@ -238,12 +299,22 @@ def _note(tips, n_tips, z, out, block):
 
 @njit(cache=True)
 def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
-    """Up to `len(chosen)` places where a hand may be, the nearest first, no two alike; rows as in
-    `ends`. How many.
+    """Positions where a hand may be, the nearest first, no two alike.
 
-    A surface is walked twice: from where it leaves the picture, and from the end that lies farthest
-    from there, as it may be the hand that lies at the border. What of it is nearest may be a hand
-    before a body that it touches.
+    A surface is walked twice: from where it leaves the picture, and from the extremum that lies
+    farthest from there, as it may be the hand that lies at the border. What of it is nearest may be
+    a hand before a body that it touches.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        n_surfaces: surfaces that are labelled.
+        size: the hand's length over the skeleton's home length.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        chosen: (m, 4), out: rows as in `ends`, at least 0.6 of the hand's sphere apart.
+
+    Returns:
+        The number of rows filled, at most m.
     """
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
     n_blocks = blocks.size
@@ -288,6 +359,15 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
 
 @njit(cache=True)
 def point_of_block(blocks, i, j, intrinsics, out):
+    """The point of a block's centre at its depth.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        i: row of the block.
+        j: column of the block.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        out: (3,) mm, camera frame, out.
+    """
     z = blocks[i, j]
     out[0] = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
     out[1] = (i * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[3]) / intrinsics[1] * z
@@ -296,8 +376,16 @@ def point_of_block(blocks, i, j, intrinsics, out):
 
 @njit(cache=True)
 def box_around(shape, middle, radius, intrinsics, box):
-    """First and last row and column (4,) of the blocks of a grid whose points can lie within
-    `radius` mm of `middle` (3,) mm. All of them, where the camera itself is so near.
+    """The blocks whose points can lie within a sphere: its bounding box in the picture.
+
+    All of the grid, where the sphere reaches behind the camera.
+
+    Args:
+        shape: (h, w) of the grid of blocks.
+        middle: (3,) mm, camera frame.
+        radius: mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        box: (4,) int64, out: first and last row, first and last column.
     """
     near = middle[2] - radius
     far = middle[2] + radius
@@ -320,7 +408,14 @@ def box_around(shape, middle, radius, intrinsics, box):
 
 @njit(cache=True)
 def relabel(labels, box, mark, slot):
-    """Give the blocks labelled `mark` within box (4,), see `box_around`, the label `slot`."""
+    """Give the blocks labelled `mark` within a box the label `slot`.
+
+    Args:
+        labels: (h, w) int32; changed in place.
+        box: (4,) as `box_around` fills it.
+        mark: the label that goes.
+        slot: the label that comes.
+    """
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
             if labels[i, j] == mark:

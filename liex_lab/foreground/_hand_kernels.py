@@ -1,7 +1,11 @@
-"""Numba kernels that cut the hand at an end of a surface from its arm, and its height map from the
-picture.
+"""Kernels that segment the hand at a geodesic extremum and cut its height map from the picture.
 
-blocks and labels are those of `_ends`.
+At an extremum a step of mean shift with a flat kernel of 60 mm (Fukunaga and Hostetler 1975) finds
+the middle of its end; a sphere of 190 mm is centred on the hand in three passes, in which what
+leaves the sphere tells the direction of the arm, and the surface is cut across it a hand's length
+(185 mm) behind the fingertips. All lengths are those of a home-sized hand.
+
+blocks and labels are those of `_geodesic_kernels`.
 """
 
 from __future__ import annotations
@@ -23,16 +27,14 @@ from liex_lab.foreground._geodesic_kernels import (
 )
 from liex_lab.foreground._hand_score_kernels import unlikeness
 
-_TIP_MM = (
-    60.0  # of a home-sized hand: this much of the end of a surface is where it is first taken to be
-)
+# of a home-sized hand: this much of the end of a surface is where it is first taken to be
+_TIP_MM = 60.0
 _MOST_ENDS = 8  # that are looked at
 # what it counts to be farther away than another end, in `unlikeness`
 _PER_MM_BEHIND = 0.012
 _MOST_BEHIND_MM = 800.0
-_AS_LIKE = (
-    1.0  # a second end is worth a look while it is not more unlike a hand than the first by this
-)
+# a second end is worth a look while it is not more unlike a hand than the first by this
+_AS_LIKE = 1.0
 _LEAST_MM2 = 2500.0  # no hand is smaller
 _LENGTH_MM = 185.0  # of a home-sized hand
 _SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
@@ -45,11 +47,19 @@ FIELDS = 8
 
 @njit(cache=True)
 def locate(blocks, labels, tip, size, intrinsics, found):
-    """Where the hand at an end of a surface is: fill `found` (FIELDS,), mark its blocks with
-    MAX_SURFACES in labels.
+    """Where the hand at an extremum of a surface is; its blocks get the label MAX_SURFACES.
 
     What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's
     length long.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32; the hand's blocks are marked in it.
+        tip: (4,) the extremum, a row of `_geodesic_kernels.ends`.
+        size: the hand's length over the skeleton's home length.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        found: (FIELDS,), out: middle x, y, z mm; direction of the fingers x, y, z (0 without an
+            arm); where along it the arm is cut, mm from the camera; area mm^2.
     """
     middle = np.empty(3)
     fingers = np.zeros(3)
@@ -178,7 +188,7 @@ def _along(p, middle, fingers):
 
 @njit(cache=True)
 def _settle(blocks, labels, slot, radius, intrinsics, middle):
-    """Move `middle` (3,) to the middle of what the surface has within `radius` mm of it."""
+    """One step of mean shift: `middle` (3,) moves to the mean of what is within `radius` mm."""
     p = np.empty(3)
     box = np.empty(4, np.int64)
     total = 0.0
@@ -200,7 +210,19 @@ def _settle(blocks, labels, slot, radius, intrinsics, middle):
 
 @njit(cache=True)
 def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
-    """How unlike a hand what would be cut at each of the ends is, into unlike (n,)."""
+    """How unlike a hand what would be cut at each of the extrema is.
+
+    The score of `unlikeness`, and 0.012 for every mm by which one lies behind the nearest (up to
+    800 mm).
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32; comes back as it was.
+        ends: (n, 4) rows of `_geodesic_kernels.ends`.
+        size: the hand's length over the skeleton's home length.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        unlike: (n,), out: the less, the more alike.
+    """
     depth = np.empty(len(unlike))
     found = np.empty(FIELDS)
     nearest = 1e9
@@ -217,7 +239,13 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
 
 @njit(cache=True)
 def box_of(labels, mark, box):
-    """First and last row and column of the blocks labelled `mark` into box (4,)."""
+    """The bounding box of the blocks labelled `mark`.
+
+    Args:
+        labels: (h, w) int32.
+        mark: the label.
+        box: (4,) int64, out: first and last row, first and last column; first beyond last for none.
+    """
     box[0] = labels.shape[0]
     box[1] = -1
     box[2] = labels.shape[1]
@@ -231,8 +259,14 @@ def box_of(labels, mark, box):
 
 @njit(cache=True)
 def sight_rotation(x, y, rotation):
-    """T_view_camera's rotation (3, 3), z towards the camera along the line of sight (x, y, 1), x as
-    the camera's.
+    """Rotation of T_view_camera for a line of sight (x, y, 1): z points at the camera along it.
+
+    The view's x axis is the camera's, as far as the line of sight allows.
+
+    Args:
+        x: of the line of sight at z = 1.
+        y: of the line of sight at z = 1.
+        rotation: (3, 3), out.
     """
     length = np.sqrt(x * x + y * y + 1.0)
     up = np.array([-x / length, -y / length, -1.0 / length])
@@ -252,8 +286,24 @@ def sight_rotation(x, y, rotation):
 def cut_heights(
     depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw
 ):
-    """Heights mm of the hand's pixels above the plane behind it into raw (S, S): -1 background, -2
-    not read.
+    """Heights of the hand's pixels above the plane behind it, on a crop.
+
+    A pixel belongs to the hand where a block of the hand lies at or beside it, where it is no more
+    than 45 mm farther than that, and where it lies beyond the cut through the arm.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32, the hand's blocks labelled MAX_SURFACES.
+        found: (FIELDS,) as `locate` fills it.
+        plane: (3,) a, b, c of the plane behind the hand, 1 / z = a u + b v + c.
+        distance: of the camera from it, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: picture pixels a crop pixel.
+        near: nearer than this counts as unread, mm.
+        far: farther than this nothing is the hand, mm.
+        raw: (S, S) float32 mm, out: heights, -1 background, -2 without a reading.
     """
     size = raw.shape[0]
     reaches = np.full((labels.shape[0] + 1, labels.shape[1] + 1), -1.0, np.float32)
@@ -322,9 +372,31 @@ def extract_one(
     n_blobs,
     k,
 ):
-    """Find the hand in frame k (H, W) mm and fill row k of the batch; see `NearestScene.extract`.
+    """Find the hand in one frame and fill its row of the batch; see `HandSegmenter.extract`.
+
     Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
-    gets what may be a hand as well.
+    gets what may be a hand as well: a second extremum that is not more unlike a hand than the first
+    by 1.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        near: least depth at which a hand is looked for, mm.
+        far: largest depth at which a hand is looked for, mm.
+        n_things: candidates a frame, 1 or 2.
+        size: the hand's length over the skeleton's home length.
+        behind: of the reference plane behind the hand's middle, mm.
+        smooth: width over which heights are averaged, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        along_axis: whether heights are measured along the optical axis, else along the line of
+            sight.
+        heights: (N, S, S) int16, 1/16 mm, out; N rows of the batch.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, picture pixels a crop pixel, out.
+        n_px: (N,) int64, pixels of the height map, out.
+        moments: (N, N_MOMENTS), out; the long axis points away from the arm where one is seen.
+        distance: (N,) mm of the view's origin from the camera, out.
+        n_blobs: (N,) int64, candidates, out.
+        k: the frame's row.
     """
     blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
     labels = np.empty(blocks.shape, np.int32)
@@ -387,8 +459,27 @@ def cut_end(
     distance,
     k,
 ):
-    """The height map of the hand at an end of a surface, and its moments, into row k; labels stay
-    as they are.
+    """The height map of the hand at an extremum, and its moments; labels stay as they are.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        near: least depth of a hand, mm.
+        far: largest depth of a hand, mm.
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        end: (4,) the extremum.
+        size: the hand's length over the skeleton's home length.
+        behind: of the reference plane behind the hand's middle, mm.
+        smooth: width over which heights are averaged, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        along_axis: whether heights are measured along the optical axis.
+        heights: (N, S, S) int16, 1/16 mm, out.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, out.
+        n_px: (N,) int64, out.
+        moments: (N, N_MOMENTS), out.
+        distance: (N,) mm, out.
+        k: the row.
     """
     found = np.empty(FIELDS)
     box = np.empty(4, np.int64)
@@ -444,8 +535,17 @@ def cut_end(
 
 @njit(cache=True)
 def view_axis(origin, step, crop, intrinsics, along_axis):
-    """Where the view's axis goes, (x, y) at z = 1: through the middle of the crop, or along the
-    optical axis.
+    """Direction of the view's axis: through the middle of the crop, or the optical axis.
+
+    Args:
+        origin: (2,) picture pixel (u, v) of crop pixel (0, 0).
+        step: picture pixels a crop pixel.
+        crop: side of the crop, px.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        along_axis: whether along the optical axis.
+
+    Returns:
+        x and y at z = 1, camera frame.
     """
     if along_axis:
         return 0.0, 0.0
@@ -457,7 +557,13 @@ def view_axis(origin, step, crop, intrinsics, along_axis):
 
 @njit(cache=True)
 def view_plane(rotation, distance, intrinsics):
-    """Coefficients (3,) of the plane that a view measures heights from: 1 / z = a u + b v + c."""
+    """Coefficients (3,) a, b, c of the plane that a view measures from: 1 / z = a u + b v + c.
+
+    Args:
+        rotation: (3, 3) of T_view_camera.
+        distance: of the camera from the plane, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+    """
     a = -rotation[2, 0] / intrinsics[0] / distance
     b = -rotation[2, 1] / intrinsics[1] / distance
     return np.array([a, b, -rotation[2, 2] / distance - a * intrinsics[2] - b * intrinsics[3]])
@@ -482,7 +588,27 @@ def extract_all(
     distance,
     n_blobs,
 ):
-    """`extract_one` for a batch; size, behind, smooth (n,) and intrinsics (n, 4) differ."""
+    """Find the hand in every picture and fill the batch, pictures in parallel.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        near: least depth at which a hand is looked for, mm.
+        far: largest depth at which a hand is looked for, mm.
+        n_things: candidates a picture; the batch has N = n_things n rows, best candidates first.
+        size: (n,) lengths of the hands over the skeleton's home length.
+        behind: (n,) mm of the reference plane behind the hand's middle.
+        smooth: (n,) mm, widths over which heights are averaged.
+        intrinsics: (n, 4) fx, fy, cx, cy px.
+        along_axis: whether heights are measured along the optical axis, else along the line of
+            sight.
+        heights: (N, S, S) int16, 1/16 mm, out.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, picture pixels a crop pixel, out.
+        n_px: (N,) int64, pixels of the height map, out.
+        moments: (N, N_MOMENTS), out.
+        distance: (N,) mm of the view's origin from the camera, out.
+        n_blobs: (N,) int64, candidates, out.
+    """
     for k in prange(depths.shape[0]):
         extract_one(
             depths[k],
@@ -506,22 +632,17 @@ def extract_all(
 
 
 @njit(cache=True)
-def fill_looks(intrinsics, origin, step, distance, crop, along_axis, looks):
-    """How each height map was cut (n, 17): see `Scene.looks`."""
-    rotation = np.empty((3, 3))
+def fill_rotations(intrinsics, origin, step, crop, along_axis, rotations):
+    """Rotations of T_view_camera along the lines of sight through the middles of crops.
+
+    Args:
+        intrinsics: (n, 4) fx, fy, cx, cy px.
+        origin: (n, 2) picture pixel (u, v) of crop pixel (0, 0).
+        step: (n,) picture pixels a crop pixel.
+        crop: side of the crops, px.
+        along_axis: whether along the optical axis instead.
+        rotations: (n, 3, 3), out.
+    """
     for k in range(len(step)):
         x, y = view_axis(origin[k], step[k], crop, intrinsics[k], along_axis)
-        sight_rotation(x, y, rotation)
-        looks[k, :4] = intrinsics[k]
-        looks[k, 4:13] = rotation.ravel()
-        looks[k, 13] = distance[k]
-        looks[k, 14] = origin[k, 0]
-        looks[k, 15] = origin[k, 1]
-        looks[k, 16] = step[k]
-
-
-@njit(cache=True)
-def view_planes(looks, planes):
-    """`view_plane` of looks (n, 17) into planes (n, 3)."""
-    for k in range(len(looks)):
-        planes[k] = view_plane(looks[k, 4:13].reshape(3, 3), looks[k, 13], looks[k, :4])
+        sight_rotation(x, y, rotations[k])

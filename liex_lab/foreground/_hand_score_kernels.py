@@ -1,6 +1,11 @@
-"""A numba kernel that says how unlike a hand a part of a surface is.
+"""Kernel of the hand score: how unlike a hand a part of a surface is.
 
-blocks and labels are those of `_ends`.
+A weighted sum of the squared logarithm of its area over that of a home-sized hand, its share on the
+picture's border, the width of what goes on behind the cut, and the logarithm of circumference^2 /
+area, which fingers make large. Logistic regression chose the weights, on rendered hands against
+elbows, chests and heads.
+
+blocks and labels are those of `_geodesic_kernels`.
 """
 
 from __future__ import annotations
@@ -12,11 +17,9 @@ from liex_lab.foreground._blob_kernels import BLOCK
 from liex_lab.foreground._geodesic_kernels import AROUND_MM, box_around, point_of_block, relabel
 
 # what tells rendered hands from elbows, chests and heads by logistic regression, in units of the
-# first: the logarithm
-# of circumference^2 over area, which fingers make large
-# of a home-sized hand; what the square of the difference counts
-_AREA_LOG_MM2 = 9.55
-_PER_AREA = 0.55
+# first: the logarithm of circumference^2 over area, which fingers make large
+_AREA_LOG_MM2 = 9.55  # of a home-sized hand
+_PER_AREA = 0.55  # what the square of the difference counts
 _PER_BORDER = 0.6  # the share that lies along the border of the picture
 # how wide it goes on behind the cut
 _WRIST_MM = 50.0
@@ -32,11 +35,19 @@ _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 @njit(cache=True)
 def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
-    """The mean depth, mm, of the blocks labelled `mark`, and how unlike a hand they are: the less,
-    the more alike.
+    """Mean depth of the blocks labelled `mark`, and how unlike a hand they are.
 
-    slot: the label of the rest of the surface, which the blocks get back; found (FIELDS,) as
-    `_nearest.locate` fills it.
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32; changed in place.
+        slot: the label of the rest of the surface, which the blocks get back.
+        mark: the label of the blocks.
+        found: (FIELDS,) as `_hand_kernels.locate` fills it.
+        size: the hand's length over the skeleton's home length.
+        intrinsics: (4,) fx, fy, cx, cy px.
+
+    Returns:
+        The mean depth, mm, and the score: the less, the more alike.
     """
     box = np.empty(4, np.int64)
     box_around(labels.shape, found, _WITHIN * AROUND_MM * size, intrinsics, box)

@@ -1,5 +1,10 @@
-"""Numba kernels that find the animal's blob in a frame and cut its height map, over many frames at
-once.
+"""Kernels that choose the animal among connected components and cut its height map, frame by frame.
+
+Every frame: `label_blobs` joins foreground pixels to components; the component whose area in mm^2
+(pixels times the squared mean depth over fx fy) is nearest to the animal's on a logarithmic scale
+is the animal; `cut_heights`, `keep_largest`, `smooth_heights` and `blob_moments` make its height
+map. In camera view, what merely hangs together with the animal in the picture is told apart by the
+largest gap in depth.
 """
 
 from __future__ import annotations
@@ -20,8 +25,15 @@ _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor 
 
 @njit(cache=True, parallel=True, nogil=True)
 def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
-    """Areas mm^2 of the blobs of every frame into areas (n, MAX_BLOBS); 0 for one that does not
-    stand on the floor.
+    """Areas of the connected components of every frame; 0 for one that does not stand on the floor.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor; a component stands on it with 30 % of its pixels.
+        bridge: blocks without readings that may lie between the parts of one component.
+        mm2_per_px: 1 / (fx fy).
+        areas: (n, MAX_BLOBS) mm^2, out; comes in as 0.
     """
     for k in prange(depths.shape[0]):
         labels = np.empty(
@@ -35,16 +47,30 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
 
 @njit(cache=True)
 def blob_area(blob, mm2_per_px):
-    """Area mm^2 seen from above of a blob (7,); mm2_per_px is 1 / (fx fy)."""
+    """Area mm^2, seen from the camera, of a component at its mean depth.
+
+    Args:
+        blob: (7,) as `label_blobs` fills it.
+        mm2_per_px: 1 / (fx fy).
+    """
     return blob[0] * (blob[5] / blob[0]) ** 2 * mm2_per_px
 
 
 @njit(cache=True)
 def order_blobs(blobs, n_blobs, area, mm2_per_px):
-    """The blobs in the order in which their areas come near to the animal's, and how many have
-    about its area.
+    """The components in the order in which their areas come near to the animal's, and how many do.
 
     While `area` is 0 the largest comes first.
+
+    Args:
+        blobs: (MAX_BLOBS, 7) as `label_blobs` fills it.
+        n_blobs: how many of the rows are filled.
+        area: the animal's usual area, mm^2, 0 while unknown.
+        mm2_per_px: 1 / (fx fy).
+
+    Returns:
+        Rows of blobs, nearest first, and how many stand on the floor and have about the animal's
+        area (within a factor of 4).
     """
     distances = np.full(n_blobs, np.inf)
     n_near = 0
@@ -62,13 +88,23 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
 
 @njit(cache=True)
 def parted(depth, limit, labels, blobs, area, mm2_per_px):
-    """The picture without what hangs together with the animal in it alone, and whether there is
-    such a thing.
+    """The picture without what hangs together with the animal in it alone, by the gap in depth.
 
     Of two layers far from one another the animal is the one whose area is nearer to its own. What
     lies before it hides parts of it, and is taken for unread; what lies behind it there is
     background. Elsewhere nothing is: of a bar and some specks the bar is likest to the animal,
     which may swim beside them.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        blobs: (n_blobs, 7) as `label_blobs` fills it.
+        area: the animal's usual area, mm^2.
+        mm2_per_px: 1 / (fx fy).
+
+    Returns:
+        The picture, a copy where it changed, and whether it did.
     """
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
@@ -93,7 +129,7 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
 
 @njit(cache=True)
 def _push_back(depth, labels, slot, cut):
-    """Make background of what lies farther than `cut` in a blob and at its border."""
+    """Make background of what lies farther than `cut` mm in a component and at its border."""
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if segment.is_animal_block(labels, i, j, slot):
@@ -125,13 +161,33 @@ def extract_one(
     n_blobs,
     k,
 ):
-    """Find the animal in frame k and fill row k of the batch; distance comes in as the floor's.
+    """Find the animal in one frame and fill its row of the batch.
+
     Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
     gets what comes next near.
 
-    behind_mm: 0 measures heights above the floor, else along the optical axis from so far behind
-    the mean depth. parts: what hangs together with the animal in the picture alone is told apart by
-    its depth, see `parted`.
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor.
+        area: the animal's usual area, mm^2, 0 while unknown.
+        n_things: candidates a frame, 1 or 2.
+        parts: whether what hangs together with the animal in the picture alone is told apart by its
+            depth, see `parted`.
+        smooth_mm: width over which heights are averaged, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        plane: (3,) the floor, 1 / z = a u + b v + c.
+        rotation: (3, 3) of T_view_camera.
+        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
+            behind the mean depth.
+        heights: (N, S, S) int16, 1/16 mm, out; N rows of the batch.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, picture pixels a crop pixel, out.
+        n_px: (N,) int64, pixels of the component, out.
+        moments: (N, N_MOMENTS), out.
+        distance: (N,) mm of the view's origin from the camera; comes in as the floor's.
+        n_blobs: (N,) int64, components of about the animal's area, out.
+        k: the frame's row.
     """
     labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
     blobs = np.empty((segment.MAX_BLOBS, 7))
@@ -192,8 +248,29 @@ def cut_crop(
     distance,
     k,
 ):
-    """The blob's height map, smoothed over about smooth_mm, and its moments, into row k;
-    distance[k] moves to behind the animal where heights are measured along the optical axis.
+    """The height map of one component, smoothed, and its moments, into row k of the batch.
+
+    The crop is a square around the component in steps of whole pixels. Where heights are measured
+    along the optical axis, distance[k] moves to behind_mm behind the animal.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        slot: the component.
+        blob: (7,) as `label_blobs` fills it.
+        mean_depth: of the component, mm.
+        smooth_mm: width over which heights are averaged, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        plane: (3,) the floor, 1 / z = a u + b v + c.
+        rotation: (3, 3) of T_view_camera.
+        behind_mm: 0 measures heights above the floor, else along the optical axis.
+        heights: (N, S, S) int16, 1/16 mm, out.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, picture pixels a crop pixel, out.
+        moments: (N, N_MOMENTS), out.
+        distance: (N,) mm of the view's origin from the camera.
+        k: the row.
     """
     crop = heights.shape[1]
     v0 = blob[1] * segment.BLOCK
@@ -250,6 +327,29 @@ def extract_all(
     distance,
     n_blobs,
 ):
+    """Find the animal in every frame of one camera and fill the batch, frames in parallel.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor.
+        area: the animal's usual area, mm^2, 0 while unknown.
+        n_things: candidates a frame; the batch has N = n_things n rows, best candidates first.
+        parts: whether layers far apart in depth are told apart, see `parted`.
+        smooth_mm: width over which heights are averaged, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        plane: (3,) the floor, 1 / z = a u + b v + c.
+        rotation: (3, 3) of T_view_camera.
+        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
+            behind the mean depth.
+        heights: (N, S, S) int16, 1/16 mm, out.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, picture pixels a crop pixel, out.
+        n_px: (N,) int64, pixels of the component, out.
+        moments: (N, N_MOMENTS), out.
+        distance: (N,) mm of the view's origin from the camera; comes in as the floor's.
+        n_blobs: (N,) int64, components of about the animal's area, out.
+    """
     for k in prange(depths.shape[0]):
         extract_one(
             depths[k],
@@ -294,6 +394,30 @@ def extract_windows(
     distance,
     n_blobs,
 ):
+    """Find the animal in patches of pictures from many cameras and fill the batch, in parallel.
+
+    The limit of each patch is its background, or the floor where that is unread, less its margin;
+    all of it counts as floor.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        background: (n, H, W) mm, 0 where unread.
+        margin: (n,) mm by which the animal stands out at least.
+        area: (n,) usual areas of the animals, mm^2.
+        n_things: candidates a patch; the batch has N = n_things n rows, best candidates first.
+        smooth_mm: (n,) widths over which heights are averaged, mm.
+        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the patches.
+        plane: (n, 3) the floors, 1 / z = a u + b v + c, in pixels of the patches.
+        rotation: (n, 3, 3) of T_view_camera.
+        behind_mm: (n,) 0 measures heights above the floor, else along the optical axis.
+        heights: (N, S, S) int16, 1/16 mm, out.
+        origin: (N, 2) int32 px, out.
+        n_steps: (N,) int32, pixels a crop pixel, out.
+        n_px: (N,) int64, pixels of the component, out.
+        moments: (N, N_MOMENTS), out.
+        distance: (N,) mm of the view's origin from the camera; comes in as the floor's.
+        n_blobs: (N,) int64, components of about the animal's area, out.
+    """
     for k in prange(depths.shape[0]):
         limit = np.empty(depths.shape[1:], np.float32)
         everywhere = np.ones(depths.shape[1:], np.bool_)

@@ -1,5 +1,16 @@
-"""The scene behind the animal, and the animal in front of it: background, floor, blob,
-height map.
+"""Background subtraction with a learned depth background, and choice of the animal's component.
+
+A pixel is foreground where its reading is nearer than
+
+    limit = background - max(min_height_mm, 3 spread),
+
+where `background` is the farthest mode of the pixel's readings over time and `spread` the standard
+deviation of that mode (see `background`); where no mode is known on the floor, the plane fitted to
+the floor takes over. Foreground pixels are joined to 8-connected components of 4 x 4 blocks; the
+animal is the component whose area comes nearest to the one that recurs in the most frames, and its
+height map and image moments are cut by the kernels (see `height_maps`). A part of the animal that
+kept still and so was absorbed into the background (the "sleeping person" problem) is found as a
+lump on the floor that the moving animal touches in nearly every frame.
 """
 
 from __future__ import annotations
@@ -16,12 +27,11 @@ from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.background import learn_background, sample_frames, stride_for
-from liex_lab.foreground.height_maps import CROP, Crops, Cutter, Windows
+from liex_lab.foreground.crop_camera import pack_crop_cameras
+from liex_lab.foreground.height_maps import HeightMaps, Segmenter
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.threads import threads
-
-__all__ = ["CROP", "Crops", "Scene", "Windows", "floor_region", "learn_background", "sample_frames"]
 
 Array = NDArray[np.float64]
 
@@ -29,21 +39,26 @@ SPREADS = 3.0  # an animal stands out by this many standard deviations of the ba
 # of the logarithms, from posture to posture of one animal
 _AREA_SD = 0.25
 _VOLUME_SD = 0.2
-_TOUCH_SHARE = (
-    0.9  # of the frames: a lump that the animal touches that often is a part of it that keeps still
-)
+# of the frames: a lump that the animal touches that often is a part of it that keeps still
+_TOUCH_SHARE = 0.9
 
 
 @dataclass(frozen=True)
-class Scene(Cutter):
-    """What the camera sees without the animal, and what nearer than that counts as the animal.
+class BackgroundSubtraction(Segmenter):
+    """The empty scene of one camera, and the depth nearer than which a reading is the animal.
 
-    background (H, W) mm; limit (H, W) mm: a reading below it is in front of the background;
-    on_floor (H, W): the floor, under which nothing lies, as far as the picture shows it: an animal
-    stands on it with at least a part of its body; area_mm2 and volume_mm3: the animal's usual area
-    seen from above and volume under its back, 0 while unknown; view: how such animals are looked
-    at; stride: only every so many-th row and column of the picture is looked at, and H, W count
-    those.
+    Attributes:
+        camera: the ideal pinhole camera of the recording.
+        floor: the floor plane in that camera's frame.
+        background: (H, W) float32 mm, depth of the empty scene, 0 where unknown.
+        limit: (H, W) float32 mm; a reading below it is in front of the background.
+        on_floor: (H, W) bool, the floor, under which nothing lies, as far as the picture shows it:
+            an animal stands on it with at least a part of its body.
+        area_mm2: the animal's usual area seen from above, mm^2; 0 while unknown.
+        volume_mm3: the animal's usual volume under its back, mm^3; 0 while unknown.
+        view: how such animals are looked at.
+        stride: only every so many-th row and column of the picture is looked at; H and W count
+            those.
     """
 
     camera: Camera
@@ -58,7 +73,7 @@ class Scene(Cutter):
 
     @cached_property
     def grid(self) -> Camera:
-        """The camera whose pixels are those that are looked at."""
+        """The camera whose pixels are looked at: every `stride`-th of the picture."""
         return self.camera.every(self.stride)
 
     @cached_property
@@ -69,11 +84,19 @@ class Scene(Cutter):
         return Floor.from_plane(self.floor.normal, self.floor.distance_mm, self.grid)
 
     @staticmethod
-    def from_floor(camera: Camera, floor: Floor, min_height_mm: float = 7.0) -> Scene:
-        """A scene of nothing but a known floor."""
+    def from_floor(
+        camera: Camera, floor: Floor, min_height_mm: float = 7.0
+    ) -> BackgroundSubtraction:
+        """A segmenter that knows nothing but the floor; the background is the bare plane.
+
+        Args:
+            camera: the ideal pinhole camera.
+            floor: the floor plane in its frame.
+            min_height_mm: what stands out from the floor by less is not the animal.
+        """
         bare = floor.depth(camera.width, camera.height)
         limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
-        return Scene(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
+        return BackgroundSubtraction(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
 
     @staticmethod
     def learn(
@@ -82,13 +105,31 @@ class Scene(Cutter):
         n_frames: int = 96,
         min_height_mm: float = 7.0,
         view: View = MOUSE_VIEW,
-    ) -> tuple[Scene, NDArray[np.float32]]:
-        """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was
-        learned.
+    ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
+        """The background subtraction of a recording, learned from frames spread over it.
 
         The background of a pixel is the farthest depth that keeps coming back, which survives an
         animal that covers it most of the time; where the animal never leaves its place the floor
-        plane takes over. spine_mm: the smallest and the largest animal to expect.
+        plane takes over. On the rims and walls around the floor, which flicker between near and
+        far, only what is nearer than the nearest usual depth counts. Where fewer than half of the
+        frames show an animal, it perhaps sits in its own background: then the floor plane itself is
+        tried as background, and kept if more frames show one.
+
+        Args:
+            recording: an ideal pinhole's recording, see `recordings.rectify`.
+            spine_mm: lengths of the smallest and the largest animal to expect, mm.
+            n_frames: frames that are sampled, at most.
+            min_height_mm: what stands out from the background by less is not the animal.
+            view: how such animals are looked at; one that does not stand on the floor may be
+                anywhere.
+
+        Returns:
+            The segmenter, and the sample (n, H, W) float32 mm of frames from which it was learned,
+            at its stride.
+
+        Raises:
+            EstimationError: no depth was read, nothing comes back often enough to be a background,
+                no floor was found, or nothing of an animal's size stands on it.
         """
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
@@ -111,7 +152,9 @@ class Scene(Cutter):
         limit = np.maximum(behind - margin, 0).astype(np.float32)
         stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
         over = on_floor if stands else np.ones_like(on_floor)
-        scene = Scene(recording.camera, floor, background, limit, over, view=view, stride=stride)
+        scene = BackgroundSubtraction(
+            recording.camera, floor, background, limit, over, view=view, stride=stride
+        )
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(
@@ -143,13 +186,20 @@ class Scene(Cutter):
         spine_mm: tuple[float, float],
         min_height_mm: float,
         area: float,
-    ) -> tuple[Scene, float]:
-        """The scene with the floor put under an animal that has left a part of itself in the
-        background.
+    ) -> tuple[BackgroundSubtraction, float]:
+        """The scene with the floor put under an animal that was partly taken for background.
 
-        Such a part is a lump on the floor that the moving animal of area mm^2 touches in (nearly)
-        every frame, and with which it is still no larger than an animal. Returns the animal's area,
-        too.
+        Such a part is a lump on the floor that the moving animal touches in (nearly, nine tenths
+        of) every frame, and together with which it is still no larger than an animal.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            spine_mm: lengths of the smallest and the largest animal to expect, mm.
+            min_height_mm: what stands out from the floor by less is not the animal.
+            area: area of the moving animal, mm^2.
+
+        Returns:
+            The scene, this one where there is no such lump, and the area mm^2 of the whole animal.
         """
         import cv2
 
@@ -185,10 +235,20 @@ class Scene(Cutter):
     def usual_area(
         self, depths: NDArray[np.float32], spine_mm: tuple[float, float]
     ) -> tuple[float, float]:
-        """The area mm^2 that the most frames have a blob of, and the share of frames that do.
+        """The area that most frames have a component of, and the share of frames that do.
 
         One object of constant size is in (nearly) every frame, the animal; other things come and go
-        or differ.
+        or differ. The mode of a kernel density over the logarithm of area, to which each frame adds
+        its nearest component with a Gaussian kernel of standard deviation 0.35.
+
+        Args:
+            depths: (n, H, W) float32 mm, frames at this scene's stride.
+            spine_mm: lengths of the smallest and the largest animal to expect, mm; they bound the
+                area.
+
+        Returns:
+            The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
+            of it; both 0 where no component has an animal's size.
         """
         areas = np.zeros((len(depths), MAX_BLOBS))
         bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
@@ -211,8 +271,12 @@ class Scene(Cutter):
         )
 
     def usual_volume(self, depths: NDArray[np.float32]) -> float:
-        """The median volume mm^3 of the animal in the frames (n, H, W) mm in which nothing else has
-        about its area.
+        """The animal's median volume, mm^3, over frames in which nothing else has about its area.
+
+        Where fewer than 5 frames are such, all frames in which it was found count.
+
+        Args:
+            depths: (n, H, W) float32 mm, frames at this scene's stride.
         """
         volume = np.zeros(len(depths))
         n_blobs = np.zeros(len(depths), np.int64)
@@ -223,8 +287,12 @@ class Scene(Cutter):
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
 
-    def every(self, step: int) -> Scene:
-        """The same with every `step`-th pixel along rows and columns."""
+    def every(self, step: int) -> BackgroundSubtraction:
+        """The same segmenter for pictures of every `step`-th row and column.
+
+        Args:
+            step: pixels from one to the next, at least 1.
+        """
         camera = self.camera.every(step)
         cut = (slice(None, None, step), slice(None, None, step))
         floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
@@ -237,9 +305,15 @@ class Scene(Cutter):
             on_floor=np.ascontiguousarray(self.on_floor[cut]),
         )
 
-    def misfit(self, crops: Crops) -> Array:
-        """How unlike the animal each crop (n) is in area and volume: the square of a number of
-        standard deviations.
+    def misfit(self, crops: HeightMaps) -> Array:
+        """How unlike the animal each height map (n,) is in size: squared standard deviations.
+
+        The sum of ((log a - log a0) / 0.25)^2 over area and ((log v - log v0) / 0.2)^2 over volume,
+        from posture to posture of one animal. An animal that swims or is held up is judged by its
+        area alone: what is below it is not its own.
+
+        Args:
+            crops: n height maps.
         """
         area = np.maximum(crops.moments[:, 1], 1.0)
         volume = np.maximum(crops.moments[:, 2], 1.0)
@@ -252,12 +326,22 @@ class Scene(Cutter):
         ) ** 2
 
     def view_rotation(self, camera_view: bool) -> Array:
-        """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame."""
+        """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame.
+
+        Args:
+            camera_view: whether heights are measured along the optical axis.
+        """
         return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
 
-    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels
-        of the picture.
+    def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The plane above which each height map is measured: the floor, or one behind the animal.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
         """
         if not camera_view:
             return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
@@ -265,25 +349,39 @@ class Scene(Cutter):
         level[:, 2] = 1.0 / crops.distance
         return level
 
-    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+    def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+        """
         middle = crops.centroid
         if camera_view:  # the view's frame is not the arena's
             middle[:, 2] -= crops.distance
             middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
         return middle
 
-    def looks(self, crops: Crops, camera_view: bool = False) -> Array:
-        """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the
-        crop.
+    def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The crop cameras of height maps.
+
+        Each says how its map was cut: intrinsics, T_view_camera, origin and step of the crop.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 17), packed as `CropCamera`.
         """
-        looks = np.empty((len(crops.step), 17))
-        looks[:, :4] = self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
-        looks[:, 4:13] = self.view_rotation(camera_view).ravel()
-        looks[:, 13] = crops.distance
-        looks[:, 14:16] = crops.origin
-        looks[:, 16] = crops.step
-        return looks
+        camera = self.camera
+        return pack_crop_cameras(
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            self.view_rotation(camera_view),
+            crops.distance,
+            crops.origin,
+            crops.step,
+        )
 
     def _extract(
         self,
@@ -292,15 +390,27 @@ class Scene(Cutter):
         parallel: bool,
         camera_view: bool,
         n_things: int,
-    ) -> Crops:
-        """See `Cutter`: the blobs whose areas are nearest to the animal's own. depths: whole
-        pictures, or a sample of them with the scene's own stride. camera_view: heights are measured
-        from the view's behind_mm behind the animal's mean depth, as the paper's features see them;
-        otherwise above the floor.
+    ) -> HeightMaps:
+        """Height maps of the components whose areas are nearest to the animal's own.
+
+        Heights are measured above the floor, or (camera_view) from the view's behind_mm behind the
+        animal's mean depth, as the paper's features see them.
+
+        Args:
+            depths: (n, H, W) float32 mm, whole pictures, or a sample of them with the scene's own
+                stride.
+            size: the animal's spine length over the skeleton's home length; scales the smoothing.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis.
+            n_things: candidates a frame, 1 or 2.
+
+        Returns:
+            The rows (n) of the likeliest components, and then (n_things 2) those of the next;
+            origin, step and n_px are in pixels of the whole picture.
         """
         if depths.shape[1:] != self.limit.shape:
             depths = depths[:, :: self.stride, :: self.stride]
-        crops = Crops.blank(n_things * len(depths), self.floor.distance_mm)
+        crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):
             kernels.extract_all(

@@ -1,5 +1,12 @@
-"""The hand in front of the camera: no background is known, but nothing is nearer, and an arm leads
-away from it.
+"""Segmentation of a hand in depth pictures by geodesic extrema: no background is known.
+
+Nothing is nearer to the camera than the hand, and an arm leads away from it. Each surface (a
+connected component of blocks whose depths differ by less than 50 mm) is walked from where it leaves
+the picture; where the geodesic distance has a maximum that stands out (its persistence) a hand may
+be. This is the idea of accumulative geodesic extrema (Plagemann et al., ICRA 2010; Baak et al.,
+ICCV 2011). Mean shift centres a sphere on such an end, what leaves the sphere is the arm, and the
+surface is cut a hand's length behind the fingertips. A score with weights learned by logistic
+regression chooses among the ends; see the kernels.
 """
 
 from __future__ import annotations
@@ -14,7 +21,8 @@ from liex_lab.body.skeleton import View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _hand_kernels as kernels
 from liex_lab.foreground.background import sample_frames
-from liex_lab.foreground.height_maps import CROP, Crops, Cutter, view_of
+from liex_lab.foreground.crop_camera import crop_columns, pack_crop_cameras, view_of
+from liex_lab.foreground.height_maps import CROP, HeightMaps, Segmenter
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.threads import threads
@@ -29,12 +37,20 @@ _VOLUME_SD = 0.45
 
 
 @dataclass(frozen=True)
-class NearestScene(Cutter):
-    """A scene in which the nearest thing is the hand; the same interface as `Scene`.
+class HandSegmenter(Segmenter):
+    """Segmentation of the hand in one camera's pictures.
 
-    floor: a plane across the optical axis behind the hand, which stands for the arena's: z points
-    at the camera. near_mm, far_mm: the range of depth in which a hand is looked for; area_mm2 and
-    volume_mm3: the hand's usual ones.
+    The same interface as that of `BackgroundSubtraction`.
+
+    Attributes:
+        camera: the ideal pinhole camera of the recording.
+        floor: a plane across the optical axis behind the hand, which stands for the arena's: z
+            points at the camera.
+        view: how hands are looked at.
+        near_mm: the least depth at which a hand is looked for.
+        far_mm: the largest depth at which a hand is looked for.
+        area_mm2: the hand's usual area as the camera sees it, mm^2; 0 while unknown.
+        volume_mm3: the hand's usual volume above its reference plane, mm^3; 0 while unknown.
     """
 
     camera: Camera
@@ -51,13 +67,24 @@ class NearestScene(Cutter):
         view: View,
         n_frames: int = 96,
         range_mm: tuple[float, float] = RANGE_MM,
-    ) -> tuple[NearestScene, NDArray[np.float32]]:
-        """The scene of a recording, and the sample (n, H, W) mm of its frames from which it was
-        learned.
+    ) -> tuple[HandSegmenter, NDArray[np.float32]]:
+        """The hand segmenter of a recording, with the hand's usual area, volume and depth.
+
+        Args:
+            recording: an ideal pinhole's recording, see `recordings.rectify`.
+            view: how hands are looked at.
+            n_frames: frames that are sampled, at most.
+            range_mm: least and largest depth at which a hand is looked for.
+
+        Returns:
+            The segmenter, and the sample (n, H, W) float32 mm of frames from which it was learned.
+
+        Raises:
+            EstimationError: nothing of a hand's size lies within the range.
         """
         sample = sample_frames(recording, n_frames)
         camera = recording.camera
-        scene = NearestScene(camera, Floor.from_plane(_FLAT, 1000.0, camera), view, *range_mm)
+        scene = HandSegmenter(camera, Floor.from_plane(_FLAT, 1000.0, camera), view, *range_mm)
         crops = scene.extract(sample, 1.0)
         if not crops.found.any():
             raise EstimationError(
@@ -74,9 +101,14 @@ class NearestScene(Cutter):
             volume_mm3=float(np.median(seen[:, 2])),
         ), sample
 
-    def misfit(self, crops: Crops) -> Array:
-        """How unlike the hand each crop (n) is in area and volume: the square of a number of
-        standard deviations.
+    def misfit(self, crops: HeightMaps) -> Array:
+        """How unlike the hand each height map (n,) is in size: squared standard deviations.
+
+        The sum of ((log a - log a0) / 0.45)^2 over area and of the same over volume, from posture
+        to posture of one hand.
+
+        Args:
+            crops: n height maps.
         """
         area = np.maximum(crops.moments[:, 1], 1.0)
         volume = np.maximum(crops.moments[:, 2], 1.0)
@@ -84,24 +116,44 @@ class NearestScene(Cutter):
             np.log(volume / self.volume_mm3) / _VOLUME_SD
         ) ** 2
 
-    def looks(self, crops: Crops, camera_view: bool = False) -> Array:
-        """How each height map was cut (n, 17): intrinsics, T_view_camera, origin and step of the
-        crop.
-        """
-        return looks_of(crops, self._intrinsics(len(crops.step)), camera_view)
+    def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The crop cameras of height maps.
 
-    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels
-        of the picture.
-        """
-        looks = self.looks(crops, camera_view)
-        planes = np.empty((len(looks), 3))
-        kernels.view_planes(looks, planes)
-        return planes
+        Each says how its map was cut: intrinsics, T_view_camera, origin and step of the crop.
 
-    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
-        T_camera_view = view_of(self.looks(crops, camera_view)).inverse()
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 17), packed as `CropCamera`.
+        """
+        return crop_cameras_of(crops, self._intrinsics(len(crops.step)), camera_view)
+
+    def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The plane above which each height map is measured, across its line of sight.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
+        """
+        camera = crop_columns(self.crop_cameras(crops, camera_view))
+        a = -camera.r20 / camera.fx / camera.distance
+        b = -camera.r21 / camera.fy / camera.distance
+        c = -camera.r22 / camera.distance - a * camera.cx - b * camera.cy
+        return np.stack([a, b, c], axis=-1)
+
+    def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+        """
+        T_camera_view = view_of(self.crop_cameras(crops, camera_view)).inverse()
         middle = (
             np.einsum("nij,nj->ni", T_camera_view.rotation, crops.centroid)
             + T_camera_view.translation
@@ -115,10 +167,21 @@ class NearestScene(Cutter):
         parallel: bool,
         camera_view: bool,
         n_things: int,
-    ) -> Crops:
-        """See `Cutter`: the nearest things of a hand's size. Heights are measured along the line of
-        sight through the middle of the crop, from behind_mm (at home size) behind the hand's
-        middle; camera_view: along the optical axis.
+    ) -> HeightMaps:
+        """Height maps of the likeliest hands; see `Segmenter`.
+
+        Heights are measured along the line of sight through the middle of the crop, from behind_mm
+        (at home size) behind the hand's middle; camera_view: along the optical axis.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            size: the hand's length over the skeleton's home length.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis.
+            n_things: candidates a frame, 1 or 2.
+
+        Returns:
+            The rows (n) of the likeliest hands, and then (n_things 2) those of the next.
         """
         n = len(depths)
         with threads(parallel):
@@ -132,8 +195,12 @@ class NearestScene(Cutter):
                 n_things,
             )
 
-    def every(self, step: int) -> NearestScene:
-        """The same with every `step`-th pixel along rows and columns."""
+    def every(self, step: int) -> HandSegmenter:
+        """The same segmenter for pictures of every `step`-th row and column.
+
+        Args:
+            step: pixels from one to the next, at least 1.
+        """
         camera = self.camera.every(step)
         return replace(
             self, camera=camera, floor=Floor.from_plane(_FLAT, self.floor.distance_mm, camera)
@@ -145,12 +212,14 @@ class NearestScene(Cutter):
 
 
 @dataclass(frozen=True)
-class NearestWindows:
-    """Parts of pictures from many cameras (n), each around one hand; the counterpart of
-    `crops.Windows`.
+class HandPatches:
+    """Patches of pictures from many cameras, each around one hand; the counterpart of `Patches`.
 
-    depth (n, H, W) mm, 0 = unread; intrinsics (n, 4) fx fy cx cy, pixels of the whole picture;
-    origin (n, 2) picture pixel of each window's first.
+    Attributes:
+        depth: (n, H, W) uint16 mm, 0 where unread.
+        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the whole picture.
+        origin: (n, 2) picture pixel (u, v) of each patch's first.
+        view: how hands are looked at.
     """
 
     depth: NDArray[np.uint16]
@@ -160,9 +229,17 @@ class NearestWindows:
 
     def extract(
         self, size: Array, camera_view: bool = False, n_things: int = 1
-    ) -> tuple[Crops, Array]:
-        """The hands and their looks (n, 17) in pixels of the windows; see `NearestScene`. n_things:
-        2 gives as many rows again, of what may be a hand as well.
+    ) -> tuple[HeightMaps, Array]:
+        """Height maps of the hands and their crop cameras; see `HandSegmenter`.
+
+        Args:
+            size: (n,) lengths of the hands over the home length.
+            camera_view: whether heights are measured along the optical axis.
+            n_things: 2 gives as many rows again, of what may be a hand as well.
+
+        Returns:
+            The height maps (n or 2 n), and their crop cameras (n or 2 n, 17) in pixels of the
+            patches.
         """
         intrinsics = self.intrinsics.copy()
         intrinsics[:, 2:] -= (
@@ -171,7 +248,7 @@ class NearestWindows:
         crops = cut_nearest(
             self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, n_things
         )
-        return crops, looks_of(crops, np.tile(intrinsics, (n_things, 1)), camera_view)
+        return crops, crop_cameras_of(crops, np.tile(intrinsics, (n_things, 1)), camera_view)
 
 
 def cut_nearest(
@@ -182,13 +259,25 @@ def cut_nearest(
     range_mm: tuple[float, float],
     camera_view: bool,
     n_things: int,
-) -> Crops:
-    """Height maps of the hands in pictures (n, H, W) mm; intrinsics (n, 4), size (n,). n_things: 2
-    gives as many rows again, of what may be a hand as well.
+) -> HeightMaps:
+    """Height maps of the hands in pictures.
 
     The long axis among the moments points away from the arm, where one is seen.
+
+    Args:
+        depths: (n, H, W) float32 or uint16 mm, 0 where unread.
+        intrinsics: (n, 4) fx, fy, cx, cy px of each picture.
+        size: (n,) lengths of the hands over the home length.
+        view: how hands are looked at; its lengths hold at home size.
+        range_mm: least and largest depth at which a hand is looked for.
+        camera_view: whether heights are measured along the optical axis, else along the line of
+            sight through the middle of the crop.
+        n_things: 2 gives as many rows again, of what may be a hand as well.
+
+    Returns:
+        n or 2 n height maps.
     """
-    crops = Crops.blank(n_things * len(depths), 1000.0)
+    crops = HeightMaps.blank(n_things * len(depths), 1000.0)
     kernels.extract_all(
         depths,
         *range_mm,
@@ -209,18 +298,27 @@ def cut_nearest(
     return crops
 
 
-def looks_of(crops: Crops, intrinsics: Array, camera_view: bool) -> Array:
-    """How each height map was cut (n, 17), for intrinsics (n, 4)."""
-    looks = np.empty((len(crops.step), 17))
-    kernels.fill_looks(
-        intrinsics, crops.origin, crops.step, crops.distance, CROP, camera_view, looks
-    )
-    return looks
+def crop_cameras_of(crops: HeightMaps, intrinsics: Array, camera_view: bool) -> Array:
+    """The crop cameras (n, 17) of height maps of hands, packed as `CropCamera`.
+
+    Args:
+        crops: n height maps.
+        intrinsics: (n, 4) fx, fy, cx, cy px of each picture.
+        camera_view: as they were extracted.
+    """
+    rotations = np.empty((len(crops.step), 3, 3))
+    kernels.fill_rotations(intrinsics, crops.origin, crops.step, CROP, camera_view, rotations)
+    return pack_crop_cameras(intrinsics, rotations, crops.distance, crops.origin, crops.step)
 
 
 def sight_rotations(p_camera: Array) -> Array:
-    """Rotations (n, 3, 3) of T_view_camera for lines of sight through points (n, 3), camera
-    frame.
+    """Rotations (n, 3, 3) of T_view_camera for lines of sight through points.
+
+    The view's z axis points from the point to the camera, its x axis lies as near as possible to
+    the camera's.
+
+    Args:
+        p_camera: (n, 3) points before the camera, in its frame; any unit.
     """
     rotations = np.empty((len(p_camera), 3, 3))
     for rotation, (x, y, z) in zip(rotations, p_camera, strict=True):

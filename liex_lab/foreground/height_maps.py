@@ -1,5 +1,15 @@
-"""Height maps of one animal, cut out of whole pictures (see `Scene`) or out of windows
-around it.
+"""Height maps of segmented animals: depth above a reference plane on a 96 x 96 crop, with moments.
+
+A segmenter (`BackgroundSubtraction` or `HandSegmenter`) finds the animal's connected component in
+whole pictures or in patches around it. Its pixels become heights above a plane by
+
+    h = distance (1 - z (a u + b v + c)),
+
+where 1 / z = a u + b v + c is the plane in a pinhole picture (inverse depth is linear in the
+pixel). The plane is the arena's floor, or (camera_view) one across the optical axis behind the
+animal, as the depth features of Lie-X see it. Area, volume, centroid and principal axes are the
+image moments of the map (Hu 1962), taken in mm in the view frame. How a map was cut is its crop
+camera, see `CropCamera`.
 """
 
 from __future__ import annotations
@@ -16,7 +26,7 @@ from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import N_MOMENTS
-from liex_lab.geometry import SE3
+from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.optics.camera import Camera
 
 Array = NDArray[np.float64]
@@ -25,17 +35,26 @@ CROP = 96  # pixels a side of a height map
 
 
 @dataclass(frozen=True)
-class Crops:
-    """Height maps of one animal, a batch (n), and how the animal's mass lies on the floor.
+class HeightMaps:
+    """Height maps of one animal in n frames, and how the animal's mass lies in the view frame.
 
-    heights (n, CROP, CROP) int16, 1/16 mm above the floor, 0 = not the animal; origin (n, 2)
-    picture pixel (u, v) of crop pixel (0, 0); step (n,) picture pixels a crop pixel; n_px (n,)
-    readings on the animal, 0 = not found; n_blobs (n,) how many things in the frame have about the
-    animal's size; moments (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, long-axis angle
-    rad (mod pi), the standard deviation mm along and across it, and (camera_view, else 0) the slope
-    of the back along it, all in the view frame. The view frame is the arena frame, or (camera_view)
-    an upright frame whose z axis is the optical axis backwards; its origin is `distance` (n,) mm in
-    front of the camera.
+    The view frame is the arena frame, or (camera_view) an upright frame whose z axis is the optical
+    axis backwards; of a hand without camera_view, its z axis runs backwards along the line of sight
+    through the middle of the crop. The origin of the view frame is `distance` mm in front of the
+    camera.
+
+    Attributes:
+        heights: (n, CROP, CROP) int16, 1/16 mm above the reference plane, 0 where it is not the
+            animal.
+        origin: (n, 2) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: (n,) int32, picture pixels a crop pixel.
+        n_px: (n,) int64, readings on the animal, 0 where it was not found.
+        moments: (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, angle of the long axis
+            rad (mod pi), the standard deviations mm along and across it, and (camera_view, else 0)
+            the slope of the back along it; all in the view frame. The axis of a hand points away
+            from its arm where one is seen.
+        distance: (n,) mm from the camera to the origin of the view frame.
+        n_blobs: (n,) int64, how many components of the frame have about the animal's size.
     """
 
     heights: NDArray[np.int16]
@@ -47,9 +66,14 @@ class Crops:
     n_blobs: NDArray[np.int64]
 
     @staticmethod
-    def blank(n: int, distance_mm: Array | float) -> Crops:
-        """A batch in which nothing is found yet."""
-        return Crops(
+    def blank(n: int, distance_mm: Array | float) -> HeightMaps:
+        """A batch of n empty height maps, in which nothing is found yet.
+
+        Args:
+            n: frames.
+            distance_mm: of the view frame's origin from the camera, one or (n,).
+        """
+        return HeightMaps(
             np.zeros((n, CROP, CROP), np.int16),
             np.zeros((n, 2), np.int32),
             np.ones(n, np.int32),
@@ -60,52 +84,66 @@ class Crops:
         )
 
     @staticmethod
-    def join(parts: Sequence[Crops]) -> Crops:
-        """Several batches as one."""
-        return Crops(
+    def join(parts: Sequence[HeightMaps]) -> HeightMaps:
+        """Several batches as one, in their order.
+
+        Args:
+            parts: at least one batch.
+        """
+        return HeightMaps(
             *(
                 np.concatenate([getattr(part, field.name) for part in parts])
-                for field in fields(Crops)
+                for field in fields(HeightMaps)
             )
         )
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Crops:
-        """Some crops out of a batch."""
-        return Crops(*(getattr(self, field.name)[index] for field in fields(self)))
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> HeightMaps:
+        """Some of the rows as a batch of their own.
 
-    def put(self, rows: NDArray[np.int64], other: Crops) -> None:
-        """Replace some rows by all of another batch."""
+        Args:
+            index: mask (n,), row numbers, or a slice.
+        """
+        return HeightMaps(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def put(self, rows: NDArray[np.int64], other: HeightMaps) -> None:
+        """Replace some rows, in place, by all rows of another batch.
+
+        Args:
+            rows: (m,) row numbers.
+            other: a batch of m rows.
+        """
         for field in fields(self):
             getattr(self, field.name)[rows] = getattr(other, field.name)
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """(n,) True where an animal is in view."""
+        """(n,) bool, True where an animal is in view."""
         return self.n_px > 0
 
     @property
     def centroid(self) -> Array:
-        """The middle (n, 3) mm of the animal's mass, at its mean height, in the view frame."""
+        """The centroid (n, 3) mm of the animal's mass, at its mean height, in the view frame."""
         moments = self.moments
         return np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
 
 
 class Foreground(Protocol):
-    """What finds the animal in the pictures of one camera: `foreground.Scene`, or
-    `nearest.NearestScene`.
+    """What finds the animal in the pictures of one camera.
+
+    The interface that `BackgroundSubtraction` and `HandSegmenter` share.
     """
 
     @property
     def camera(self) -> Camera:
-        """The camera that looks."""
+        """The ideal pinhole camera whose pictures are segmented."""
 
     @property
     def floor(self) -> Floor:
-        """Where heights of a recording's results are measured from."""
+        """The plane from which heights in a recording's results are measured."""
 
     @property
     def area_mm2(self) -> float:
-        """The animal's usual area seen by the camera."""
+        """The animal's usual area as the camera sees it, mm^2."""
 
     def extract(
         self,
@@ -113,8 +151,19 @@ class Foreground(Protocol):
         size: float,
         parallel: bool = True,
         camera_view: bool = False,
-    ) -> Crops:
-        """The animal of each frame (n, H, W) mm."""
+    ) -> HeightMaps:
+        """Height maps of the animal in each frame.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            size: the animal's spine length over the skeleton's home length.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis rather than above the
+                floor.
+
+        Returns:
+            One row for each frame.
+        """
 
     def extract_both(
         self,
@@ -122,33 +171,65 @@ class Foreground(Protocol):
         size: float,
         parallel: bool = True,
         camera_view: bool = False,
-    ) -> tuple[Crops, Crops]:
-        """The animal of each frame (n, H, W) mm, and what else may be it, found where n_blobs is
-        more than one.
+    ) -> tuple[HeightMaps, HeightMaps]:
+        """Height maps of the animal in each frame, and of the next thing that may be it.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            size: the animal's spine length over the skeleton's home length.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis rather than above the
+                floor.
+
+        Returns:
+            The best candidates (n rows), and the second best (n rows), found where `n_blobs` is
+            more than one.
         """
 
-    def looks(self, crops: Crops, camera_view: bool = False) -> Array:
-        """How each height map was cut (n, 17)."""
+    def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The crop cameras (n, 17) of height maps, packed as `CropCamera`.
 
-    def planes(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The plane (n, 3) above which each height map is measured: 1 / z = a u + b v + c in pixels
-        of the picture.
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
         """
 
-    def middles(self, crops: Crops, camera_view: bool = False) -> Array:
-        """The middle (n, 3) mm of what each crop shows, in the arena frame."""
+    def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The plane above which each height map is measured.
 
-    def misfit(self, crops: Crops) -> Array:
-        """How unlike the animal each crop (n) is."""
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
+        """
+
+    def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+        """
+
+    def misfit(self, crops: HeightMaps) -> Array:
+        """How unlike the animal each height map (n,) is in size: squared standard deviations.
+
+        Args:
+            crops: n height maps.
+        """
 
     def every(self, step: int) -> Foreground:
-        """The same with every `step`-th pixel along rows and columns."""
+        """The same segmenter for pictures of every `step`-th row and column.
+
+        Args:
+            step: pixels from one to the next, at least 1.
+        """
 
 
-class Cutter(ABC):
-    """What cuts the animal out of pictures, and what else may be it in the same pass; the part that
-    scenes share.
-    """
+class Segmenter(ABC):
+    """Base of the segmenters: the animal in each picture and, in one pass, the next candidate."""
 
     def extract(
         self,
@@ -156,9 +237,18 @@ class Cutter(ABC):
         size: float,
         parallel: bool = True,
         camera_view: bool = False,
-    ) -> Crops:
-        """The animal of each frame (n, H, W) mm; `size` is its spine over the skeleton's home
-        length. camera_view: heights are measured along the optical axis.
+    ) -> HeightMaps:
+        """Height maps of the animal in each frame.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            size: the animal's spine length over the skeleton's home length; scales the smoothing.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis, from behind the
+                animal.
+
+        Returns:
+            One row for each frame.
         """
         return self._extract(depths, size, parallel, camera_view, 1)
 
@@ -168,8 +258,20 @@ class Cutter(ABC):
         size: float,
         parallel: bool = True,
         camera_view: bool = False,
-    ) -> tuple[Crops, Crops]:
-        """`extract`, and the next thing that may be the animal after all."""
+    ) -> tuple[HeightMaps, HeightMaps]:
+        """Height maps of the animal in each frame, and of the next thing that may be it after all.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            size: the animal's spine length over the skeleton's home length; scales the smoothing.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis, from behind the
+                animal.
+
+        Returns:
+            The best candidates (n rows), and the second best (n rows), found where `n_blobs` is
+            more than one.
+        """
         crops = self._extract(depths, size, parallel, camera_view, 2)
         n = len(depths)
         return crops[:n], crops[n:]
@@ -182,24 +284,33 @@ class Cutter(ABC):
         parallel: bool,
         camera_view: bool,
         n_things: int,
-    ) -> Crops:
-        """The rows (n) of the most likely things, and then (n_things 2) those of the next."""
+    ) -> HeightMaps:
+        """Height maps of the likeliest component of each frame and, where asked, of the next.
 
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            size: the animal's spine length over the skeleton's home length.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis.
+            n_things: candidates a frame, 1 or 2.
 
-def view_of(looks: Array) -> SE3:
-    """T_view_camera (n) of looks (n, 17)."""
-    translation = np.zeros((len(looks), 3))
-    translation[:, 2] = looks[:, 13]
-    return SE3(looks[:, 4:13].reshape(-1, 3, 3), translation)
+        Returns:
+            The rows (n) of the likeliest components, and then (n_things 2) those of the next.
+        """
 
 
 @dataclass(frozen=True)
-class Windows:
-    """Parts of pictures from many cameras (n), each around one animal on a known floor.
+class Patches:
+    """Patches of pictures from many cameras, each around one animal on a known floor.
 
-    depth, background (n, H, W) mm, 0 = unread; intrinsics (n, 4) fx fy cx cy, pixels of the whole
-    picture; origin (n, 2) picture pixel of each window's first; inverse_depth (n, 3): 1 / z of the
-    floor = a u + b v + c in pixels of the whole picture; view: how such animals are looked at.
+    Attributes:
+        depth: (n, H, W) uint16 or float32 mm, 0 where unread.
+        background: (n, H, W) uint16 or float32 mm, 0 where unread: there the floor takes over.
+        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the whole picture.
+        origin: (n, 2) picture pixel (u, v) of each patch's first.
+        inverse_depth: (n, 3) a, b, c of the floor, 1 / z = a u + b v + c, per mm, in pixels of the
+            whole picture.
+        view: how such animals are looked at.
     """
 
     depth: NDArray[np.uint16] | NDArray[np.float32]
@@ -210,7 +321,11 @@ class Windows:
     view: View = MOUSE_VIEW
 
     def floor(self, k: int) -> Floor:
-        """The floor of window k."""
+        """The floor of one patch.
+
+        Args:
+            k: the patch.
+        """
         fx, fy, cx, cy = self.intrinsics[k]
         return Floor.from_inverse_depth(self.inverse_depth[k], Camera(fx, fy, cx, cy, 1, 1))
 
@@ -221,10 +336,23 @@ class Windows:
         min_height_mm: Array | float = 7.0,
         camera_view: bool = False,
         n_things: int = 1,
-    ) -> tuple[Crops, Array]:
-        """The blob of each window whose area is nearest to area_mm2 (n,), and its looks (n, 17);
-        see `Scene.extract` and `Scene.looks`. size (n,) of the animals over home; min_height_mm:
-        one, or (n,); n_things: 2 gives as many rows again, of what is next near.
+    ) -> tuple[HeightMaps, Array]:
+        """Height maps of the component of each patch whose area is nearest to the animal's.
+
+        Background subtraction as in `BackgroundSubtraction`, but every pixel counts as floor, and
+        the background is given.
+
+        Args:
+            size: (n,) spine lengths of the animals over the home length.
+            area_mm2: (n,) usual areas of the animals.
+            min_height_mm: what is nearer than the background by less is not the animal; one or
+                (n,).
+            camera_view: whether heights are measured along the optical axis.
+            n_things: 2 gives as many rows again, those of the next nearest components.
+
+        Returns:
+            The height maps (n or 2 n), and their crop cameras (n or 2 n, 17) in pixels of the
+            patches.
         """
         n = len(self.depth)
         distance = np.empty(n)
@@ -245,7 +373,7 @@ class Windows:
             rotation[k] = (
                 np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
             )
-        crops = Crops.blank(n_things * n, np.tile(distance, n_things))
+        crops = HeightMaps.blank(n_things * n, np.tile(distance, n_things))
         kernels.extract_windows(
             self.depth,
             self.background,
@@ -265,8 +393,11 @@ class Windows:
             crops.distance,
             crops.n_blobs,
         )
-        cut = np.tile(np.concatenate([intrinsics, rotation.reshape(n, 9)], axis=1), (n_things, 1))
-        looks = np.concatenate(
-            [cut, crops.distance[:, None], crops.origin, crops.step[:, None]], axis=1
+        packed = pack_crop_cameras(
+            np.tile(intrinsics, (n_things, 1)),
+            np.tile(rotation, (n_things, 1, 1)),
+            crops.distance,
+            crops.origin,
+            crops.step,
         )
-        return crops, looks
+        return crops, packed

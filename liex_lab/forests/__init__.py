@@ -1,3 +1,1 @@
-"""Regression forests on pose-indexed depth features (Lie-X section 4.4): what a tree is, and how it
-is grown.
-"""
+"""Random regression forests on pose-indexed depth features (Lie-X section 4.4)."""

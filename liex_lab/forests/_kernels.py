@@ -1,4 +1,8 @@
-"""Numba kernels of the forests: one probe, one test, one descent.
+"""Numba kernels of the forests: pose-indexed depth features, binary tests, descent of a tree.
+
+The feature is Lie-X Eq. 15, phi = depth(Proj(x + g(u))) - depth(Proj(x + g(v))), for offsets u, v
+that turn with the joint's frame g; it extends the two-point depth features of Shotton et al.
+(2013). Depth is read from a height map, and the projection is linearised at the joint.
 
 A node is four int32, 16 bytes, one quarter of a cache line:
     word 0: u_x, u_y, u_z, v_x as int8, lowest byte first
@@ -12,9 +16,9 @@ Tests compare a response with the threshold and go right when it is at least as 
     SCALAR      a number that describes the whole animal from the joint's point of view
 Heights are 1/16 mm of an animal of home size, so one forest serves animals of every size.
 
-A view, 9 float32, is how a joint of a candidate pose looks onto a height map: crop pixel (column,
-row) of the joint, a 2x3 matrix from offsets (1/127 of the reach, in the joint's frame) to crop
-pixels, and the joint's own height.
+A view, 9 float32, is the linearised projection of a joint of a candidate pose into a height map:
+crop pixel (column, row) of the joint, a 2x3 matrix from offsets (1/127 of the reach, in the joint's
+frame) to crop pixels, and the joint's own height.
 """
 
 from __future__ import annotations
@@ -30,11 +34,20 @@ VIEW = 9
 
 @njit(cache=True, inline="always")
 def probe(heights, view, a, b, c):
-    """Height in the map (S, S) under offset (a, b, c); a probe outside reads the border, which is
-    background.
+    """Read the height map under an offset from a joint.
 
-    In float32, and in this order, as `_walk` has it: a forest then sees the same wherever it is
-    asked.
+    A probe outside the map reads its border, which is background. The arithmetic is float32, and in
+    this order, as in `_walk`: a forest then gives the same answer wherever it is asked.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm.
+        view: (9,) float32 linearised projection of the joint.
+        a: x component of the offset, -127..127, in 1/127 of the reach, in the joint's frame.
+        b: y component of the offset.
+        c: z component of the offset.
+
+    Returns:
+        The height, int16.
     """
     limit = heights.shape[0] - 1
     x = np.float32(a)
@@ -50,15 +63,25 @@ def probe(heights, view, a, b, c):
 
 @njit(cache=True, inline="always")
 def byte(word, index):
-    """Signed byte `index` of an int32."""
+    """Signed byte `index` (0 is the lowest) of the int32 `word`."""
     return (((word >> (8 * index)) & 0xFF) ^ 0x80) - 0x80
 
 
 @njit(cache=True, inline="always")
 def response(heights, inverse_size, views, scalars, word0, word1, word3):
-    """The number that a test compares with its threshold, for one sample.
+    """Response of one sample to a test: the number that is compared with the threshold.
 
-    heights (S, S) int16; views (V, 9); scalars (n,); words 0, 1 and 3 of a node.
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm.
+        inverse_size: home size over the animal's size.
+        views: (V, 9) float32 linearised projections of the sample's joints.
+        scalars: (n,) float32 numbers that describe the animal.
+        word0: word 0 of the node.
+        word1: word 1 of the node.
+        word3: word 3 of the node.
+
+    Returns:
+        The response, 1/16 mm at home size for tests on heights.
     """
     kind = word3 & 3
     channel = word3 >> 2
@@ -75,7 +98,19 @@ def response(heights, inverse_size, views, scalars, word0, word1, word3):
 
 @njit(cache=True, inline="always")
 def descend(nodes, root, heights, inverse_size, views, scalars):
-    """The leaf that a sample reaches in the tree at `root`."""
+    """Descend one tree with one sample.
+
+    Args:
+        nodes: (N, 4) int32 packed nodes.
+        root: index of the tree's root.
+        heights: (S, S) int16 height map, 1/16 mm.
+        inverse_size: home size over the animal's size.
+        views: (V, 9) float32 linearised projections of the sample's joints.
+        scalars: (n,) float32 numbers that describe the animal.
+
+    Returns:
+        Number of the leaf that the sample reaches.
+    """
     at = root
     child = nodes[at, 2]
     while child >= 0:
@@ -89,7 +124,16 @@ def descend(nodes, root, heights, inverse_size, views, scalars):
 
 @njit(cache=True, inline="always")
 def pack_offsets(u, v, threshold):
-    """Words 0 and 1 of a node from two offsets (3,) of -127..127 and an int16 threshold."""
+    """Pack two offsets and a threshold into words 0 and 1 of a node.
+
+    Args:
+        u: (3,) integer offset of the first probe, -127..127.
+        v: (3,) integer offset of the second probe, -127..127.
+        threshold: the threshold, int16.
+
+    Returns:
+        The two words, int32.
+    """
     word0 = (
         (np.int32(u[0]) & 0xFF)
         | ((np.int32(u[1]) & 0xFF) << 8)
@@ -106,7 +150,7 @@ def pack_offsets(u, v, threshold):
 
 @njit(cache=True, inline="always")
 def next_random(state):
-    """The next 64 random bits of a splitmix64 sequence whose state is `state` (1,) uint64."""
+    """The next 64 random bits of a splitmix64 sequence; `state` (1,) uint64 is advanced."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
     z = state[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -116,17 +160,22 @@ def next_random(state):
 
 @njit(cache=True, inline="always")
 def random_below(state, n):
-    """A random integer of 0 .. n - 1."""
+    """A random integer of 0 .. n - 1 from the splitmix64 sequence `state` (1,)."""
     return np.int64((next_random(state) >> np.uint64(33)) % np.uint64(n))
 
 
 @njit(cache=True)
 def number_nodes(is_leaf, starts, nodes):
-    """Child pointers of trees, in the order in which growth made them, into word 2 of `nodes` (n,
-    4).
+    """Write the child pointers of trees into word 2 of their nodes, in the order of their growth.
 
-    is_leaf (n,); starts (trees + 1,): where each tree's nodes begin, and the end. A tree's children
-    are appended as a pair when their parent splits, the left side of the stack first.
+    A tree's children are appended as a pair when their parent splits, the left side of the stack
+    first, so the pointers follow from which nodes are leaves. Leaves are numbered in the same
+    order.
+
+    Args:
+        is_leaf: (n,) bool.
+        starts: (trees + 1,) where each tree's nodes begin, and the end of the last.
+        nodes: (n, 4) int32, word 2 of which is filled.
     """
     leaf = 0
     stack = np.empty(is_leaf.size + 1, np.int64)

@@ -1,4 +1,4 @@
-"""Sixteen samples down one tree together, in vector registers: the fast twin of `_kernels.descend`.
+"""SIMD descent of regression trees, sixteen samples at once: the fast twin of `_kernels.descend`.
 
 A test has no branch here: both probes are read, and a selection picks what the node's kind asks
 for. That alone is twice as fast as branching, which the processor cannot foresee; sixteen lanes
@@ -37,11 +37,12 @@ def _same(type_: str, value: object) -> str:
 
 
 def _mask(indices: list[int]) -> str:
+    """A shuffle mask of the given indices, as LLVM text."""
     return f"<{len(indices)} x i32> <" + ", ".join(f"i32 {i}" for i in indices) + ">"
 
 
 class _Text:
-    """Lines of LLVM code under way."""
+    """Lines of LLVM code under construction; a call appends one."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -184,13 +185,21 @@ def _load_views(text: _Text) -> None:
 
 
 def _middle(text: _Text) -> None:
+    """%middle_u and %middle_v: the joint's crop pixel plus one half, for rounding."""
     for c, axis in ((0, "u"), (1, "v")):
         text(f"%middle_{axis} = fadd {_FLOATS} %view{c}, {_same('float', '0.5')}")
 
 
 def llvm_text(name: str, several: bool) -> str:
-    """The function as LLVM code; several: nodes choose among the samples' views, else there is one
-    view.
+    """The descent as an LLVM module in text form.
+
+    Args:
+        name: name of the function to define.
+        several: nodes choose among the samples' views (n, V, 9); otherwise each sample has one
+            view, laid out (9, n).
+
+    Returns:
+        The module's text, with one function that `_emit` links and calls.
     """
     text = _Text()
     text.spread("start", "i32", "%root")
@@ -270,7 +279,7 @@ def llvm_text(name: str, several: bool) -> str:
 
 
 def _emit(name: str, several: bool) -> Any:
-    """The code generator of an intrinsic that calls the function."""
+    """The code generator of an intrinsic that links and calls the function of `llvm_text`."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         library = context.codegen().create_library(name)
@@ -318,10 +327,23 @@ def walk_one_view(
     leaf: Any,
     first: Any,
 ) -> Any:
-    """Leaves of lanes first .. first + LANES - 1 in the tree at `root`, into leaf (n,) int32.
+    """Descend one tree with LANES samples of one view each.
 
-    nodes (N, 4) int32; inverse (n,) float32 home size over the animal's; views (9, n) float32 and
-    stride n; side of the height maps in pixels. Arrays are contiguous; nothing is checked.
+    Arrays are contiguous; nothing is checked.
+
+    Args:
+        typing: numba's typing context.
+        nodes: (N, 4) int32 packed nodes, see `_kernels`.
+        root: index of the tree's root.
+        pixels: int16 height maps, and behind them the samples' scalars.
+        base: (n,) int32 where each sample's height map begins in pixels.
+        scalar_base: (n,) int32 where each sample's scalars begin in pixels.
+        inverse: (n,) float32 home size over the animal's size.
+        views: (9, n) float32 linearised projections.
+        stride: n, the length of a row of views.
+        side: side of the height maps, pixels.
+        leaf: (n,) int32; lanes first .. first + LANES - 1 are filled with the leaf they reach.
+        first: the first of the LANES lanes.
     """
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_one_view", False)
@@ -342,8 +364,23 @@ def walk_views(
     leaf: Any,
     first: Any,
 ) -> Any:
-    """`walk_one_view` for nodes that choose among the views (n, V, 9) of a sample; stride
-    is 9 V.
+    """Descend one tree with LANES samples, whose nodes choose among several views of a sample.
+
+    Arrays are contiguous; nothing is checked.
+
+    Args:
+        typing: numba's typing context.
+        nodes: (N, 4) int32 packed nodes, see `_kernels`.
+        root: index of the tree's root.
+        pixels: int16 height maps, and behind them the samples' scalars.
+        base: (n,) int32 where each sample's height map begins in pixels.
+        scalar_base: (n,) int32 where each sample's scalars begin in pixels.
+        inverse: (n,) float32 home size over the animal's size.
+        views: (n, V, 9) float32 linearised projections.
+        stride: 9 V, the length of a sample's views.
+        side: side of the height maps, pixels.
+        leaf: (n,) int32; lanes first .. first + LANES - 1 are filled with the leaf they reach.
+        first: the first of the LANES lanes.
     """
     arguments = (nodes, root, pixels, base, scalar_base, inverse, views, stride, side, leaf, first)
     return types.void(*arguments), _emit("liex_walk_views", True)

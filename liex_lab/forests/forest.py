@@ -1,4 +1,14 @@
-"""A forest: all its trees in one packed array, and what it predicts."""
+"""Random regression forest: all trees in one packed node array, and its prediction.
+
+Lie-X section 4.4 (Breiman 2001; Criminisi and Shotton 2013). A sample descends every tree by binary
+tests on pose-indexed depth features; each leaf stores the mean label of its training samples, and
+the forest predicts the mean over trees,
+
+    y(x) = 1/T sum_t leaf_t(x).
+
+The paper takes the mean-shift mode of the trees' votes instead; that is done where the votes are
+used (`estimation._cascade_kernels.mode_of_votes`).
+"""
 
 from __future__ import annotations
 
@@ -15,8 +25,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Forest:
-    """Trees on pose-indexed tests. nodes (n, 4) int32, see `_kernels`; roots (T,); leaves
-    (n_leaves, D) float32.
+    """Regression trees on pose-indexed tests, packed in one node array.
+
+    Attributes:
+        nodes: (n, 4) int32 packed nodes, see `_kernels`.
+        roots: (T,) int32 index of each tree's root among the nodes.
+        leaves: (n_leaves, D) float32 value of each leaf.
     """
 
     nodes: NDArray[np.int32]
@@ -30,14 +44,28 @@ class Forest:
 
     @staticmethod
     def pack(trees: list[tuple[NDArray[np.int32], NDArray[np.float32]]]) -> Forest:
-        """One forest from trees given as (nodes, leaves), each with its root at 0."""
+        """Pack trees into one forest.
+
+        Args:
+            trees: (nodes, leaves) of each tree, with its root at node 0 and its own leaf numbers.
+
+        Returns:
+            The forest; child pointers and leaf numbers are shifted to its arrays.
+        """
         return Forest.join(
             [Forest(nodes, np.zeros(1, np.int32), leaves) for nodes, leaves in trees]
         )
 
     @staticmethod
     def join(forests: list[Forest]) -> Forest:
-        """One forest of all the trees of several."""
+        """Join several forests into one of all their trees.
+
+        Args:
+            forests: forests whose leaves have equally many values.
+
+        Returns:
+            The forest; its prediction is the mean over all the trees.
+        """
         nodes = []
         roots = []
         leaves = []
@@ -61,9 +89,12 @@ class Forest:
 class Samples:
     """What a forest is trained on or asked about: n samples on a set of height maps.
 
-    heights (n_images, S, S) int16; image (n,) int32 index of each sample's map; inverse_size (n,)
-    float32 home size over the animal's size; views (n, V, 9) float32; scalars (n, n_scalars)
-    float32.
+    Attributes:
+        heights: (n_images, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        image: (n,) int32 index of each sample's height map.
+        inverse_size: (n,) float32 home size over the animal's size.
+        views: (n, V, 9) float32 linearised projections of the sample's V joints, see `_kernels`.
+        scalars: (n, n_scalars) float32 numbers that describe the whole animal.
     """
 
     heights: NDArray[np.int16]
@@ -73,10 +104,15 @@ class Samples:
     scalars: NDArray[np.float32]
 
     def __len__(self) -> int:
+        """Number of samples."""
         return len(self.image)
 
     def __getitem__(self, index: NDArray[np.int64]) -> Samples:
-        """Some of the samples, on the same maps."""
+        """Select samples; the height maps stay the same.
+
+        Args:
+            index: (m,) rows to take.
+        """
         return Samples(
             self.heights,
             self.image[index],
@@ -87,7 +123,11 @@ class Samples:
 
     @staticmethod
     def join(parts: list[Samples]) -> Samples:
-        """The samples of several sets on the same maps, one after the other."""
+        """Concatenate several sets of samples on the same height maps.
+
+        Args:
+            parts: the sets, in order; the height maps of the first are taken.
+        """
         fields = ("image", "inverse_size", "views", "scalars")
         return Samples(
             parts[0].heights,
@@ -98,10 +138,17 @@ class Samples:
 def predict(
     forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float32]:
-    """Mean leaf value (n, D) of each sample.
+    """Mean leaf value of each sample.
 
-    in_bag (T, n_images): trees that have seen a sample's image are left out, unless all have
-    (METHOD lesson 6).
+    Args:
+        forest: the forest to ask.
+        samples: n samples.
+        in_bag: (T, n_images) bool, which images each tree was grown on. Trees that were grown on a
+            sample's image are left out (out-of-bag prediction), unless all of them were (METHOD
+            lesson 6); None asks all trees.
+
+    Returns:
+        (n, D) float32 predictions.
     """
     out = np.zeros((len(samples), forest.leaves.shape[1]), np.float32)
     bag = np.zeros((forest.n_trees, 1), np.bool_) if in_bag is None else in_bag
@@ -121,7 +168,15 @@ def predict(
 
 
 def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
-    """Every tree's own leaf value (n, T, D) of each sample."""
+    """Leaf value of each tree for each sample.
+
+    Args:
+        forest: the forest to ask.
+        samples: n samples.
+
+    Returns:
+        (n, T, D) float32, the votes of the single trees.
+    """
     out = np.empty((len(samples), forest.n_trees, forest.leaves.shape[1]), np.float32)
     _predict_each(
         forest.nodes,

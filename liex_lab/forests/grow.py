@@ -1,4 +1,15 @@
-"""How a forest is grown: which tests a node tries, and which one it keeps (Lie-X Eq. 16 and 17)."""
+"""Growth of regression trees by variance reduction, and stochastic gradient boosting of them.
+
+Lie-X section 4.4, Eq. 16 and 17. At each node m random tests with evenly spread thresholds are
+tried, and the one with the largest gain is kept:
+
+    I = E(S) - |S_l|/|S| E(S_l) - |S_r|/|S| E(S_r),   E(S) = 1/|S| sum_i |y_i - mean(S)|^2
+
+(plain variance reduction; the paper's E is a sum). All tests are ranked on a small subsample of the
+node, and the best few again on a larger one. Bagging is by image, without replacement (METHOD
+lesson 6). `boost_forest` grows pairs of trees on the residuals of those before them (Friedman,
+Stochastic gradient boosting, 2002).
+"""
 
 from __future__ import annotations
 
@@ -29,11 +40,22 @@ _N_KEPT = 12
 
 @dataclass(frozen=True)
 class GrowthPlan:
-    """How trees grow. Shares are of the tests tried at a node; the rest compare two probes.
+    """How trees are grown.
 
-    depth_share: how far offsets reach along the joint's z axis, of their reach across; bag_share:
-    share of the images that a tree sees, drawn without replacement, all samples of an image
-    together (1: every tree sees all).
+    Shares are of the tests that are tried at a node; the rest compare two probes (Eq. 15).
+
+    Attributes:
+        n_trees: number of trees.
+        max_depth: deepest level of a leaf, the root being 0.
+        min_leaf: fewest samples of a leaf.
+        n_tests: random tests that are tried at a node of 128 samples or more; fewer at smaller
+            ones.
+        one_probe_share: share of tests that compare one probe with the joint's own height.
+        scalar_share: share of tests on a number that describes the whole animal.
+        depth_share: how far offsets reach along the joint's z axis, relative to their reach across
+            it.
+        bag_share: share of the images that a tree sees, drawn without replacement, all samples of
+            an image together (1: every tree sees all).
     """
 
     n_trees: int
@@ -53,10 +75,20 @@ def grow_forest(
     plan: GrowthPlan,
     rng: np.random.Generator,
 ) -> tuple[Forest, NDArray[np.bool_]]:
-    """A forest for labels (n, D) of the kept samples, and which images each tree saw (T, n_images).
+    """Grow a bagged regression forest.
 
-    Trees grow in parallel from seeds drawn here, so the forest does not depend on the number of
-    threads.
+    Trees grow in parallel from seeds that are drawn here, so the forest does not depend on the
+    number of threads.
+
+    Args:
+        samples: n samples with their features.
+        labels: (n, D) float32 labels; one unit weighs the same in every component.
+        keep: (n,) bool, the samples to learn from.
+        plan: size of the forest and its tests.
+        rng: source of the bags and of the trees' seeds.
+
+    Returns:
+        The forest, and (T, n_images) bool, which images each tree was grown on.
     """
     n_images = len(samples.heights)
     in_bag = np.zeros((plan.n_trees, n_images), np.bool_)
@@ -104,12 +136,21 @@ def boost_forest(
     shrinkage: float,
     rng: np.random.Generator,
 ) -> Forest:
-    """A forest whose trees correct one another: each pair is grown on what the pairs before it left
-    of labels (n, D).
+    """Grow a forest by stochastic gradient boosting of the squared error.
 
-    Stochastic gradient boosting of squared error (Friedman 2002) with two trees a stage, grown in
-    parallel on different images. Leaves are scaled so that the mean over trees, which is how every
-    forest predicts, is the boosted sum.
+    Each pair of trees is grown in parallel, on different bags of images, on the residuals that the
+    pairs before it left (Friedman 2002, with two trees a stage). Leaves are scaled so that the mean
+    over trees, which is how every forest predicts, is the boosted sum.
+
+    Args:
+        samples: n samples with their features; all are learned from.
+        labels: (n, D) float32 labels.
+        plan: size of the forest; n_trees counts all stages.
+        shrinkage: share of a pair's prediction that is taken off the residuals, in (0, 1].
+        rng: source of the bags and of the trees' seeds.
+
+    Returns:
+        The forest of all stages.
     """
     mean = labels.mean(axis=0)
     left = (labels - mean).astype(np.float32)
@@ -148,6 +189,7 @@ def _grow_all(
     leaves,
     counts,
 ):
+    """Grow all trees in parallel: tree t on the samples order[starts[t] : starts[t + 1]]."""
     for t in prange(seeds.size):
         _grow_tree(
             heights,
@@ -194,11 +236,19 @@ def _draw_test(state, n_views, n_scalars, one_probe_share, scalar_share, depth_s
 
 @njit(cache=True)
 def _best_threshold(values, n, chosen, labels, min_share, sums, result):
-    """Best of evenly spread thresholds for responses values (n,) of samples `chosen`: gain and it,
-    into result (2,).
+    """Best of evenly spread thresholds for the responses of a node's samples: gain and threshold.
 
     Plain variance reduction (Eq. 16 with Eq. 17 as a mean): up to a constant, |sum_left|^2 / n_left
-    + the same right.
+    + |sum_right|^2 / n_right.
+
+    Args:
+        values: (n,) responses of the samples to a test, the first n of which count.
+        n: number of samples.
+        chosen: (n,) rows of the samples in labels.
+        labels: (N, D) labels of all samples.
+        min_share: smallest share of the samples that may go to one side.
+        sums: (thresholds + 1, D + 1) scratch: running sums of labels and counts.
+        result: (2,) filled with the gain, -1 where there is none, and the threshold.
     """
     result[0] = -1.0
     result[1] = 0.0
@@ -240,7 +290,7 @@ def _best_threshold(values, n, chosen, labels, min_share, sums, result):
 
 @njit(cache=True)
 def _look(heights, image, inverse_size, views, scalars, chosen, n, test, values):
-    """Responses of samples `chosen` (n,) to a test into `values`."""
+    """Compute the responses of the samples `chosen` (n,) to a test into `values`."""
     for i in range(n):
         s = chosen[i]
         values[i] = response(
@@ -268,8 +318,11 @@ def _find_split(
     sums,
     best,
 ):
-    """The test that a node keeps into best (4,): words 0, 1, 3 and the threshold. False when none
-    separates it.
+    """Find the test that a node keeps.
+
+    All tests are ranked on at most 96 of the node's samples, the best 12 of them again on at most
+    1500. Writes words 0, 1 and 3 of the node and the threshold into best (4,); returns False when
+    no test separates the samples.
     """
     n = members.size
     n_tried = n_tests if n >= 128 else min(n_tests, max(20, n_tests * n // 128))
@@ -316,7 +369,7 @@ def _find_split(
 
 @njit(cache=True)
 def _part(heights, image, inverse_size, views, scalars, members, best):
-    """Order `members` so that those going left come first; how many do."""
+    """Partition `members` in place so that those that go left come first; returns how many do."""
     left = 0
     right = members.size - 1
     while left <= right:
@@ -352,8 +405,9 @@ def _grow_tree(
     leaves,
     counts,
 ):
-    """Grow one tree on `members` into nodes and leaves; counts (2,) gets how many of each there
-    are.
+    """Grow one tree on the samples `members` into nodes and leaves, depth first.
+
+    counts (2,) gets how many nodes and leaves there are. `members` is reordered.
     """
     state = np.empty(1, np.uint64)
     state[0] = seed

@@ -1,5 +1,6 @@
-"""Rigid motion: SO(3), SE(3), geodesics and Brownian motion. Twists are (omega, nu): radians, then
-millimetres.
+"""Lie groups of rigid motion: SO(3), SE(3), geodesics and Brownian motion (Lie-X section 3).
+
+Twists are (omega, nu): radians, then millimetres.
 """
 
 from liex_lab.geometry.brownian import brownian_path, brownian_steps

@@ -1,4 +1,10 @@
-"""Left-invariant Brownian motion on SE(3) (Lie-X Eq. 6 and 7)."""
+"""Left-invariant Brownian motion on SE(3) (Lie-X Eq. 6 and 7).
+
+With z_k ~ N(0, covariance) in the tangent space and step length delta,
+
+    g((k + 1) delta) = g(k delta) exp(sqrt(delta) z_k)                            (Eq. 6)
+    g(t) = g(k delta) exp((t - k delta) / sqrt(delta) z_k) between the steps      (Eq. 7)
+"""
 
 from __future__ import annotations
 
@@ -11,8 +17,16 @@ from liex_lab.geometry.se3 import SE3
 def brownian_steps(
     rng: np.random.Generator, covariance: ArrayLike, n_steps: int, *batch: int
 ) -> NDArray[np.float64]:
-    """Tangent steps z_k ~ N(0, covariance) (*batch, n_steps, 6) for a covariance (6, 6) in rad and
-    mm.
+    """Tangent steps z_k ~ N(0, covariance).
+
+    Args:
+        rng: where chance comes from.
+        covariance: (6, 6) in rad and mm, for one unit of time.
+        n_steps: steps of one path.
+        *batch: shape of the batch of paths.
+
+    Returns:
+        (*batch, n_steps, 6) rad and mm.
     """
     return rng.multivariate_normal(
         np.zeros(6), np.asarray(covariance, float), size=(*batch, n_steps)
@@ -20,13 +34,19 @@ def brownian_steps(
 
 
 def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) -> SE3:
-    """The path g(t) from `start` at the given times (n,), as a batch (n,).
+    """The path g(t) from `start` at given times, by Lie-X Eq. 6 and 7.
 
-    g((k+1) delta) = g(k delta) exp(sqrt(delta) z_k) (Eq. 6); between the steps g(t) = g(k delta)
-    exp((t - k delta) / sqrt(delta) z_k) (Eq. 7).
+    Args:
+        start: one element, g(0).
+        steps: (n_steps, 6) tangent steps z.
+        delta: step length, s.
+        times: (n,) s, in [0, n_steps * delta].
 
-    steps: tangent steps z (n_steps, 6); delta: step length in s; times: seconds in [0, n_steps *
-    delta].
+    Returns:
+        A batch (n,).
+
+    Raises:
+        ValueError: a time outside the path, or a delta that is not positive.
     """
     z = np.asarray(steps, float)
     t = np.atleast_1d(np.asarray(times, float))

@@ -1,5 +1,14 @@
-"""The group SE(3) of rigid motions: one element or a batch, with the formulas of Lie-X
-section 3.
+"""The Lie group SE(3) of rigid motions: exponential, logarithm, adjoint, geodesics.
+
+The formulas of Lie-X section 3.
+
+For a twist xi = (omega, nu) and th = |omega|:
+
+    exp(hat(xi)) = [[exp(hat(omega)), A nu], [0, 1]]                                      (Eq. 4)
+    A = I + (1 - cos th) / th^2 hat(omega) + (th - sin th) / th^3 hat(omega)^2            (Eq. 5)
+    Ad(g) = [[R, 0], [hat(t) R, R]]
+
+Units: radians, then millimetres.
 """
 
 from __future__ import annotations
@@ -19,8 +28,11 @@ Array = NDArray[np.float64]
 class SE3:
     """Rigid transforms, one or a batch: `T_a_b` carries points of frame b into frame a.
 
-    rotation (..., 3, 3), proper; translation (..., 3) mm. A tangent vector is (wx, wy, wz, vx, vy,
-    vz), as in the paper: radians, then millimetres.
+    A tangent vector is (wx, wy, wz, vx, vy, vz), as in the paper: radians, then millimetres.
+
+    Attributes:
+        rotation: (..., 3, 3), proper.
+        translation: (..., 3) mm.
     """
 
     rotation: Array
@@ -28,25 +40,37 @@ class SE3:
 
     @staticmethod
     def identity(*batch: int) -> SE3:
-        """The identity, or a batch of identities of shape `batch`."""
+        """The identity, or a batch of identities.
+
+        Args:
+            *batch: shape of the batch; none for one element.
+        """
         return SE3(np.broadcast_to(np.eye(3), (*batch, 3, 3)).copy(), np.zeros((*batch, 3)))
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> SE3:
-        """From homogeneous matrices (..., 4, 4)."""
+        """Rigid transforms from homogeneous matrices.
+
+        Args:
+            matrix: (..., 4, 4); the last row is not looked at.
+        """
         m = np.asarray(matrix, float)
         return SE3(m[..., :3, :3].copy(), m[..., :3, 3].copy())
 
     @staticmethod
     def exp(twist: ArrayLike) -> SE3:
-        """The group elements of twists (..., 6) (Lie-X Eq. 4 and 5)."""
+        """The group elements of twists (Lie-X Eq. 4 and 5).
+
+        Args:
+            twist: (..., 6) rad and mm.
+        """
         xi = np.asarray(twist, float)
         omega = xi[..., :3]
         nu = xi[..., 3:]
         return SE3(so3.exp(omega), np.einsum("...ij,...j->...i", so3.left_jacobian(omega), nu))
 
     def log(self) -> Array:
-        """The twists (..., 6) with rotation angle in [0, pi]: the inverse of `exp`."""
+        """The twists (..., 6) rad and mm with rotation angle in [0, pi]: the inverse of `exp`."""
         omega = so3.log(self.rotation)
         nu = np.einsum("...ij,...j->...i", so3.left_jacobian_inverse(omega), self.translation)
         return np.concatenate([omega, nu], axis=-1)
@@ -57,8 +81,9 @@ class SE3:
         return SE3(transposed, -np.einsum("...ij,...j->...i", transposed, self.translation))
 
     def adjoint(self) -> Array:
-        """Matrices (..., 6, 6) that carry a twist of frame b into frame a: `exp(Ad xi) = g exp(xi)
-        g^-1`.
+        """Adjoint matrices (..., 6, 6), which carry a twist of frame b into frame a.
+
+        `exp(Ad xi) = g exp(xi) g^-1`.
         """
         r = self.rotation
         matrix = np.zeros((*r.shape[:-2], 6, 6))
@@ -81,6 +106,11 @@ class SE3:
     @overload
     def __matmul__(self, other: ArrayLike) -> Array: ...
     def __matmul__(self, other: SE3 | ArrayLike) -> SE3 | Array:
+        """The product of transforms, or the transform of points.
+
+        Args:
+            other: transforms (...) that broadcast, or points (..., 3) mm.
+        """
         if isinstance(other, SE3):
             return SE3(self.rotation @ other.rotation, self @ other.translation)
         return (
@@ -89,11 +119,14 @@ class SE3:
         )
 
     def geodesic(self, other: SE3, s: ArrayLike) -> SE3:
-        """The curve from self (s = 0) to other (s = 1): rotation and translation each go straight
-        (Lie-X section 3).
+        """The curve from self (s = 0) to other (s = 1); rotation and translation each go straight.
 
-        The paper's matrix multiplies the translation by A, with which the end point is missed; it
-        is left out here.
+        R(s) = R1 exp(s log(R1^T R2)), t(s) = t1 + s (t2 - t1) (Lie-X section 3). The paper's matrix
+        multiplies the translation by A, with which the end point is missed; it is left out here.
+
+        Args:
+            other: the end point (...).
+            s: (...) share of the path, 0 to 1.
         """
         step = np.asarray(s, float)[..., None]
         omega = so3.log(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
@@ -102,8 +135,13 @@ class SE3:
 
 
 def product_of_exponentials(twists: ArrayLike) -> SE3:
-    """All partial products exp(xi_1) ... exp(xi_j) of a chain of twists (..., J, 6), as a batch
-    (..., J).
+    """All partial products exp(xi_1) ... exp(xi_j) of a chain of twists.
+
+    Args:
+        twists: (..., J, 6) rad and mm.
+
+    Returns:
+        A batch (..., J).
     """
     links = SE3.exp(twists)
     rotations = []

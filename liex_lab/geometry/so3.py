@@ -1,5 +1,8 @@
-"""The rotation group SO(3): hat, exp, log, and means. Vectors are (..., 3) radians, rotations (...,
-3, 3).
+"""The rotation group SO(3): hat, Rodrigues' exponential, logarithm, left Jacobian, chordal mean.
+
+    exp(hat(w)) = I + sin(th) / th hat(w) + (1 - cos th) / th^2 hat(w)^2,   th = |w|     (Rodrigues)
+
+Small angles use the series of these factors. Vectors are (..., 3) radians, rotations (..., 3, 3).
 """
 
 from __future__ import annotations
@@ -14,7 +17,14 @@ _SMALL_A = 1e-6  # th^2 below which A and its inverse use their series
 
 
 def hat(omega: ArrayLike) -> Array:
-    """Skew matrices (..., 3, 3) of vectors (..., 3) (Lie-X Eq. 2): `hat(w) @ x == cross(w, x)`."""
+    """Skew matrices of vectors (Lie-X Eq. 2): `hat(w) @ x == cross(w, x)`.
+
+    Args:
+        omega: (..., 3).
+
+    Returns:
+        (..., 3, 3).
+    """
     w = np.asarray(omega, float)
     matrix = np.zeros((*w.shape[:-1], 3, 3))
     matrix[..., 0, 1] = -w[..., 2]
@@ -27,8 +37,14 @@ def hat(omega: ArrayLike) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products (..., 3) of vectors (..., 3) that broadcast; np.cross, three times as fast for
-    few.
+    """Cross products of vectors; np.cross, three times as fast for few.
+
+    Args:
+        a: (..., 3).
+        b: (..., 3), broadcasts with a.
+
+    Returns:
+        (..., 3).
     """
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for k, i, j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -37,13 +53,27 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def vee(matrix: ArrayLike) -> Array:
-    """Vectors (..., 3) of skew matrices (..., 3, 3): the inverse of `hat`."""
+    """Vectors of skew matrices: the inverse of `hat`.
+
+    Args:
+        matrix: (..., 3, 3).
+
+    Returns:
+        (..., 3).
+    """
     m = np.asarray(matrix, float)
     return np.stack([m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]], axis=-1)
 
 
 def exp(omega: ArrayLike) -> Array:
-    """Rotations (..., 3, 3) of rotation vectors (..., 3) rad, by Rodrigues' formula."""
+    """Rotations of rotation vectors, by Rodrigues' formula.
+
+    Args:
+        omega: (..., 3) rad.
+
+    Returns:
+        (..., 3, 3).
+    """
     w = np.asarray(omega, float)
     th2 = np.sum(w * w, axis=-1)[..., None, None]
     small = th2 < _SMALL_EXP
@@ -56,10 +86,16 @@ def exp(omega: ArrayLike) -> Array:
 
 
 def quaternion(rotation: ArrayLike) -> Array:
-    """Unit quaternions (..., 4) as (w, x, y, z), w >= 0, of rotations (..., 3, 3).
+    """Unit quaternions of rotations.
 
-    Shepperd's method: of the four squared components the largest is taken as pivot, so no division
-    is by a small number at any angle, pi included.
+    Shepperd's method (1978): of the four squared components the largest is taken as pivot, so no
+    division is by a small number at any angle, pi included.
+
+    Args:
+        rotation: (..., 3, 3).
+
+    Returns:
+        (..., 4) as (w, x, y, z), w >= 0.
     """
     r = np.asarray(rotation, float)
     d0 = r[..., 0, 0]
@@ -88,12 +124,17 @@ def quaternion(rotation: ArrayLike) -> Array:
 
 
 def log(rotation: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) rad, length in [0, pi], of rotations (..., 3, 3): the inverse of
-    `exp`.
+    """Rotation vectors of rotations: the inverse of `exp`.
 
     Goes through the quaternion and atan2, which keeps full precision near 0 and near pi, where the
     arc cosine of the trace loses all of it. At exactly pi the two signs are the same rotation;
     either may come out.
+
+    Args:
+        rotation: (..., 3, 3).
+
+    Returns:
+        (..., 3) rad, length in [0, pi].
     """
     q = quaternion(rotation)
     v = q[..., 1:]
@@ -104,7 +145,16 @@ def log(rotation: ArrayLike) -> Array:
 
 
 def left_jacobian(omega: ArrayLike) -> Array:
-    """The matrix A (..., 3, 3) of Lie-X Eq. 5: the translation of exp(omega, nu) is `A @ nu`."""
+    """The left Jacobian A of Lie-X Eq. 5: the translation of exp(omega, nu) is `A @ nu`.
+
+    A = I + (1 - cos th) / th^2 hat(w) + (th - sin th) / th^3 hat(w)^2.
+
+    Args:
+        omega: (..., 3) rad.
+
+    Returns:
+        (..., 3, 3).
+    """
     w = np.asarray(omega, float)
     th2 = np.sum(w * w, axis=-1)[..., None, None]
     small = th2 < _SMALL_A
@@ -116,8 +166,15 @@ def left_jacobian(omega: ArrayLike) -> Array:
 
 
 def left_jacobian_inverse(omega: ArrayLike) -> Array:
-    """The inverse of `left_jacobian` for lengths in [0, pi]; it has a pole at 2 pi, so keep logs
-    principal.
+    """The inverse of `left_jacobian`.
+
+    A^-1 = I - 1/2 hat(w) + (1 - th/2 cot(th/2)) / th^2 hat(w)^2.
+
+    Args:
+        omega: (..., 3) rad, lengths in [0, pi]; there is a pole at 2 pi, so keep logs principal.
+
+    Returns:
+        (..., 3, 3).
     """
     w = np.asarray(omega, float)
     th2 = np.sum(w * w, axis=-1)[..., None, None]
@@ -133,7 +190,14 @@ def left_jacobian_inverse(omega: ArrayLike) -> Array:
 
 
 def nearest_rotation(matrix: ArrayLike) -> Array:
-    """The proper rotation (..., 3, 3) nearest to a matrix (..., 3, 3) in the Frobenius norm."""
+    """The proper rotation nearest to a matrix in the Frobenius norm, by SVD.
+
+    Args:
+        matrix: (..., 3, 3).
+
+    Returns:
+        (..., 3, 3).
+    """
     u, _, vt = np.linalg.svd(np.asarray(matrix, float))
     sign = np.sign(np.linalg.det(u @ vt))
     u = u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None, :]
@@ -141,8 +205,14 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
 
 
 def mean(rotations: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Weighted mean rotation (3, 3) of rotations (n, 3, 3): the chordal mean, unique unless they
-    cancel.
+    """Weighted mean rotation: the chordal (L2) mean, unique unless the rotations cancel.
+
+    Args:
+        rotations: (n, 3, 3).
+        weights: (n,); None weighs all alike.
+
+    Returns:
+        (3, 3).
     """
     r = np.asarray(rotations, float)
     w = np.ones(len(r)) if weights is None else np.asarray(weights, float)

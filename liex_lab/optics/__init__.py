@@ -1,4 +1,4 @@
-"""From a pixel to a ray and back: pinhole cameras, lens distortion, a water surface."""
+"""Optics of the depth camera: pinhole projection, lens distortion, refraction at water."""
 
 from liex_lab.optics.camera import Camera
 

@@ -1,5 +1,11 @@
-"""The depth camera: a pinhole that carries points to pixels and back, and says where its numbers
-come from.
+"""Pinhole camera with lens distortion: Brown-Conrady (rational) and Kannala-Brandt fisheye.
+
+u = fx x' + cx, v = fy y' + cy, where (x', y') is the distorted ray (x, y) = (X / Z, Y / Z), r^2 =
+x^2 + y^2, in OpenCV's convention:
+
+- Brown-Conrady (Brown 1966): the radius times (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4
+  + k6 r^6); to x' comes 2 p1 x y + p2 (r^2 + 2 x^2), to y' p1 (r^2 + 2 y^2) + 2 p2 x y;
+- Kannala-Brandt (2006): the radius becomes t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8), t = atan r.
 """
 
 from __future__ import annotations
@@ -30,12 +36,20 @@ _WIDEST = 8.0  # tangent of the largest angle from the optical axis that is cons
 
 @dataclass(frozen=True)
 class Distortion:
-    """How a lens bends rays: the ray (x, y, 1) of an ideal pinhole meets the picture where (x', y',
-    1) should.
+    """How a lens bends rays.
 
-    model and coefficients, in OpenCV's order: 'brown_conrady' has k1 k2 p1 p2 k3 k4 k5 k6 (ROS:
-    plumb_bob with five of them, rational_polynomial with all), 'kannala_brandt' the k1 k2 k3 k4 of
-    a fisheye lens (ROS: equidistant). `of` makes one from what a file states.
+    An ideal pinhole's ray (x, y, 1) meets the picture where (x', y', 1) should.
+
+    `of` makes one from what a file states.
+
+    Attributes:
+        model: 'brown_conrady' or 'kannala_brandt'.
+        coefficients: in OpenCV's order: 'brown_conrady' has k1 k2 p1 p2 k3 k4 k5 k6 (ROS: plumb_bob
+            with five of them, rational_polynomial with all), 'kannala_brandt' the k1 k2 k3 k4 of a
+            fisheye lens (ROS: equidistant).
+
+    Raises:
+        LiexError: an unknown model, or coefficients that are not finite or not as many as it has.
     """
 
     model: str
@@ -52,11 +66,15 @@ class Distortion:
 
     @staticmethod
     def of(model: str, coefficients: Sequence[float]) -> Distortion | None:
-        """The distortion that a file states; None where all coefficients are zero, for then there
-        is none.
+        """The distortion that a file states; None where all coefficients are zero.
 
-        Coefficients that are left out at the end are zero; OpenCV's thin prism (beyond the eighth)
-        is refused unless zero. Raises LiexError for a model that is not known.
+        Args:
+            model: as OpenCV, ROS or Foxglove call it, in any case; an empty name is plumb_bob.
+            coefficients: in OpenCV's order; those that are left out at the end are zero. OpenCV's
+                thin prism (beyond the eighth) is refused unless zero.
+
+        Raises:
+            LiexError: a model that is not known, or too many coefficients.
         """
         values = [float(value) for value in coefficients]
         name = model.strip().lower().replace("-", "_").replace(" ", "_")
@@ -78,8 +96,9 @@ class Distortion:
 
     @cached_property
     def limit(self) -> float:
-        """The radius of (x, y) up to which farther out stays farther out; beyond it the model is no
-        lens any more.
+        """The radius of (x, y) up to which what is farther out stays farther out.
+
+        Beyond it the model is no lens any more.
         """
         r = np.linspace(0.0, _WIDEST, 4001)
         turned = np.flatnonzero(~(np.diff(self._radius(r)) > 0))
@@ -101,7 +120,14 @@ class Distortion:
         )
 
     def distort(self, xy: ArrayLike) -> Array:
-        """Ideal rays (..., 2), z = 1 -> where the lens sends them (..., 2); NaN beyond `limit`."""
+        """Where the lens sends ideal rays; NaN beyond `limit`.
+
+        Args:
+            xy: (..., 2) rays at z = 1.
+
+        Returns:
+            (..., 2) distorted, at z = 1.
+        """
         x, y = np.moveaxis(np.asarray(xy, float), -1, 0)
         s = x * x + y * y
         r = np.sqrt(s)
@@ -120,11 +146,16 @@ class Distortion:
         )
 
     def undistort(self, xy: ArrayLike) -> Array:
-        """Where rays met the picture (..., 2) -> the ideal rays (..., 2) that did; NaN where none
-        within `limit` does.
+        """The ideal rays that met the picture at given points; NaN where none within `limit` does.
 
         The radius by bisection of the radial part, which increases, then Newton's steps for the
         small tangential one.
+
+        Args:
+            xy: (..., 2) distorted rays, at z = 1.
+
+        Returns:
+            (..., 2) ideal rays at z = 1.
         """
         seen = np.asarray(xy, float)
         target = np.linalg.norm(seen, axis=-1)
@@ -156,13 +187,23 @@ class Distortion:
         return {"model": self.model, "coefficients": list(self.coefficients)}
 
     def __str__(self) -> str:
+        """The model and its coefficients to four digits."""
         return f"{self.model} {', '.join(f'{value:.4g}' for value in self.coefficients)}"
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The intrinsics of a camera, stated without the size of its pictures; pixels, as in
-    `Camera`.
+    """The intrinsics of a camera, stated without the size of its pictures.
+
+    Attributes:
+        fx: focal length along rows, px.
+        fy: focal length along columns, px.
+        cx: principal point, px; 0 is the centre of the first pixel.
+        cy: principal point, px.
+        distortion: of the lens; None where it is straight.
+
+    Raises:
+        LiexError: a focal length that is not positive, or a number that is not finite.
     """
 
     fx: float
@@ -184,11 +225,19 @@ class Lens:
 
 @dataclass(frozen=True)
 class Camera(Lens):
-    """A depth camera. Pixels; (0, 0) is the centre of the top-left pixel.
+    """A depth camera: pinhole intrinsics, lens distortion, and the size of its pictures.
 
-    Camera frame: x right, y down, z away from the lens, mm. `source` names where the intrinsics
-    come from. Only a recording as it was opened may have a distortion; what looks at pictures wants
-    an ideal pinhole and gets it from `recordings.rectify`.
+    Pixels; (0, 0) is the centre of the top-left pixel. Camera frame: x right, y down, z away from
+    the lens, mm. Only a recording as it was opened may have a distortion; what looks at pictures
+    wants an ideal pinhole and gets it from `recordings.rectify`.
+
+    Attributes:
+        width: px.
+        height: px.
+        source: names where the intrinsics come from.
+
+    Raises:
+        LiexError: a picture without pixels, or intrinsics that `Lens` refuses.
     """
 
     width: int
@@ -204,7 +253,14 @@ class Camera(Lens):
             )
 
     def project(self, p_camera: ArrayLike) -> Array:
-        """Points (..., 3) mm in the camera frame -> (u, v) pixels (..., 2); NaN behind the lens."""
+        """Pixels at which points are seen; NaN behind the lens.
+
+        Args:
+            p_camera: (..., 3) mm, camera frame.
+
+        Returns:
+            (..., 2) u, v px.
+        """
         x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
         z = np.where(z > 0, z, np.nan)
         if self.distortion is None:
@@ -215,7 +271,15 @@ class Camera(Lens):
         ]
 
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Array:
-        """Pixels (..., 2) and their depth (...) mm -> points (..., 3) mm in the camera frame."""
+        """The points that pixels show at given depths.
+
+        Args:
+            uv: (..., 2) px.
+            depth: (...) mm, along the optical axis.
+
+        Returns:
+            (..., 3) mm, camera frame.
+        """
         u, v = np.moveaxis(np.asarray(uv, float), -1, 0)
         z = np.asarray(depth, float)
         x = (u - self.cx) / self.fx
@@ -225,7 +289,11 @@ class Camera(Lens):
         return np.stack([x * z, y * z, z * np.ones_like(u)], axis=-1)
 
     def every(self, stride: int) -> Camera:
-        """The camera whose picture is every `stride`-th row and column of this one's."""
+        """The camera whose picture is every `stride`-th row and column of this one's.
+
+        Args:
+            stride: pixels from one to the next, at least 1.
+        """
         if stride == 1:
             return self
         fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
@@ -235,7 +303,7 @@ class Camera(Lens):
 
     @property
     def matrix(self) -> Array:
-        """The intrinsic matrix K (3, 3)."""
+        """The intrinsic matrix K (3, 3), px."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def to_dict(self) -> dict[str, Any]:
@@ -252,7 +320,12 @@ class Camera(Lens):
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Camera:
-        """The camera that `to_dict` wrote; other keys are passed over."""
+        """The camera that `to_dict` wrote.
+
+        Args:
+            numbers: its intrinsics, size, source, and distortion if any; other keys are passed
+                over.
+        """
         known = {
             name: numbers[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")
         }

@@ -1,27 +1,21 @@
-"""A flat water surface between the camera and what it looks at: where a point truly is that seems
-to be nearer.
+"""Refraction at a flat water surface by Snell's law: the true position of a point seen from air.
 
-Light from under water bends at the surface, so a camera above it sees every point in a wrong
-direction and reports a wrong depth. The direction is put right by following the camera's ray down
-(Snell's law). Which depth the camera reports, the *apparent* depth, depends on how it measures:
+n sin r = sin i, with i and r the angles between ray and perpendicular in air and in water. A camera
+above the water sees every point in a wrong direction and reports a wrong depth. The direction is
+put right by following the camera's ray down. Which depth the camera reports, the *apparent* depth,
+depends on how it measures:
 
 - `light_field` (plenoptic cameras, many small views in all directions) and `structured_light` (also
-  stereo; two views
-  side by side along the picture's rows) triangulate: the apparent point is where the back-traced
-  rays of neighbouring
-  views intersect. Seen straight down that is at depth / n below the surface. Obliquely the rays of
-  a point meet in two
-  places (refraction at a plane is astigmatic): views displaced within the plane of incidence see it
-  at
-  d cos^3(i) / (n cos^3(r)), views displaced across it at d tan(r) / tan(i), for a point d below the
-  surface, i and r
-  the angles in air and in water. A camera reports the depth of which the disparity is the sum of
-  both, each with the
-  part of the displacement along it; for a light field the mean over all directions is taken.
+  stereo; two views side by side along the picture's rows) triangulate: the apparent point is where
+  the back-traced rays of neighbouring views intersect. Seen straight down that is at depth / n
+  below the surface. Obliquely the rays of a point meet in two places (refraction at a plane is
+  astigmatic): views displaced within the plane of incidence see it at d cos^3(i) / (n cos^3(r)),
+  views displaced across it at d tan(r) / tan(i), for a point d below the surface. A camera reports
+  the depth of which the disparity is the sum of both, each with the part of the displacement along
+  it; for a light field the mean over all directions is taken.
 - `time_of_flight` cameras report half the way that the light would have gone in air: the way in
-  water counts n times,
-  so that things seem farther, not nearer. (n is that of the group velocity, and near infrared is
-  soon absorbed.)
+  water counts n times, so that things seem farther, not nearer. (n is that of the group velocity,
+  and near infrared is soon absorbed.)
 - `paraxial`: depth / n below the surface at every angle, the textbook's rule; for comparison.
 """
 
@@ -47,9 +41,16 @@ _STEEPEST = 0.05  # cosine between a ray and the perpendicular; flatter rays do 
 class Water:
     """A flat water surface that the camera looks down through.
 
-    height_mm: of the lens above the surface, along the perpendicular; tilt_x_rad, tilt_y_rad: how
-    the surface recedes from the camera towards the right and towards the lower edge of the picture;
-    ranging: one of `RANGINGS`, see above.
+    Attributes:
+        height_mm: of the lens above the surface, along the perpendicular.
+        refractive_index: of water over air, at least 1.
+        tilt_x_rad: how the surface recedes from the camera towards the right of the picture.
+        tilt_y_rad: how it recedes towards the lower edge of the picture.
+        ranging: one of `RANGINGS`, see the module.
+
+    Raises:
+        LiexError: a height that is not positive, an index below 1, a tilt of 1.2 rad or more, or an
+            unknown ranging.
     """
 
     height_mm: float
@@ -72,27 +73,28 @@ class Water:
 
     @property
     def normal(self) -> Array:
-        """Unit vector (3,) perpendicular to the surface, away from the camera, in the
-        camera frame.
-        """
+        """Unit normal (3,) of the surface, away from the camera, in the camera frame."""
         down = np.array([-np.tan(self.tilt_x_rad), -np.tan(self.tilt_y_rad), 1.0])
         return down / np.linalg.norm(down)
 
     @property
     def lift_mm(self) -> Array:
-        """What carries points (3,) mm from the frame of the camera into that of `without`, whose
-        axes are parallel.
+        """Translation (3,) mm from the camera's frame to that of `without`.
+
+        To be added to points; the axes are parallel.
         """
         return (self.refractive_index - 1.0) * self.height_mm * self.normal
 
     def without(self, camera: Camera) -> Camera:
-        """The ideal camera that sees without the water what this one sees through it, from higher
-        up (see `lift_mm`).
+        """The ideal camera, higher up, that sees without the water what this one sees through it.
 
         Under water the rays that meet in the lens run, near the perpendicular, as if they met n
-        times as high above the surface. An ideal camera there, with focal lengths n times as long,
-        sees everything from the same side and in the same pixel; off the perpendicular a point
-        moves a little towards the middle.
+        times as high above the surface. An ideal camera there (see `lift_mm`), with focal lengths n
+        times as long, sees everything from the same side and in the same pixel; off the
+        perpendicular a point moves a little towards the middle.
+
+        Args:
+            camera: the real one, with a straight lens.
         """
         n = self.refractive_index
         way = self.law(np.zeros(2))[7:]
@@ -105,13 +107,22 @@ class Water:
         )
 
     def law(self, rays: ArrayLike) -> Array:
-        """What refraction does to rays (..., 2), the x and y of (x, y, 1): `N_LAW` numbers for each
-        (..., N_LAW).
+        """What refraction does to rays: `N_LAW` numbers for each.
 
         (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z lies d below the
-        surface, where a d^2 + (b - c z) d = k z - 1, if k z > 1, else above the water and where it
-        seems to be; and its place is (sx, sy, sz) + d (bx, by, bz), mm in the camera frame: the
-        ray's own place on the surface, and its way down.
+        surface, where
+
+            a d^2 + (b - c z) d = k z - 1,   if k z > 1,
+
+        else above the water and where it seems to be; and its position is (sx, sy, sz) + d (bx, by,
+        bz), mm in the camera frame: the ray's own position on the surface, and its direction down.
+        Rays flatter than 0.05 (cosine to the perpendicular) do not reach the water: k = 0.
+
+        Args:
+            rays: (..., 2), the x and y of (x, y, 1), camera frame.
+
+        Returns:
+            (..., N_LAW).
         """
         xy = np.asarray(rays, float)
         ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -132,9 +143,7 @@ class Water:
         return law
 
     def _depth_law(self, ray: Array, cos_air: Array, cos_water: Array) -> Array:
-        """a, b, c and room for k of `law` (..., 4), from unit rays (..., 3) and the cosines (...)
-        of i and r.
-        """
+        """a, b, c of `law` and an empty column for k (..., 4), from unit rays and cosines."""
         n = self.refractive_index
         h = self.height_mm
         zero = np.zeros_like(cos_air)
@@ -184,8 +193,14 @@ class Water:
         return within * share, across * share
 
     def true_points(self, rays: ArrayLike, depth: ArrayLike) -> Array:
-        """Where points (..., 3) mm truly are that are seen along rays (..., 2) at apparent depth
-        (...) mm.
+        """Where points truly are that are seen along rays at an apparent depth.
+
+        Args:
+            rays: (..., 2), the x and y of (x, y, 1), camera frame.
+            depth: (...) mm, as the camera reports it.
+
+        Returns:
+            (..., 3) mm, camera frame.
         """
         xy = np.asarray(rays, float)
         z = np.asarray(depth, float)

@@ -1,4 +1,4 @@
-"""Everything a run depends on: the plan of a session, and the study that holds many."""
+"""Plan of a run (all settings of one session) and study file (many sessions), both TOML."""
 
 from liex_lab.plan.plan import Plan, known_plans, plans_folder
 

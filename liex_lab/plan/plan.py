@@ -1,4 +1,9 @@
-"""A plan: everything a run depends on, in one small TOML file. Equal plans give equal results."""
+"""Plan file: all settings of a run in one small TOML file, validated by pydantic.
+
+Equal plans give equal results. A setting that is left out has its default value. `Plan.to_toml`
+writes the file with a comment for every setting; the comment over a section is the docstring of its
+class in `liex_lab.plan.sections`, the one over a setting its description there.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +47,26 @@ _HEADER = """\
 
 
 class Plan(Table):
-    """Everything a run depends on. Units are in the names; None is 'not set'."""
+    """Everything a run depends on.
+
+    Units are in the names of the settings; None is 'not set'. A plan is never changed after it was
+    made.
+
+    Attributes:
+        seed: all randomness of a run comes from this number.
+        animal: what is in front of the camera.
+        camera: intrinsics that overrule those of the recording.
+        recording: how the file is read.
+        water: a flat water surface between camera and animal.
+        arena: where in the arena the animal is.
+        foreground: what belongs to the animal and what to the scene.
+        estimation: one pose per frame.
+        tracking: from the frames' poses to a curve.
+        session: facts about the animal and the day.
+        actions: who names what the animal does.
+        behaviour: where one behaviour ends and the next begins.
+        replay: what the Rerun replay holds.
+    """
 
     seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
     animal: Animal = Animal()
@@ -60,7 +84,14 @@ class Plan(Table):
 
     @staticmethod
     def load(plan: str | Path) -> Plan:
-        """The bundled plan of this name ('mouse'), or the plan in a TOML file."""
+        """Load a bundled plan by name, or the plan in a TOML file.
+
+        Args:
+            plan: a bundled name, such as 'mouse', or the path of a .toml file.
+
+        Raises:
+            PlanError: there is no such plan, or something in it cannot be used.
+        """
         path = plans_folder() / f"{plan}.toml"
         if not path.is_file():
             path = Path(plan)
@@ -76,7 +107,15 @@ class Plan(Table):
 
     @staticmethod
     def from_toml(text: str, origin: str = "the plan") -> Plan:
-        """The plan in a TOML text; `origin` names the file in errors."""
+        """The plan in a TOML text.
+
+        Args:
+            text: the text.
+            origin: names the file in errors.
+
+        Raises:
+            PlanError: the text is not TOML, or a setting cannot be used.
+        """
         try:
             table = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, RecursionError) as error:
@@ -87,8 +126,14 @@ class Plan(Table):
 
     @staticmethod
     def from_table(table: dict[str, Any], origin: str = "the plan") -> Plan:
-        """The plan in a nested dict, as TOML or JSON gives it; missing settings have their
-        defaults.
+        """The plan in a nested dict, as TOML or JSON gives it.
+
+        Args:
+            table: sections by name; missing settings have their defaults.
+            origin: names the file in errors.
+
+        Raises:
+            PlanError: a setting is not known or its value cannot be used.
         """
         try:
             return Plan.model_validate(table)
@@ -96,8 +141,13 @@ class Plan(Table):
             raise PlanError(f"{origin}: {_sentence(error)}") from None
 
     def with_settings(self, settings: Iterable[str]) -> Plan:
-        """This plan with settings like 'animal.spine_mm=65' put in; 'animal.spine_mm=' brings the
-        default back.
+        """This plan with some settings changed, as by --set on the command line.
+
+        Args:
+            settings: texts like 'animal.spine_mm=65'; 'animal.spine_mm=' brings the default back.
+
+        Raises:
+            PlanError: a setting is not known or its value cannot be used.
         """
         chosen = list(settings)
         table = self.model_dump(exclude_none=True)
@@ -130,7 +180,7 @@ class Plan(Table):
             if not isinstance(value, Table):
                 lines += [*_entry(name, value, field.description), ""]
                 continue
-            lines += [*_comment(type(value).__doc__ or ""), f"[{name}]"]
+            lines += [*_comment(" ".join((type(value).__doc__ or "").split())), f"[{name}]"]
             for key, inner in type(value).model_fields.items():
                 lines += _entry(key, getattr(value, key), inner.description)
             lines.append("")
@@ -138,13 +188,13 @@ class Plan(Table):
 
 
 def plans_folder() -> Path:
-    """The folder of bundled plans: inside the package once installed, beside it in a clone."""
+    """Folder of the bundled plans: inside the package once installed, beside it in a clone."""
     installed = _HERE / "pipelines" / "plans"
     return installed if installed.is_dir() else _HERE.parent / "pipelines" / "plans"
 
 
 def known_plans() -> list[str]:
-    """The names of the bundled plans."""
+    """Names of the bundled plans, in alphabetical order."""
     return sorted(
         path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS
     )

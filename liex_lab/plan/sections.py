@@ -1,4 +1,9 @@
-"""The sections of a plan: what can be set in each, its unit, its limits and its default."""
+"""Sections of a plan as pydantic models: each setting with its unit, limits and default.
+
+The docstring of a section's class is the comment over that section in a plan file, and each field's
+description the comment over that setting (`Plan.to_toml`): a change of either changes the files
+that are written.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +17,10 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class Table(BaseModel):
-    """A table of settings: no unknown key, no value of another type, never changed after it was
-    made.
+    """A table of settings.
+
+    It takes no unknown key and no value of another type, nor infinity or NaN, and is never changed
+    after it was made.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

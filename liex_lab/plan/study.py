@@ -1,8 +1,8 @@
-"""A study: which animals, in which groups, recorded in which sessions, measured by which plan; one
-small TOML file.
+"""Study file: which animals, in which groups, recorded in which sessions, measured by which plan.
 
-The file names recordings and never leaves the folder it lies in: its recordings, plans and results
-are inside.
+One small TOML file, validated by pydantic; names follow NeuroBlueprint (`sub-m01/ses-01`). The file
+names recordings and never leaves the folder it lies in: its recordings, plans and results are
+inside.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ Settings = dict[str, Any]
 STUDY_FILE = "study.toml"
 RAW = "rawdata"
 DERIVED = "derivatives/liex-lab"
-RESULTS = (
-    "behav"  # the session folder of one recording, as NeuroBlueprint calls what shows behaviour
-)
+# the session folder of one recording, as NeuroBlueprint calls what shows behaviour
+RESULTS = "behav"
 VIRTUAL = "synthetic:"
 _PATHS = (
     ("arena", "zones"),
@@ -57,7 +56,16 @@ class _Table(BaseModel):
 
 
 class StudyAnimal(_Table):
-    """[[animals]]: one animal of the study."""
+    """One animal of the study, a table [[animals]].
+
+    Attributes:
+        id: letters and digits only, unique whatever the case.
+        group: experimental group.
+        cage: home cage or tank.
+        sex: sex of the animal.
+        batch: batch of the experiment.
+        set: settings of the plan for this animal, nested.
+    """
 
     id: Name
     group: Text = ""
@@ -68,7 +76,17 @@ class StudyAnimal(_Table):
 
 
 class StudySession(_Table):
-    """[[sessions]]: one recording of one animal."""
+    """One recording of one animal, a table [[sessions]].
+
+    Attributes:
+        animal: id of the animal.
+        session: letters and digits, with key-value pairs after them, as in 01_date-20260821.
+        recording: path below the study's folder, or address of a virtual recording.
+        plan: a bundled plan or a path below the study's folder; None takes the study's.
+        start_time: ISO 8601 with time zone; None takes what the recording says.
+        exclude: why the session is left out; empty where it is not.
+        set: settings of the plan for this session, nested.
+    """
 
     animal: Name
     session: SessionName
@@ -80,7 +98,16 @@ class StudySession(_Table):
 
 
 class StudyTable(_Table):
-    """The whole file as it is written."""
+    """The whole study file as it is written.
+
+    Attributes:
+        name: the study's name.
+        plan: a bundled plan or a path below the study's folder.
+        results: path below the study's folder that results go to.
+        set: settings of the plan for all sessions, nested.
+        animals: the animals.
+        sessions: the sessions.
+    """
 
     name: Text = "study"
     plan: PathText = "mouse"
@@ -117,8 +144,13 @@ class StudyTable(_Table):
 class PlannedSession:
     """One recording of the study with everything it is measured by.
 
-    id: unique in the study, as in sub-m01_ses-01; recording: a path, or the address of a virtual
-    one; folder: where its results lie; exclude: why it is left out, empty where it is not.
+    Attributes:
+        id: unique in the study, as in sub-m01_ses-01.
+        animal: the animal.
+        recording: a path, or the address of a virtual recording.
+        folder: where its results lie.
+        plan: all settings, resolved.
+        exclude: why it is left out; empty where it is not.
     """
 
     id: str
@@ -130,21 +162,32 @@ class PlannedSession:
 
     @property
     def recording_exists(self) -> bool:
-        """Whether there is anything at the recording's place."""
+        """Whether there is anything at the recording's place; a virtual recording always exists."""
         return self.recording.startswith(VIRTUAL) or Path(self.recording).exists()
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study file that was read. path: of the file; paths in it count from its folder."""
+    """A study file that was read.
+
+    Attributes:
+        path: absolute path of the file; paths in it count from its folder.
+        table: its content.
+    """
 
     path: Path
     table: StudyTable
 
     @staticmethod
     def load(path: str | Path) -> Study:
-        """The study in a TOML file. Raises StudyError with one sentence about what is wrong
-        in it.
+        """Read the study in a TOML file.
+
+        Args:
+            path: the file, or a folder that holds study.toml.
+
+        Raises:
+            StudyError: there is no such file, or something in it cannot be used; one sentence says
+                what.
         """
         file = Path(path)
         if file.is_dir():
@@ -159,7 +202,15 @@ class Study:
 
     @staticmethod
     def from_table(table: dict[str, Any], path: Path) -> Study:
-        """The study in a nested dict, as TOML gives it; `path` is where its file is or would be."""
+        """The study in a nested dict, as TOML gives it.
+
+        Args:
+            table: the content of a study file.
+            path: where its file is or would be.
+
+        Raises:
+            StudyError: something in it cannot be used.
+        """
         try:
             study = Study(path.absolute(), StudyTable.model_validate(table))
         except ValidationError as error:
@@ -181,7 +232,11 @@ class Study:
 
     @property
     def results(self) -> Path:
-        """Where the sessions' folders go."""
+        """Where the sessions' folders go.
+
+        Raises:
+            StudyError: that lies in rawdata, where nothing is written, or outside of the study.
+        """
         found = self.inside(self.table.results, "results")
         raw = self.folder / RAW
         if found == raw or raw in found.parents:
@@ -198,12 +253,25 @@ class Study:
 
     @cached_property
     def sessions(self) -> tuple[PlannedSession, ...]:
-        """Every session of the file, in its order, with its plan resolved."""
+        """Every session of the file, in its order, with its plan resolved.
+
+        Raises:
+            StudyError: a setting or a path cannot be used.
+            PlanError: a plan that is named cannot be used.
+        """
         animals = {animal.id: animal for animal in self.table.animals}
         return tuple(self._planned(animals[one.animal], one) for one in self.table.sessions)
 
     def inside(self, text: str, what: str) -> Path:
-        """A path of the study file, which may not leave the study's folder."""
+        """Full path of a path in the study file, which may not leave the study's folder.
+
+        Args:
+            text: the path as written, with / or backslashes.
+            what: what it is the path of, for the error message.
+
+        Raises:
+            StudyError: the path is absolute, begins with ~ or a drive, or has a part '..'.
+        """
         parts = PurePosixPath(text.replace("\\", "/")).parts
         bad = (
             "\0" in text
@@ -230,9 +298,7 @@ class Study:
         )
 
     def _plan(self, animal: StudyAnimal, one: StudySession, id: str) -> Plan:
-        """The plan with the settings of study, animal and session put in, the later before the
-        earlier.
-        """
+        """The plan with the settings of study, animal and session put in, in this order."""
         named = one.plan or self.table.plan
         plan = Plan.load(named if named in known_plans() else self.inside(named, "plan"))
         facts: Settings = {"name": id, "individual": animal.id, "subject_id": animal.id}
@@ -258,7 +324,12 @@ class Study:
 
 
 def merged(table: Settings, settings: Settings) -> Settings:
-    """Nested settings put into others: what both have is taken from `settings`."""
+    """Nested settings put into others.
+
+    Args:
+        table: nested settings; not changed.
+        settings: those that overrule them where both have one.
+    """
     out = dict(table)
     for key, value in settings.items():
         below = out.get(key)

@@ -1,4 +1,8 @@
-"""Depth recordings of every format through one door: `open_recording`."""
+"""Depth recordings of every format, opened by one function: `open_recording`.
+
+A recording is lazy, in order of time, and in millimetres along the optical axis, whatever the
+format it was stored in.
+"""
 
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.open import open_recording

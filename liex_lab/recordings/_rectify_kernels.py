@@ -1,5 +1,4 @@
-"""Numba kernels that carry a depth picture to an ideal pinhole camera: lens distortion and water
-undone.
+"""Numba kernels of rectification: table lookup, forward splatting with a z-buffer, hole closing.
 
 Serial, and without the interpreter's lock: what is written is spread over the picture, and two
 threads that spread together cost more than they save (`look_up` of 1024 x 1024 pixels takes about 2
@@ -22,8 +21,12 @@ _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 @njit(cache=True, nogil=True)
 def look_up(depth, source, out):
-    """Into out (H, W), for every ideal pixel, the depth of the picture's pixel `source` (H, W); -1:
-    there is none.
+    """Copy, for every pixel of the ideal picture, the depth of one pixel of the real one.
+
+    Args:
+        depth: (h, w) float32 mm.
+        source: (H, W) int32, row * w + column in `depth`; -1 where there is none.
+        out: (H, W) float32 mm, written; 0 where source is -1.
     """
     stored = depth.ravel()
     for row in range(out.shape[0]):
@@ -34,8 +37,20 @@ def look_up(depth, source, out):
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def lift_row(depth, law, u, v, deep):
-    """Where the pixels of one row (W,) go, and their new depth. law (13, W): see
-    `rectify.pixel_laws`.
+    """New pixels and depths of the readings of one row, moved to where they truly are under water.
+
+    Where k z > 1 the ray meets the surface, and the depth d below it solves
+
+        a d^2 + (b - c z) d = k z - 1,
+
+    in the form of the quadratic formula that does not cancel.
+
+    Args:
+        depth: (W,) float32 mm, as the camera reported it.
+        law: (13, W) float32, see `rectify.pixel_laws`.
+        u: (W,) int32, written: new column, px.
+        v: (W,) int32, written: new row, px.
+        deep: (W,) float32, written: new depth, mm.
     """
     for column in range(depth.size):
         along = law[3, column] * depth[column]  # 1 where the ray meets the water
@@ -55,11 +70,14 @@ def lift_row(depth, law, u, v, deep):
 
 @njit(cache=True, nogil=True)
 def lift(depth, laws, out):
-    """Every pixel of `depth` (H, W) mm as a point, moved to where it truly is, into out (H, W); the
-    nearest stays.
+    """Splat every pixel of a depth picture to its true position, the nearest on top.
 
-    out is infinite where nothing went. laws (H, 13, W). A pixel without reading goes the way of the
-    reading before it in its row, and leaves UNREAD.
+    A pixel without reading moves like the reading before it in its row, and leaves `UNREAD`.
+
+    Args:
+        depth: (H, W) float32 mm, 0 where unread.
+        laws: (H, 13, W) float32, see `rectify.pixel_laws`.
+        out: (H, W) float32 mm, written; infinite where nothing went.
     """
     n_rows, n_columns = depth.shape
     u = np.empty(n_columns, np.int32)
@@ -85,11 +103,16 @@ def lift(depth, laws, out):
 
 @njit(cache=True, nogil=True)
 def close(lifted, out):
-    """Fill what lies between two readings, side by side or one above the other, with the farther
-    one: into out (H, W).
+    """Fill what lies between two readings with the farther one.
+
+    The two lie side by side or one above the other.
 
     Only where nothing went: a pixel that was unread stays so. The farther, so that no outline
     grows.
+
+    Args:
+        lifted: (H, W) float32 mm, `UNREAD` where unread, infinite where nothing went.
+        out: (H, W) float32 mm, written; 0 where unread.
     """
     n_rows, n_columns = lifted.shape
     for row in range(n_rows):
@@ -107,4 +130,5 @@ def close(lifted, out):
 
 @njit(cache=True, nogil=True)
 def _between(one, other):
+    """The farther of two readings, mm; 0 unless both are readings."""
     return max(one, other) if one < UNREAD and other < UNREAD else np.float32(0.0)

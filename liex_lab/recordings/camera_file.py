@@ -1,4 +1,8 @@
-"""camera.toml: the few facts about a depth camera that pictures do not hold."""
+"""The camera.toml format: intrinsics, depth encoding and clock of pictures that do not hold them.
+
+Keys stand under [camera] (or [recording], or at the top); all may be left out. An unknown key is
+reported with the nearest known one.
+"""
 
 from __future__ import annotations
 
@@ -35,15 +39,27 @@ _KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a camera.toml states, under [camera] or at its top; everything may be left out.
+    """Contents of a camera.toml; everything may be left out.
 
-    intrinsics: any of fx, fy, cx, cy; distortion: of the lens, from distortion (a list of
-    coefficients in OpenCV's order) and distortion_model; width, height: pixels; unit_mm:
-    millimetres per stored step; unread: stored values that mean "no reading"; encoding: how stored
-    values mean depth, a key of `encodings`; byte_order: of PGM pictures, "big" or "little"; fps:
-    used where there are no stamps; timestamps: name of the stamp file, time_column and time_unit:
-    its column of times, see `read_csv_times`; pattern: which pictures of the folder to read, as in
-    "*_depth.png"; metadata: subject_id, session_start_time; source: who says all this.
+    Attributes:
+        path: where the file is, or would be.
+        intrinsics: any of fx, fy, cx, cy, px.
+        width: columns of the pictures, px.
+        height: rows of the pictures, px.
+        unit_mm: mm per stored step.
+        unread: stored values that mean "no reading".
+        encoding: how stored values mean depth, one of `ENCODINGS`.
+        byte_order: of PGM pictures, "big" or "little".
+        fps: frame rate, Hz, used where there are no stamps.
+        timestamps: name of the stamp file.
+        time_column: its column of times, see `read_csv_times`.
+        time_unit: the unit of that column.
+        pattern: which pictures of the folder to read, as in "*_depth.png".
+        metadata: subject_id and session_start_time, where stated.
+        source: who says all this, for `Camera.source`.
+        problems: sentences about keys that mean nothing or were not used.
+        distortion: of the lens, from distortion (a list of coefficients in OpenCV's order) and
+            distortion_model.
     """
 
     path: Path
@@ -66,7 +82,17 @@ class CameraFile:
 
     @staticmethod
     def read(path: Path) -> CameraFile:
-        """The file at `path`; where there is none, what holds when nothing is stated."""
+        """Parse the file; where there is none, what holds when nothing is stated.
+
+        Args:
+            path: the camera.toml.
+
+        Returns:
+            What it states.
+
+        Raises:
+            RecordingError: the file is no TOML, or the value of a key cannot be.
+        """
         if not path.is_file():
             return CameraFile(path)
         try:
@@ -83,11 +109,30 @@ class CameraFile:
         return _from_table(path, table, tuple(_unknown_key(path, key) for key in unknown))
 
     def decode(self, stored: Stored) -> Depth:
-        """Stored values -> depth (H, W) float32 mm."""
+        """Depth of stored values, by the stated encoding and unit.
+
+        Args:
+            stored: (H, W), or (H, W, 3) for colour pictures, as the file holds them.
+
+        Returns:
+            (H, W) float32 mm, 0 where unread.
+        """
         return decode(stored, self.encoding, self.unit_mm, self.unread)
 
     def camera(self, width: int, height: int, stated: Lens | None = None) -> Camera:
-        """The camera of pictures of this size; `stated` comes before the file."""
+        """The camera of pictures of a given size.
+
+        Args:
+            width: columns of the pictures, px.
+            height: rows of the pictures, px.
+            stated: a camera or lens that comes before the file.
+
+        Returns:
+            The camera, of this size.
+
+        Raises:
+            RecordingError: no intrinsics are stated, or those stated belong to another size.
+        """
         if stated is not None:
             return fitting(stated, width, height, "the camera that was stated")
         if not self.intrinsics:
@@ -110,8 +155,19 @@ class CameraFile:
 
 
 def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
-    """The camera itself, if it belongs to pictures of this size; one stated without a size belongs
-    to any.
+    """The camera itself, if it belongs to pictures of this size; a bare lens belongs to any.
+
+    Args:
+        lens: a camera, or intrinsics without a size.
+        width: columns of the pictures, px.
+        height: rows of the pictures, px.
+        where: who states the intrinsics, for the sentence.
+
+    Returns:
+        The camera of this size.
+
+    Raises:
+        RecordingError: the camera is of another size.
     """
     bare = (lens.fx, lens.fy, lens.cx, lens.cy, width, height)
     camera = lens if isinstance(lens, Camera) else Camera(*bare, distortion=lens.distortion)
@@ -124,7 +180,18 @@ def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
 
 
 def rate(fps: float | None, where: str) -> float | None:
-    """A stated frame rate, if it can be one."""
+    """A stated frame rate, checked.
+
+    Args:
+        fps: frames per second, Hz; None where none is stated.
+        where: who states it, for the sentence.
+
+    Returns:
+        fps unchanged.
+
+    Raises:
+        RecordingError: it is not in (0, 100000].
+    """
     if fps is not None and not (math.isfinite(fps) and 0 < fps <= 100_000):
         raise RecordingError(
             f"{where} states fps = {fps:g}; a frame rate is a positive number of frames per second"

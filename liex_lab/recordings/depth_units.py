@@ -1,5 +1,12 @@
-"""How stored numbers mean depth, the ways that cameras and data sets of the field have come up
-with, and millimetres as the whole steps that 16-bit pictures store, exactly or not at all.
+"""Depth encodings of cameras and data sets, and millimetres as the steps of 16-bit pictures.
+
+    linear              d = unit_mm * stored
+    tum                 5000 steps per metre (TUM RGB-D)
+    sun                 mm, their 16 bits rotated left by 3 (SUN RGB-D)
+    kinect1-disparity   d = 351.3 m / (1092.5 - disparity), 11 bits (NYU Depth v2)
+    nyu-hand            d = 256 green + blue, mm, of an 8-bit colour picture (NYU hand pose)
+
+On writing, steps are exact or nearest.
 """
 
 from __future__ import annotations
@@ -25,9 +32,7 @@ def _rotated(stored: Stored) -> Stored:
 
 
 def _disparity(stored: Stored) -> Stored:
-    """Kinect v1 as NYU Depth v2 keeps it: 11 bits of disparity, metres = 351.3 / (1092.5 -
-    value).
-    """
+    """Kinect v1 disparity of 11 bits, as NYU Depth v2 keeps it: z = 351.3 / (1092.5 - value) m."""
     ahead = 1092.5 - stored.astype(np.float32)
     read = (ahead > 0) & (stored != _NO_DISPARITY)
     return np.where(read, 351_300.0 / np.where(read, ahead, 1.0), 0.0).astype(np.float32)
@@ -51,17 +56,31 @@ ENCODINGS = tuple(_MILLIMETRES)
 
 
 def own_unit_mm(encoding: str) -> float:
-    """Millimetres per step of what an encoding gives."""
+    """Millimetres per step of what an encoding gives.
+
+    Args:
+        encoding: one of `ENCODINGS`.
+
+    Returns:
+        mm per step: 0.2 for "tum", else 1.
+    """
     return _MILLIMETRES[encoding][0]
 
 
 def decode(
     stored: Stored, encoding: str, unit_mm: float, unread: Sequence[float] = (0.0,)
 ) -> Depth:
-    """Stored values (H, W) -> float32 mm (H, W), 0 = unread.
+    """Depth in millimetres of stored values in a named encoding.
 
-    unit_mm: millimetres per step of what `encoding` gives; unread: *stored* values that mean "no
-    reading" (of what the encoding gives for colour pictures), besides those that it has by itself.
+    Args:
+        stored: (H, W), or (H, W, 3) uint8 (blue, green, red) for colour pictures.
+        encoding: one of `ENCODINGS`.
+        unit_mm: mm per step of what `encoding` gives.
+        unread: *stored* values that mean "no reading" (of what the encoding gives for colour
+            pictures), besides those that it has by itself.
+
+    Returns:
+        (H, W) float32 mm, 0 = unread.
     """
     values = _MILLIMETRES[encoding][1](stored)
     if values is stored or stored.ndim == 3:
@@ -73,8 +92,14 @@ def decode(
 
 
 def whole_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
-    """The steps (H, W) that are read back as exactly this depth; None where there are none, or more
-    than 16 bits.
+    """The 16-bit steps that are read back as exactly this depth.
+
+    Args:
+        depth: (H, W) float32 mm.
+        step_mm: mm of a step.
+
+    Returns:
+        (H, W) uint16; None where there are none, or they need more than 16 bits.
     """
     if depth.size and float(depth.max()) > LARGEST_STEP * step_mm:
         return None
@@ -89,18 +114,31 @@ def whole_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
 
 
 def nearest_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
-    """The nearest steps (H, W); None where they do not fit into 16 bits."""
+    """The nearest 16-bit steps to a depth.
+
+    Args:
+        depth: (H, W) float32 mm.
+        step_mm: mm of a step.
+
+    Returns:
+        (H, W) uint16; None where they do not fit into 16 bits.
+    """
     steps = np.rint(depth / np.float32(step_mm))
     return steps.astype(np.uint16) if not depth.size or float(steps.max()) <= LARGEST_STEP else None
 
 
 def metres(depth: Depth) -> tuple[NDArray[np.float32], int]:
-    """Depth (H, W) in m that times 1000 is the depth again, and for how many pixels there is no
-    such number.
+    """Depth in metres that times 1000 is the depth again, in float32.
 
     Between 1000 and 1024 mm, and at their halves and doubles, neighbouring float32s of metres are
-    farther apart than those of millimetres; there the nearest is taken, half a millionth of a
+    farther apart than those of millimetres. There the nearest is taken, half a millionth of a
     millimetre per metre off.
+
+    Args:
+        depth: (H, W) float32 mm.
+
+    Returns:
+        (H, W) float32 m, and for how many pixels there is no exact number.
     """
     scaled = depth / np.float32(1000.0)
     off = scaled * np.float32(1000.0) != depth

@@ -1,4 +1,8 @@
-"""One depth picture, and how stored numbers become millimetres."""
+"""One depth frame, and the linear law by which stored numbers become millimetres.
+
+depth = unit_mm * stored, float32, measured along the optical axis (z of the camera frame, not range
+along the ray); 0 means that there is no reading.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,12 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DepthFrame:
-    """A depth picture: index, its row in the recording it was read from; time_ns on the recording's
-    own clock.
+    """One depth picture with its row and its time.
 
-    depth (H, W) float32 mm along the optical axis; 0 = unread; finite, never negative.
+    Attributes:
+        index: its row in the recording that it was read from.
+        time_ns: its time on the recording's own clock, ns.
+        depth: (H, W) float32 mm along the optical axis; 0 = unread; finite, never negative.
     """
 
     index: int
@@ -26,12 +32,18 @@ class DepthFrame:
 
 
 def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float] = (0.0,)) -> Depth:
-    """Stored values (H, W) -> float32 mm (H, W), a fresh array; 0 = unread.
+    """Depth in millimetres of stored values, by a linear law.
 
-    unit_mm: millimetres per stored step, negative where the file's depth axis points towards the
-    camera; unread: stored values that mean "no reading". They are marked before scaling, while they
-    can still be compared exactly. 0, NaN and infinite values are always unread, and so is what lies
-    behind the lens.
+    Values that mean "no reading" are marked before scaling, while they can still be compared
+    exactly. 0, NaN and infinite values are always unread, and so is what lies behind the lens.
+
+    Args:
+        stored: (H, W) or any other shape, integers or floats as the file holds them.
+        unit_mm: mm per stored step, negative where the file's depth axis points towards the camera.
+        unread: stored values that mean "no reading".
+
+    Returns:
+        float32 mm of the same shape, a fresh array; 0 = unread.
     """
     depth = stored.astype(np.float32)
     for value in unread:

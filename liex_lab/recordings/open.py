@@ -1,4 +1,8 @@
-"""The one door to depth recordings of every format: which module reads what."""
+"""Dispatch from a path to the reader of its format: the one entry point to depth recordings.
+
+The format is told from the name of a file, or from the names in a folder; the reader's module and
+its libraries are imported only when they are needed.
+"""
 
 from __future__ import annotations
 
@@ -100,13 +104,24 @@ def open_recording(
     strict: bool = False,
     progress: Progress = silent,
 ) -> Recording:
-    """Open a depth recording of any format; frames are read when asked for.
+    """Open a depth recording of any format; frames are decoded when they are asked for.
 
-    path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see
-    `open_synthetic`); camera: comes before whatever the files state, a `Lens` for pictures of any
-    size; fps: used only where the files hold no time stamps; topic: of an MCAP file or a ROS bag
-    with several depth topics; strict: refuse a recording that is cut short, instead of only saying
-    so in `problems` and `truncated`; progress: told while an archive is unpacked or an index made.
+    Args:
+        path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see
+            `open_synthetic`).
+        camera: comes before whatever the files state; a `Lens` for pictures of any size.
+        fps: frame rate, Hz; used only where the files hold no time stamps.
+        topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
+        strict: refuse a recording that is cut short, instead of only saying so in `problems` and
+            `truncated`.
+        progress: told while an archive is unpacked or an index made.
+
+    Returns:
+        The recording; close it, or use it in a `with` block.
+
+    Raises:
+        RecordingError: the path does not exist, holds no depth that can be read, or (strict) is
+            cut.
     """
     path = Path(path)
     try:

@@ -1,5 +1,8 @@
-"""A recording: what a depth camera saw, frame by frame, read when asked for and never wholly in
-memory.
+"""Lazy, re-iterable sequence of depth frames from one camera, independent of the file format.
+
+A `Recording` holds the time stamps and the camera; a depth frame is decoded when it is asked for,
+so memory does not grow with the length. Time stamps are integer nanoseconds and increase strictly;
+gaps are steps of more than 1.5 median steps. The input is identified by the SHA-256 of its files.
 """
 
 from __future__ import annotations
@@ -27,17 +30,24 @@ _BLOCK = 1 << 20
 
 
 class Recording:
-    """Depth frames in order of time, from one camera.
+    """Depth frames in order of time, from one camera, read one at a time.
 
-    A format makes one by handing over `read`, which turns a stored frame's number into depth (H, W)
-    float32 mm. Frames are read one at a time, so memory does not grow with length; iterating twice
-    reads twice and yields the same.
+    A format makes one by handing over `read`, which turns a stored frame's number into depth.
+    Memory does not grow with the length; iterating twice reads twice and yields the same.
 
-    name; format ("images", "moseq", "mcap", ...); camera; times_ns (n,) int64 on the recording's
-    own clock, strictly increasing; problems: sentences about what is odd in the file, also those
-    found while reading; truncated: the file is cut or damaged, and n_whole of its frames are whole;
-    metadata: subject_id and session_start_time (ISO 8601 with zone) where the file tells them;
-    optics: what was undone on reading, empty where nothing was (see `rectify`).
+    Attributes:
+        name: name of the recording, usually that of its file or folder without the suffix.
+        format: name of the format, such as "images", "moseq", "mcap", "oni" or "rosbag".
+        camera: the camera of the depth pictures.
+        times_ns: (n,) int64 time stamps on the recording's own clock, ns, strictly increasing;
+            read-only.
+        problems: sentences about what is odd in the file, also those found while reading.
+        truncated: True where the file is cut or damaged.
+        n_whole: how many of the frames are whole.
+        metadata: facts that the files state, such as subject_id and session_start_time (ISO 8601
+            with zone).
+        optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
+            see `rectify`.
     """
 
     def __init__(
@@ -59,10 +69,31 @@ class Recording:
         faults: NDArray[np.uint8] | None = None,
         grow: Callable[[], Recording | None] | None = None,
     ) -> None:
-        """sources: the input's files, for `digest`; step_ns and stored: what a slice inherits from
-        its parent.
+        """Check and freeze the time stamps; no frame is read.
 
-        faults (n,): which stamps were moved and why, see `Settled`; grow: see `grown`.
+        Args:
+            name: name of the recording.
+            format: name of the format that it was read from.
+            camera: the camera of the depth pictures.
+            times_ns: (n,) int64 stamps, ns, strictly increasing.
+            read: turns a stored frame's number into depth (H, W) float32 mm, 0 where unread.
+            sources: the files of the input, for `digest`; empty for a recording that is in no file.
+            problems: sentences about what is odd; the list is shared, so reading may append to it.
+            truncated: whether the file is cut or damaged.
+            n_whole: how many frames are whole; None for all.
+            metadata: facts that the files state.
+            close: lets go of open files; called once, at the latest when nobody holds the
+                recording.
+            step_ns: median step, ns; a slice inherits it from its parent, None to compute it.
+            stored: (n,) int64 number of the stored frame of each row; a slice inherits it, None for
+                0 ... n - 1.
+            faults: (n,) uint8, which stamps were moved and why, an index into `FAULTS`; None for
+                none.
+            grow: opens what was appended to the files since, see `grown`; None where the format
+                cannot.
+
+        Raises:
+            RecordingError: there is no frame, or the stamps do not increase strictly.
         """
         self.name = name
         self.format = format
@@ -94,29 +125,33 @@ class Recording:
 
     @property
     def width(self) -> int:
-        """Pixels in a row."""
+        """Columns of a depth picture, px."""
         return self.camera.width
 
     @property
     def height(self) -> int:
-        """Rows in a picture."""
+        """Rows of a depth picture, px."""
         return self.camera.height
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second while none is missing: one over the median step; NaN for a single
-        frame.
+        """Frames per second while none is missing; NaN for a single frame.
+
+        One over the median step between neighbouring frames.
         """
         return 1e9 / self._step_ns if self._step_ns else float("nan")
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first frame to the last."""
+        """Time from the first frame to the last, s."""
         return int(self.times_ns[-1] - self.times_ns[0]) / 1e9
 
     @property
     def gaps(self) -> list[Gap]:
-        """Where the camera left out frames: steps of more than 1.5 median steps."""
+        """Intervals in which the camera left out frames: steps of more than 1.5 median steps.
+
+        A gap at which the clock jumped has the reason `JUMPED`.
+        """
         found = find_gaps(self.times_ns, self._step_ns)
         return [replace(gap, reason=JUMPED) if self._jumped(gap) else gap for gap in found]
 
@@ -125,8 +160,9 @@ class Recording:
 
     @property
     def faults(self) -> list[Gap]:
-        """The frames whose stamps had to be moved: repeated, out of order, or wild; clock jumps are
-        among the gaps.
+        """Frames whose stamps had to be moved: repeated, out of order, or wild.
+
+        Clock jumps that show as a gap are among the `gaps` instead.
         """
         joined = {gap.start_frame for gap in self.gaps if self._jumped(gap)}
         found = find_faults(self.times_ns, self._step_ns, self._faults)
@@ -142,7 +178,18 @@ class Recording:
         )
 
     def frame(self, index: int) -> DepthFrame:
-        """Frame `index`, counted from 0, or from the end when negative."""
+        """One frame, decoded now.
+
+        Args:
+            index: row of the frame, counted from 0, or from the end when negative.
+
+        Returns:
+            The frame, with its row, its stamp and its depth (H, W) float32 mm.
+
+        Raises:
+            IndexError: there is no such row.
+            RecordingError: the recording was closed.
+        """
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of a recording of {len(self)} frames")
         if (self._whole or self)._closed:
@@ -154,8 +201,17 @@ class Recording:
         return (self.frame(i) for i in range(len(self)))
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames from `first` on in lists of `n_frames`, the last may be shorter; one list is
-        in memory.
+        """Consecutive frames in lists of equal length, of which one is in memory at a time.
+
+        Args:
+            n_frames: frames to a list; the last list may be shorter.
+            first: row of the first frame.
+
+        Yields:
+            Lists of decoded frames, in order.
+
+        Raises:
+            ValueError: n_frames is less than 1.
         """
         if n_frames < 1:
             raise ValueError(f"a chunk has at least one frame, got {n_frames}")
@@ -163,8 +219,19 @@ class Recording:
             yield [self.frame(i) for i in range(start, min(start + n_frames, len(self)))]
 
     def __getitem__(self, part: slice) -> Recording:
-        """Some of the frames as a recording of its own, with rows counted anew; it reads from the
-        same files.
+        """Some of the frames as a recording of its own, with rows counted anew.
+
+        It reads from the same files, and has the digest of the whole input.
+
+        Args:
+            part: a slice with a positive step.
+
+        Returns:
+            The recording of these frames.
+
+        Raises:
+            TypeError: part is not a slice.
+            RecordingError: the slice is empty or runs backwards.
         """
         if not isinstance(part, slice):
             raise TypeError(
@@ -198,10 +265,17 @@ class Recording:
     def seen_by(
         self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]
     ) -> Recording:
-        """The same frames as another camera would have seen them: `change` turns each depth picture
-        when it is read.
+        """The same frames as another camera would have taken them, transformed when they are read.
 
-        The input, and so the digest, stays the same; closing one closes both.
+        The input, and so the digest, stays the same; closing one recording closes both.
+
+        Args:
+            camera: the camera of the transformed pictures.
+            change: turns depth (H, W) float32 mm of this camera into depth of the other one.
+            optics: what `change` undoes, kept as the `optics` of the result.
+
+        Returns:
+            The recording through the other camera.
         """
         read = self._read
         other = Recording(
@@ -226,11 +300,13 @@ class Recording:
         return other
 
     def grown(self) -> Recording | None:
-        """The same recording with what was written to its files since it was opened, read on from
-        where it ended.
+        """The same recording with what was appended to its files since it was opened.
 
-        It takes this one's place, which is used no more. None where the format has to be opened
-        anew for that.
+        Reading goes on from where it ended. The result takes this one's place, which is used no
+        more.
+
+        Returns:
+            The longer recording; None where the format has to be opened anew for that.
         """
         more = None if self._grow is None else self._grow()
         if more is not None:
@@ -240,11 +316,17 @@ class Recording:
         return more
 
     def digest(self, progress: Progress = silent) -> str:
-        """sha256 of the input, hex: of one file its bytes; of several, names, sizes and bytes in
-        order of name.
+        """SHA-256 of the input, in hexadecimal.
 
-        A recording that is in no file is its times and depths. A slice has the digest of the whole
-        input.
+        Of one file its bytes; of several, their names, sizes and bytes in order of name. A
+        recording that is in no file is hashed by its times and depths. A slice has the digest of
+        the whole input.
+
+        Args:
+            progress: told how many MB were read.
+
+        Returns:
+            64 hexadecimal digits; computed once and kept.
         """
         if self._whole is not None:
             return self._whole.digest(progress)
@@ -256,16 +338,19 @@ class Recording:
 
     @property
     def stamp(self) -> list[list[str | int]]:
-        """Name, size and time of each of the input's files, to see cheaply whether it changed;
-        empty without files.
+        """Name, size (bytes) and modification time (ns) of each input file, in order.
+
+        It shows cheaply whether the input changed; empty without files.
         """
         whole = self._whole or self
         found = [(path.name, path.stat()) for path in whole._sources]
         return sorted([name, stat.st_size, stat.st_mtime_ns] for name, stat in found)
 
     def take_digest(self, digest: str) -> None:
-        """Believe that this is the input's hash, for it was read before and its files have not
-        changed since.
+        """Accept a digest that was computed before, for the input's files have not changed since.
+
+        Args:
+            digest: the SHA-256 of the input, in hexadecimal.
         """
         (self._whole or self)._digest = digest
 
@@ -276,8 +361,9 @@ class Recording:
         return whole.hexdigest()
 
     def close(self) -> None:
-        """Let go of files, and remove what was unpacked; a slice leaves that to the recording it
-        was cut from.
+        """Let go of files, and remove what was unpacked.
+
+        A slice leaves that to the recording that it was cut from.
         """
         self._closed = self._whole is None
         if self._close is not None:
@@ -296,8 +382,16 @@ class Recording:
 
 
 def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
-    """sha256, hex: of one file its bytes; of several, for each in order of name its name, its size
-    and its bytes.
+    """SHA-256 of one file, or of several files together.
+
+    Of one file its bytes; of several, for each in order of name its name, its size and its bytes.
+
+    Args:
+        files: the paths of the files, in any order.
+        progress: told how many MB were read.
+
+    Returns:
+        64 hexadecimal digits.
     """
     ordered = sorted(files, key=lambda path: path.name)
     sizes = [path.stat().st_size for path in ordered]

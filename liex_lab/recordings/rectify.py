@@ -1,10 +1,11 @@
-"""True millimetres on reading: a recording through a bent lens or a water surface, as an ideal
-pinhole would see it.
+"""Rectification of depth pictures: lens distortion and refraction at a water surface undone.
 
-Everything behind this door works with an ideal pinhole camera in air. A recording without
-distortion and water is handed on untouched. A bent lens becomes a straight one with the same focal
-lengths, its picture so much larger that it holds what the bent one held. For the water see
-`Water.without`: the ideal camera stands higher than the real one.
+Everything that follows works with an ideal pinhole camera in air; a recording without distortion
+and water is handed on untouched. Distortion (Brown-Conrady or Kannala-Brandt): inverse warping by a
+nearest-neighbour lookup table into a straight picture with the same focal lengths, so much larger
+that it holds what the distorted one held. Water (Snell's law, `Water.law`): every reading becomes a
+point, is moved to where it truly is and splatted forward with a z-buffer into an ideal camera that
+stands higher than the real one (`Water.without`); small holes are then closed.
 """
 
 from __future__ import annotations
@@ -26,10 +27,17 @@ _MAX_GROWTH = 0.15  # of a picture's width or height, at each side
 
 
 def rectified(recording: Recording, water: Water | None = None) -> Recording:
-    """The recording with its camera's distortion and the water's refraction undone whenever a frame
-    is read.
+    """The recording with lens distortion and refraction undone whenever a frame is read.
 
-    The recording itself where there is neither. `optics` of the result says what was undone.
+    Where more than 5 % of the pixels leave the picture, `problems` of the result say so.
+
+    Args:
+        recording: depth as the camera delivered it.
+        water: the water surface; None for air. It is left out where it was undone before.
+
+    Returns:
+        The rectified recording, whose `optics` say what was undone; the recording itself where
+        there is neither distortion nor water.
     """
     camera = recording.camera
     water = None if recording.optics.get("water") else water  # it was undone before
@@ -53,6 +61,12 @@ def mirrored(recording: Recording) -> Recording:
     """The recording with left and right exchanged in every picture.
 
     Drivers of some cameras deliver mirrored pictures; and a left hand in the mirror is a right one.
+
+    Args:
+        recording: depth to be mirrored.
+
+    Returns:
+        The mirrored recording, with its principal point mirrored too.
     """
     camera = recording.camera
     turned = replace(camera, cx=camera.width - 1.0 - camera.cx)
@@ -61,17 +75,31 @@ def mirrored(recording: Recording) -> Recording:
 
 
 def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
-    """The ideal pinhole to which pictures of this camera are carried."""
+    """The ideal pinhole to which pictures of a camera are carried.
+
+    Args:
+        camera: the real camera, perhaps with distortion.
+        water: the water surface that it looks through; None for air.
+
+    Returns:
+        A camera without distortion, in air.
+    """
     straight = straight_camera(camera)
     return straight if water is None else water.without(straight)
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The same camera with a straight lens: its picture grows at each side by as much as the bent
-    one's edge went in.
+    """The same camera with a straight lens and a picture large enough for what the bent one held.
 
-    Up to `_MAX_GROWTH`, for the far corners of a fisheye lens would be at infinity. Sizes stay
-    multiples of four.
+    The picture grows at each side by as much as the bent one's edge went in, up to 15 % of its
+    width or height (`_MAX_GROWTH`), for the far corners of a fisheye lens would be at infinity. Its
+    sizes are multiples of four.
+
+    Args:
+        camera: the real camera, perhaps with distortion.
+
+    Returns:
+        A camera without distortion, with the same focal lengths.
     """
     straight = replace(camera, distortion=None)
     if camera.distortion is None:
@@ -104,11 +132,27 @@ def straight_camera(camera: Camera) -> Camera:
 
 
 def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], Depth]:
-    """What turns a depth picture (H, W) mm of this camera into that of its `ideal_camera`."""
+    """The function that turns depth of a camera into depth of its `ideal_camera`.
+
+    Args:
+        camera: the real camera, perhaps with distortion.
+        water: the water surface that it looks through; None for air.
+
+    Returns:
+        A function from depth (H, W) float32 mm to depth (H', W') float32 mm, 0 where unread.
+    """
     source = None if camera.distortion is None else lookup_table(camera)
     laws = None if water is None else pixel_laws(straight_camera(camera), water)
 
     def undo(depth: Depth) -> Depth:
+        """Depth of the real camera as depth of the ideal one.
+
+        Args:
+            depth: (H, W) float32 mm, 0 where unread.
+
+        Returns:
+            (H', W') float32 mm, 0 where unread.
+        """
         if source is not None:
             straight = np.empty(source.shape, np.float32)
             kernels.look_up(depth, source, straight)
@@ -125,12 +169,17 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
 
 
 def lookup_table(camera: Camera) -> NDArray[np.int32]:
-    """For every pixel of the straight picture the pixel of the bent one that lies nearest, row *
-    width + column; or -1.
+    """For every pixel of the straight picture the nearest pixel of the distorted one.
 
-    The other way round would leave holes where the straight picture is the larger one. Depth along
-    the optical axis is the same in both, and is never mixed from neighbours, which would put points
-    between the animal and the floor.
+    Nearest-neighbour inverse warping: the other way round would leave holes where the straight
+    picture is the larger one. Depth along the optical axis is the same in both, and is never mixed
+    from neighbours, which would put points between the animal and the floor.
+
+    Args:
+        camera: the camera with distortion.
+
+    Returns:
+        (H', W') int32, row * width + column in the distorted picture; -1 where there is none.
     """
     straight = straight_camera(camera)
     seen = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
@@ -140,10 +189,17 @@ def lookup_table(camera: Camera) -> NDArray[np.int32]:
 
 
 def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
-    """`Water.law` of every pixel's ray (H, 13, W) for `kernels.lift`, its points as homogeneous
-    pixels of `without`.
+    """Refraction law of every pixel's ray, in homogeneous pixels, as `kernels.lift` takes it.
 
-    A point of the law becomes (u z, v z, z), and three more numbers carry it to the higher camera.
+    A point of the law (`Water.law`) becomes (u z, v z, z) of the camera `without` the water, and
+    three more numbers carry it to that higher camera.
+
+    Args:
+        camera: a camera without distortion.
+        water: the water surface that it looks through.
+
+    Returns:
+        (H, 13, W) float32.
     """
     ideal = water.without(camera)
     up = water.lift_mm
@@ -159,8 +215,13 @@ def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
 
 
 def share_lost(camera: Camera) -> float:
-    """The share of a bent picture's pixels that have no place in the straight one, told from every
-    eighth.
+    """Share of the distorted picture's pixels that the straight picture does not hold.
+
+    Args:
+        camera: the real camera, perhaps with distortion.
+
+    Returns:
+        A share from 0 to 1, told from every eighth row and column; 0 without distortion.
     """
     if camera.distortion is None:
         return 0.0

@@ -1,5 +1,12 @@
-"""RVL, the run-length code for depth images: zeros are counted, steps between readings are stored
-in nibbles.
+"""RVL, lossless run-length and variable-length code for 16-bit depth (Wilson, ISS 2017).
+
+A picture is pairs of counts (unread pixels, read pixels) followed by the read pixels as steps s
+from the one read before, zigzag coded:
+
+    z = (s << 1) ^ (s >> 63).
+
+Every number is written in nibbles of three bits and one that says more follow; eight nibbles make a
+32-bit word, the first in the highest bits.
 """
 
 from __future__ import annotations
@@ -15,8 +22,10 @@ from numpy.typing import NDArray
 def _put(
     value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[np.uint32, int, int]:
-    """Append a number as nibbles of three bits and one that says more follow; eight nibbles make a
-    word.
+    """Append a number as nibbles of three bits and one that says more follow.
+
+    Eight nibbles make a word. Returns the word that is being filled, where the next one goes, and
+    how many nibbles the first holds.
     """
     while True:
         nibble = value & 7
@@ -64,7 +73,14 @@ def _pack(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
 
 
 def pack_rvl(depth: NDArray[np.uint16]) -> NDArray[np.uint32]:
-    """The RVL words of a depth image (H, W)."""
+    """Encode a depth image as RVL words.
+
+    Args:
+        depth: (H, W) uint16, 0 where unread.
+
+    Returns:
+        (m,) uint32 words.
+    """
     pixels = np.ascontiguousarray(depth, np.uint16).ravel()
     # a pixel costs at most 6 nibbles, and every second pixel may add two counts of one nibble each
     words = np.empty(pixels.size + 8, np.uint32)
@@ -72,8 +88,16 @@ def pack_rvl(depth: NDArray[np.uint16]) -> NDArray[np.uint32]:
 
 
 def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """The whole payload of a compressedDepth RVL message, which is what Rerun takes as an
-    `EncodedDepthImage`.
+    """Payload of a compressedDepth RVL message, as ROS writes it and Rerun takes it.
+
+    Rerun's name for it is `EncodedDepthImage`. Before the words stand the configuration (format,
+    and two floats of a quantisation that is not used) and width and height.
+
+    Args:
+        depth: (H, W) uint16, 0 where unread.
+
+    Returns:
+        (m,) uint8 bytes of the payload.
     """
     height, width = depth.shape
     head = struct.pack("<iffII", 0, 0.0, 0.0, width, height)
@@ -106,9 +130,7 @@ def _take(
 
 @njit(cache=True, nogil=True)
 def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
-    """Decode into pixels (n,), which are zero; False where the words do not hold exactly as
-    many.
-    """
+    """Decode words into pixels (n,), which are zero before; False where the words do not fit n."""
     n = len(pixels)
     i = 0
     at = 0
@@ -134,7 +156,16 @@ def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
 
 
 def unpack_rvl(data: bytes | memoryview, width: int, height: int) -> NDArray[np.uint16] | None:
-    """A depth image (H, W) out of its RVL words; None where they are cut short or damaged."""
+    """Decode a depth image out of its RVL words.
+
+    Args:
+        data: the words, 32 bits each, little endian, without a header.
+        width: columns of the image, px.
+        height: rows of the image, px.
+
+    Returns:
+        (H, W) uint16; None where the words are cut short or damaged.
+    """
     words = np.frombuffer(data, "<u4", len(data) // 4).astype(np.uint32, copy=False)
     pixels = np.zeros(width * height, np.uint16)
     return pixels.reshape(height, width) if _unpack(words, pixels) else None
@@ -149,8 +180,13 @@ def _to_millimetres(depth: NDArray[np.float32], out: NDArray[np.uint16]) -> None
 
 
 def to_millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth (H, W) mm to the nearest whole millimetre; 0 stays unread, beyond 65535 mm becomes
-    unread.
+    """Depth rounded to the nearest whole millimetre.
+
+    Args:
+        depth: (H, W) float32 mm, 0 where unread.
+
+    Returns:
+        (H, W) uint16 mm; 0 stays unread, and what is beyond 65535 mm becomes unread.
     """
     out = np.empty(depth.shape, np.uint16)
     _to_millimetres(np.ascontiguousarray(depth, np.float32), out)

@@ -1,5 +1,8 @@
-"""Frames that are still to come: of a file or folder that is being written, or replayed through a
-socket.
+"""Live sources of depth frames: files that still grow, and a TCP stream of raw frames.
+
+A growing file is polled every 20 ms and read on from where it ended. The stream opens with a JSON
+greeting (length as u32, then name and camera); each frame follows as index and time (i64, ns),
+height and width (u32), little endian, then H * W float32 mm, row by row.
 """
 
 from __future__ import annotations
@@ -31,7 +34,12 @@ _MOST_WAITING = 128  # frames that have come and were not asked for yet; then th
 
 
 class Arrival(NamedTuple):
-    """A frame, and when it was there, on the clock of `time.perf_counter`."""
+    """A frame and when it arrived.
+
+    Attributes:
+        frame: the depth frame.
+        at_s: its time of arrival, s, on the clock of `time.perf_counter`.
+    """
 
     frame: DepthFrame
     at_s: float
@@ -39,7 +47,13 @@ class Arrival(NamedTuple):
 
 @dataclass(frozen=True)
 class Arriving:
-    """A recording that goes on: its name and camera, and its frames as they come. Iterate once."""
+    """A recording that goes on: its name and camera, and its frames as they come.
+
+    Attributes:
+        name: name of the recording.
+        camera: the camera of the frames.
+        frames: the frames in order; iterate once.
+    """
 
     name: str
     camera: Camera
@@ -47,10 +61,18 @@ class Arriving:
 
 
 def growing(reopen: Callable[[], Recording], patience_s: float) -> Arriving:
-    """A file or folder that is being written; it is over when nothing has come for patience_s.
+    """Frames of a file or folder that is being written, as they come.
 
-    reopen: opens what is there now, as far as it is whole. It is asked again whenever the last look
-    found all read.
+    Args:
+        reopen: opens what is there now, as far as it is whole; called again whenever all of what it
+            opened last has been read and the format cannot read on by itself.
+        patience_s: the recording is over when nothing has come for this long, s.
+
+    Returns:
+        The recording that goes on; its first frame is there already.
+
+    Raises:
+        RecordingError: no first frame came within patience_s.
     """
     first = _when_there(reopen, patience_s)
     return Arriving(first.name, first.camera, _grown(first, reopen, patience_s))
@@ -102,8 +124,14 @@ def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
 
 
 def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
-    """A recording sent through a socket of this machine at its own pace, or `speed` times
-    as fast.
+    """A recording sent through a socket of this machine at its own pace, or faster.
+
+    Args:
+        recording: what is sent, from its first frame to its last, by a thread of its own.
+        speed: how many times as fast as it was recorded.
+
+    Returns:
+        The frames as they come out of the socket.
     """
     server = socket.create_server(("127.0.0.1", 0))
     threading.Thread(target=_send, args=(server, recording, speed), daemon=True).start()
@@ -111,7 +139,21 @@ def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
 
 
 def received(host: str, port: int) -> Arriving:
-    """What a sender like `replayed` offers at an address."""
+    """Frames from a sender like `replayed`, at a TCP address.
+
+    They are read on a thread of their own, so that the time of a frame is when it came and not when
+    it was asked for; at most 128 wait, then the sender waits.
+
+    Args:
+        host: name or address of the sender.
+        port: its TCP port.
+
+    Returns:
+        The frames as they come, until the sender closes the connection.
+
+    Raises:
+        RecordingError: nobody answers there, or no greeting with name and camera comes within 10 s.
+    """
     try:
         link = socket.create_connection((host, port), timeout=_GREETING_S)
     except OSError as error:
@@ -142,8 +184,9 @@ def _greeting(link: socket.socket, where: str) -> dict[str, Any]:
 
 
 def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
-    """The same, read on a thread of its own, so that a frame's time is when it came and not when it
-    was asked for.
+    """The same frames, read on a thread of their own.
+
+    So a frame's time is when it came and not when it was asked for.
     """
     waiting: Queue[Arrival | None] = Queue(_MOST_WAITING)
 
@@ -168,9 +211,8 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
         ).encode()
         link.sendall(_HEAD.pack(len(greeting)) + greeting)
         first = int(recording.times_ns[0])
-        began: float | None = (
-            None  # when the first frame is read: what that takes is not the recording's pace
-        )
+        # when the first frame is read: what that takes is not the recording's pace
+        began: float | None = None
         for frame in recording:
             began = time.perf_counter() if began is None else began
             late = (frame.time_ns - first) * 1e-9 / speed - (time.perf_counter() - began)
@@ -201,8 +243,9 @@ def _exactly(link: socket.socket, n: int) -> bytes:
 
 
 def _fill(link: socket.socket, place: memoryview) -> bool:
-    """Whether the next bytes came, as many as there is room for; they go where they stay, a frame
-    is millions.
+    """Receive bytes until the buffer is full; False where the sender has gone.
+
+    They go straight to where they stay, for a frame has millions of them.
     """
     filled = 0
     while filled < len(place):

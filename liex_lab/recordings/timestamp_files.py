@@ -1,5 +1,8 @@
-"""Time stamps that stand beside the pictures, in a file or in their names: read as written, exact
-to the nanosecond.
+"""Text formats of time stamps: tables (CSV, blank separated) and stamps in the names of pictures.
+
+A stamp is read as a decimal number and becomes integer nanoseconds exactly; a float64 of seconds
+since 1970 is good to 200 ns only. Names hold a date and time, seconds since 1970 with a fraction
+(as in the TUM RGB-D data sets), or 13, 16 or 19 digits of ms, µs or ns since 1970.
 """
 
 from __future__ import annotations
@@ -32,8 +35,19 @@ _PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 t
 
 
 def to_ns(text: str, ns_per_unit: int) -> int:
-    """A decimal number as integer nanoseconds, exactly: a float64 of seconds since 1970 is good to
-    200 ns only.
+    """A decimal number as integer nanoseconds, exactly.
+
+    A float64 of seconds since 1970 is good to 200 ns only.
+
+    Args:
+        text: the number as it is written.
+        ns_per_unit: nanoseconds in its unit.
+
+    Returns:
+        The time, ns, rounded to a whole one.
+
+    Raises:
+        InvalidOperation: the text is no finite number, or is beyond the year 2116.
     """
     value = Decimal(text.strip()) * ns_per_unit
     if not value.is_finite() or abs(value) >= LIMIT_NS:
@@ -42,12 +56,21 @@ def to_ns(text: str, ns_per_unit: int) -> int:
 
 
 def read_csv_times(path: Path, column: str | int | None = None, unit: str | None = None) -> Times:
-    """The stamps of a table with a header, parted by commas, semicolons, tabs or blanks.
+    """Stamps of a table with a header, separated by commas, semicolons, tabs or blanks.
 
-    column: the name of the column of times, or its number from 0 in a table that may have no
-    header; by itself the first of time_ns, time_us, time_ms and time_s is taken. unit: ns, us, ms
-    or s, where the column's name does not end in it. Lines that begin with # are passed over, but
-    for one that names the columns.
+    Lines that begin with # are passed over, but for one that names the columns.
+
+    Args:
+        path: the table.
+        column: name of the column of times, or its number from 0 in a table that may have no
+            header; None for the first of time_ns, time_us, time_ms and time_s.
+        unit: ns, us, ms or s, where the column's name does not end in it.
+
+    Returns:
+        (n,) int64 stamps, ns, in file order.
+
+    Raises:
+        RecordingError: there is no such column, its unit is not known, or a cell is no number.
     """
     lines = _lines(path)
     rows = [(number, row) for number, row in enumerate(_split(lines), start=1) if row]
@@ -80,8 +103,17 @@ def read_csv_times(path: Path, column: str | int | None = None, unit: str | None
 
 
 def read_column_times(path: Path, ns_per_unit: int) -> Times:
-    """The stamps in column 0 of a file of numbers parted by blanks or commas; a header line is
-    passed over.
+    """Stamps in the first column of a file of numbers; a header line is passed over.
+
+    Args:
+        path: the file, its columns separated by blanks or commas.
+        ns_per_unit: nanoseconds in the unit of column 0.
+
+    Returns:
+        (n,) int64 stamps, ns, in file order.
+
+    Raises:
+        RecordingError: the file is no text, or a line has no number there.
     """
     rows = [
         (number, line.replace(",", " ").split())
@@ -94,12 +126,18 @@ def read_column_times(path: Path, ns_per_unit: int) -> Times:
 
 
 def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
-    """The stamps that stand in the names of pictures, and whether they count from 1970 in UTC.
+    """Stamps in the names of pictures, and whether they count from 1970 in UTC.
 
-    They must stand in every name, in one of these forms: a date and a time with a fraction of a
-    second, as in 20121214T142255.814212 (its zone is not known, so it tells steps and no moment);
+    They must stand once in every name, in one of these forms: a date and a time with a fraction of
+    a second, as in 20121214T142255.814212 (its zone is not known, so it tells steps and no moment);
     seconds since 1970 with a fraction; or 13, 16 or 19 digits of milliseconds, microseconds or
-    nanoseconds since 1970. None where they do not.
+    nanoseconds since 1970. Stamps outside the years 2000 to 2100 are taken for something else.
+
+    Args:
+        names: names of the files, in order.
+
+    Returns:
+        (n,) int64 stamps, ns, and True where they tell a moment; None where the names hold none.
     """
     for form, read in ((_DATE, _date_ns), (_SECONDS, _seconds_ns), (_WHOLE, _whole_ns)):
         found = [form.findall(name) for name in names]

@@ -1,5 +1,10 @@
-"""Time stamps: read as written, exact to the nanosecond, and made to increase without hiding that
-they did not.
+"""Monotone time stamps with the fewest changes, by a longest increasing subsequence.
+
+Stamps are int64 ns. Those that can all stay form a longest increasing subsequence (patience
+sorting, O(n log n)); the others are spread evenly between their kept neighbours. Strict increase
+t[i] < t[i + 1] of integers is the same as t[i] - i not decreasing, so the longest non-decreasing
+subsequence of t[i] - i is used. Lasting jumps of the clock backwards are taken out first. A gap is
+a step of more than 1.5 median steps. What was moved is reported, never hidden.
 """
 
 from __future__ import annotations
@@ -17,9 +22,8 @@ GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames 
 CLOCK_JUMP_NS = (
     60 * 10**9
 )  # no camera drops frames for a minute: it was stopped, or its clock was set
-_SURE = (
-    5  # frames on either side that tell a lasting jump of the clock from a few stamps out of order
-)
+# frames on either side that tell a lasting jump of the clock from a few stamps out of order
+_SURE = 5
 _LONGEST_STEP_NS = 10**9
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
 _PLAUSIBLE_START_NS = (
@@ -33,12 +37,20 @@ JUMPED = "clock_jumped"
 
 @dataclass(frozen=True)
 class Gap:
-    """A place where the recording's time is not what a steady camera would have written.
+    """An interval in which the recording's time is not what a steady camera would have written.
 
-    Half open, like every interval here. Frames that the camera did not deliver: start_frame =
-    stop_frame = the frame after the gap, for no frame lies inside; from start_ns, one median step
-    after the last frame before, to stop_ns, the time of the frame after. A stamp that had to be
-    moved: the one frame it belongs to, n_frames_missing = 0.
+    Intervals are half open. For frames that the camera did not deliver, start_frame = stop_frame =
+    the frame after the gap, for no frame lies inside; the time runs from one median step after the
+    last frame before the gap to the frame after it. For a stamp that had to be moved, the interval
+    holds the one frame it belongs to, and n_frames_missing = 0.
+
+    Attributes:
+        start_frame: row of the first frame of the interval.
+        stop_frame: row behind its last frame.
+        start_ns: beginning of the interval, ns.
+        stop_ns: its end, ns.
+        n_frames_missing: how many frames the camera left out, estimated from the median step.
+        reason: `DROPPED`, or one of `FAULTS`.
     """
 
     start_frame: int
@@ -58,10 +70,13 @@ _JUMPED = 3
 
 @dataclass(frozen=True)
 class Settled:
-    """Stamps made strictly increasing.
+    """Time stamps made strictly increasing.
 
-    times_ns (n,); faults (n,) uint8, index into `FAULTS`: why this frame's stamp was moved, 0 for
-    one that stayed; problem: a sentence about what was moved, None where nothing was.
+    Attributes:
+        times_ns: (n,) int64 ns, strictly increasing.
+        faults: (n,) uint8 index into `FAULTS`: why this frame's stamp was moved, 0 for one that
+            stayed.
+        problem: a sentence about what was moved; None where nothing was.
     """
 
     times_ns: Times
@@ -70,15 +85,29 @@ class Settled:
 
 
 def median_step(times_ns: Times) -> int:
-    """The median time between neighbouring frames, ns; 0 for fewer than two frames."""
+    """Median time between neighbouring frames.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns.
+
+    Returns:
+        The step, ns; 0 for fewer than two frames.
+    """
     return int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
 
 
 def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
-    """The places where more than 1.5 steps of `step_ns` lie between two frames.
+    """Intervals in which frames are missing: steps of more than 1.5 median steps.
 
-    Where it is more than a minute the camera was stopped, or its clock set: how many frames are
-    missing, nobody knows, and one is counted.
+    A step of more than a minute means that the camera was stopped or its clock set. How many frames
+    are missing there, nobody knows, and one is counted.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns, increasing.
+        step_ns: the median step, ns; 0 finds nothing.
+
+    Returns:
+        The gaps in order of time, with the reason `DROPPED` or `JUMPED`.
     """
     if step_ns <= 0:
         return []
@@ -100,7 +129,16 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
 
 
 def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> list[Gap]:
-    """The frames whose stamps were moved, as `Settled.faults` counts them."""
+    """The frames whose stamps were moved, each as an interval of its own.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns, after they were made to increase.
+        step_ns: the median step, ns, for the end of the last frame.
+        faults: (n,) uint8 index into `FAULTS`, as in `Settled.faults`.
+
+    Returns:
+        One interval for every frame with a fault, in order.
+    """
     stops = np.append(times_ns[1:], times_ns[-1:] + max(step_ns, 1))
     return [
         Gap(int(i), int(i) + 1, int(times_ns[i]), int(stops[i]), 0, FAULTS[faults[i]])
@@ -109,18 +147,32 @@ def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> lis
 
 
 def from_rate(n_frames: int, fps: float) -> Times:
-    """Evenly spaced stamps from 0, ns: the last resort, where a file holds no clock."""
+    """Evenly spaced stamps from 0: the last resort, where a file holds no clock.
+
+    Args:
+        n_frames: how many stamps.
+        fps: frame rate, Hz.
+
+    Returns:
+        (n_frames,) int64 ns.
+    """
     return np.round(np.arange(n_frames) * (1e9 / fps)).astype(np.int64)
 
 
 def settle(times_ns: Times) -> Settled:
-    """The stamps made strictly increasing, frames in file order, without hiding what was moved.
+    """Make stamps strictly increasing by moving as few as possible; frames stay in file order.
 
-    A clock that was set back, or wrapped around, while frames went on coming is let go on from
+    A clock that was set back, or wrapped around, while frames went on coming is continued from
     where it was, as if one frame were missing there: how long the jump really took, nobody knows.
-    After that the most stamps that can stay do stay, exactly (the longest chain that increases), so
-    that one wild stamp does not drag its neighbours along; the others are spread evenly between
-    those that stay, for that is where a camera that runs on takes its pictures.
+    After that the most stamps that can stay do stay, exactly (a longest increasing subsequence), so
+    that one wild stamp does not drag its neighbours along. The others are spread evenly between
+    those that stay, for that is when a camera that runs on takes its pictures.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns, in file order.
+
+    Returns:
+        The stamps, which of them were moved and why, and a sentence about it.
     """
     if np.all(np.diff(times_ns) > 0):
         return Settled(times_ns, np.zeros(len(times_ns), np.uint8), None)
@@ -154,11 +206,16 @@ def settle(times_ns: Times) -> Settled:
 
 
 def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
-    """The stamps with every lasting jump back taken out, and the frames (k,) at which the clock
-    jumps.
+    """Take every lasting jump back out of the stamps.
 
     Lasting: `_SURE` stamps before it increase, and `_SURE` from it on increase without reaching the
     one before it. What is shorter is frames out of order, or one wild stamp.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns.
+
+    Returns:
+        The joined stamps (n,), ns, and the frames (k,) at which the clock jumps.
     """
     dt = np.diff(times_ns)
     back = np.flatnonzero(dt <= 0) + 1
@@ -182,8 +239,9 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
 
 
 def _fewest_moved(times_ns: Times) -> Times:
-    """The stamps made strictly increasing by moving as few of them as possible, evenly between
-    those that stay.
+    """Make stamps strictly increasing by moving as few as possible.
+
+    Those that move are spread evenly between those that stay.
     """
     # Integers that must increase by at least 1 are integers minus their rank that must not
     # decrease.
@@ -204,9 +262,7 @@ def _fewest_moved(times_ns: Times) -> Times:
 
 
 def _first_of_equal(times_ns: Times, slack: Times, keep: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The chain with the first of equal stamps in place of a later one: what repeats is the stale
-    one.
-    """
+    """Keep the first of equal stamps in place of a later one: what repeats is stale."""
     chosen = keep.copy()
     for n, k in enumerate(keep.tolist()):
         first = k
@@ -243,8 +299,16 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
 def match_counts(
     n_frames: int, times_ns: Times, frames_from: str, times_from: str
 ) -> tuple[int, str | None]:
-    """How many frames have both a picture and a stamp, and a sentence with both numbers when they
-    differ.
+    """How many frames have both a picture and a stamp.
+
+    Args:
+        n_frames: number of pictures.
+        times_ns: (m,) int64 stamps, ns.
+        frames_from: name of the file or folder of the pictures, for the sentence.
+        times_from: name of the file of the stamps, for the sentence.
+
+    Returns:
+        The smaller of both numbers, and a sentence with both when they differ, else None.
     """
     if n_frames == len(times_ns):
         return n_frames, None
@@ -256,8 +320,13 @@ def match_counts(
 
 
 def start_of_day(stated: str | datetime | None) -> str | None:
-    """A stated start as ISO 8601 with zone; None where there is none or it has no zone, for then it
-    says no moment.
+    """A stated start of the recording as ISO 8601 with zone.
+
+    Args:
+        stated: ISO 8601 text or a datetime, as a file states it; None where it does not.
+
+    Returns:
+        The moment; None where there is none, or it has no zone and so says no moment.
     """
     if isinstance(stated, str):
         try:
@@ -270,8 +339,14 @@ def start_of_day(stated: str | datetime | None) -> str | None:
 
 
 def start_of_clock(first_ns: int) -> str | None:
-    """The moment of a stamp that counts from 1970 (UTC), ISO 8601; None where it plainly counts
-    from something else.
+    """The moment of a stamp that counts from 1970 (UTC), as ISO 8601.
+
+    Args:
+        first_ns: the stamp, ns.
+
+    Returns:
+        The moment, to the microsecond; None where the stamp is before 2000 and so plainly counts
+        from something else.
     """
     if first_ns < _PLAUSIBLE_START_NS:
         return None

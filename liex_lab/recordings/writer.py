@@ -1,7 +1,8 @@
-"""Recordings written frame by frame: what every writer promises; folders of PNG pictures, and .oni.
+"""Writers of recordings, frame by frame: their interface, folders of 16-bit PNG pictures, and .oni.
 
-A writer is left with its `with` block: what belongs at the end is written where the block ended
-well. `notes` then says what a reader of the file should know.
+A writer is used in a `with` block: what belongs at the end of the file is written where the block
+ends without an error. Its `notes` then say what a reader of the file should know. Depth is stored
+in whole steps of `step_mm`, either exactly or rounded to the nearest step.
 """
 
 from __future__ import annotations
@@ -26,22 +27,36 @@ _FACTS = ("subject_id", "session_start_time")  # of the metadata, those that a c
 
 
 class RecordingWriter(ABC):
-    """Takes the frames of a recording in order of time. path: what is written, and there must be
-    nothing yet.
+    """Interface of a writer that takes the frames of a recording in order of time.
+
+    Attributes:
+        path: the file or folder that is written; there must be nothing yet.
+        camera: the camera of the frames.
+        notes: sentences about what the format could not keep, complete after `finish`.
     """
 
     def __init__(self, path: Path, camera: Camera) -> None:
+        """Keep the path and the camera; nothing is written.
+
+        Args:
+            path: the file or folder to write.
+            camera: the camera of the frames.
+        """
         self.path = path
         self.camera = camera
         self.notes: list[str] = []
 
     @abstractmethod
     def add(self, frame: DepthFrame) -> None:
-        """The next frame."""
+        """Append the next frame.
+
+        Args:
+            frame: the frame; its time is not before that of the last one.
+        """
 
     @abstractmethod
     def finish(self) -> None:
-        """Write what belongs at the end."""
+        """Write what belongs at the end of the file."""
 
     @abstractmethod
     def release(self) -> None:
@@ -64,9 +79,9 @@ class RecordingWriter(ABC):
 
 
 class PictureFolderWriter(RecordingWriter):
-    """16-bit PNG pictures, one to a frame, with a camera.toml and a timestamps.csv in nanoseconds.
+    """Writer of a folder of 16-bit PNG pictures, with a camera.toml and a timestamps.csv.
 
-    step_mm: of a stored step; exact: refuse depths between steps instead of rounding them.
+    There is one picture to a frame; the stamps are in nanoseconds.
     """
 
     def __init__(
@@ -78,6 +93,15 @@ class PictureFolderWriter(RecordingWriter):
         exact: bool = True,
         metadata: dict[str, Any] | None = None,
     ) -> None:
+        """Make the folder.
+
+        Args:
+            path: the folder, which must not exist.
+            camera: the camera of the frames, for camera.toml.
+            step_mm: mm of a stored step.
+            exact: refuse depths between steps instead of rounding them.
+            metadata: facts of the recording, of which subject_id and session_start_time are kept.
+        """
         super().__init__(path, camera)
         self._step_mm = step_mm
         self._exact = exact
@@ -86,7 +110,14 @@ class PictureFolderWriter(RecordingWriter):
         path.mkdir()
 
     def add(self, frame: DepthFrame) -> None:
-        """Write a picture; a stamp is kept until the end."""
+        """Write one picture; its stamp is kept until the end.
+
+        Args:
+            frame: the frame, depth (H, W) float32 mm.
+
+        Raises:
+            RecordingError: its depth does not fit into 16 bits, or (exact) lies between steps.
+        """
         steps = steps_of(frame, self._step_mm, self._exact)
         (self.path / f"frame_{len(self._times):06d}.png").write_bytes(png_of(steps))
         self._times.append(frame.time_ns)
@@ -113,13 +144,11 @@ class PictureFolderWriter(RecordingWriter):
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
 
     def release(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, for no file is held open."""
 
 
 class OniRecordingWriter(RecordingWriter):
-    """PrimeSense's .oni; step_mm: 1.0 or 0.1; exact: refuse depths between steps instead of
-    rounding them.
-    """
+    """Writer of PrimeSense's .oni, which holds microseconds and steps of 1.0 or 0.1 mm."""
 
     def __init__(
         self,
@@ -131,8 +160,16 @@ class OniRecordingWriter(RecordingWriter):
         start_ns: int = 0,
         rate_hz: float = 30.0,
     ) -> None:
-        """start_ns: of the first frame, for the format has no time before zero; rate_hz: what the
-        file says of it.
+        """Open the file and write its beginning.
+
+        Args:
+            path: the .oni file.
+            camera: the camera of the frames; its lens distortion is left out, which `notes` then
+                say.
+            step_mm: mm of a stored step, 1.0 or 0.1.
+            exact: refuse depths between steps instead of rounding them.
+            start_ns: stamp of the first frame, ns, for the format has no time before zero.
+            rate_hz: the frame rate that the file states, Hz.
         """
         from liex_lab.recordings.formats.oni.writer import OniWriter
 
@@ -144,13 +181,20 @@ class OniRecordingWriter(RecordingWriter):
         self._oni = OniWriter(path, camera, unit_mm=step_mm, rate_hz=rate_hz, exact=exact)
 
     def add(self, frame: DepthFrame) -> None:
-        """Write a picture with its time in microseconds."""
+        """Write one picture with its time in microseconds.
+
+        Args:
+            frame: the frame, depth (H, W) float32 mm.
+
+        Raises:
+            RecordingError: its depth does not fit into 16 bits, or (exact) lies between steps.
+        """
         time_us, rest = divmod(frame.time_ns - self._earlier_ns + 500, 1000)
         self._rounded |= rest != 500
         self._oni.add(time_us, frame.depth)
 
     def finish(self) -> None:
-        """Write the table of seeking."""
+        """Write the seek table and the counts."""
         self._oni.close()
         if self._rounded:
             self.notes.append("times were rounded to microseconds, which is what .oni holds")
@@ -167,12 +211,24 @@ class OniRecordingWriter(RecordingWriter):
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
 
     def release(self) -> None:
-        """Close the file."""
+        """Close the file; closing twice does no harm."""
         self._oni.abandon()  # closing twice does no harm
 
 
 def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint16]:
-    """A frame's depth in steps of 16 bits, or the sentence why there are none."""
+    """Depth of a frame as 16-bit steps.
+
+    Args:
+        frame: the frame, depth (H, W) float32 mm.
+        step_mm: mm of a step.
+        exact: refuse depths between steps instead of rounding them.
+
+    Returns:
+        (H, W) uint16 steps, 0 where unread.
+
+    Raises:
+        RecordingError: a depth is beyond 65535 steps, or (exact) lies between two of them.
+    """
     depth: Depth = frame.depth
     steps = whole_steps(depth, step_mm) if exact else nearest_steps(depth, step_mm)
     if steps is not None:
@@ -191,7 +247,14 @@ def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint1
 
 
 def png_of(steps: NDArray[np.uint16]) -> bytes:
-    """A picture (H, W) as 16-bit PNG."""
+    """Encode a picture as 16-bit grey PNG.
+
+    Args:
+        steps: (H, W) uint16.
+
+    Returns:
+        The bytes of the PNG file.
+    """
     import cv2
 
     good, packed = cv2.imencode(".png", steps)

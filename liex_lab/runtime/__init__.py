@@ -1,1 +1,1 @@
-"""How a job behaves on a machine: its memory, its threads, and what it says while it works."""
+"""Running on a machine: memory and memory-mapped arrays, threads, prefetching, progress."""

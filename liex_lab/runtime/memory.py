@@ -1,5 +1,6 @@
-"""How much memory this process has held, and arrays that lie on disk so that hours of recording
-take no more of it.
+"""Memory of a process: its peak, trimming of the heap, and disk-backed arrays (memory maps).
+
+Arrays that lie on disk let hours of recording take no more memory than minutes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ Room = Callable[
 
 
 def peak_memory_mb() -> float | None:
-    """The most memory this process has held, MB; None where the system does not tell."""
+    """The most memory this process has held, MB; None where the system does not tell.
+
+    VmHWM of /proc/self/status, else getrusage, which would also count the process that started this
+    one.
+    """
     status = Path(
         "/proc/self/status"
     )  # getrusage would also count the process that started this one
@@ -42,10 +47,10 @@ def peak_memory_mb() -> float | None:
 
 
 def give_back() -> None:
-    """Hand memory that is not used any more back to the system, where it would be kept for later.
+    """Trim the heap: hand memory that is not used any more back to the system.
 
-    glibc keeps what lies between arrays still in use, and Arrow what tables took; after hours of
-    recording it is much.
+    It would be kept for later otherwise: glibc keeps what lies between arrays still in use, and
+    Arrow what tables took; after hours of recording it is much.
     """
     if "pyarrow" in sys.modules:
         sys.modules["pyarrow"].default_memory_pool().release_unused()
@@ -58,13 +63,20 @@ def give_back() -> None:
 
 
 def on_disk(folder: Path) -> Room:
-    """Where arrays are made that lie in nameless files of that folder and go with the last who
-    looks at them; in memory where files of that disk cannot be mapped, as on some shares.
+    """An array allocator whose arrays lie in nameless files and go with their last user.
 
-    Making one raises OSError where the disk is full, so that filling it cannot fail.
+    In memory where files of that disk cannot be mapped, as on some shares. Making an array raises
+    OSError where the disk is full, so that filling it cannot fail.
+
+    Args:
+        folder: on the disk that is to hold the arrays.
+
+    Returns:
+        A function of shape and dtype that gives an array to be filled, as np.empty.
     """
 
     def room(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        """An array of this shape and dtype in a nameless file; OSError where the disk is full."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if not size:
             return np.empty(shape, dtype)
@@ -95,16 +107,23 @@ def _reserve(file: IO[bytes], size: int) -> None:
 
 
 def blocks(n: int, size: int) -> Iterator[slice]:
-    """The rows (n,) of something long, `size` at a time."""
+    """Consecutive blocks of the rows of something long, as slices.
+
+    Args:
+        n: rows.
+        size: rows of a block; the last has fewer.
+    """
     return (slice(start, min(start + size, n)) for start in range(0, n, size))
 
 
 def let_go(*arrays: NDArray[Any]) -> None:
-    """Let go of the memory of those of these arrays that are mapped from files; it is read again
-    when it is wanted.
+    """Release the pages of arrays that are mapped from files; they are read again when wanted.
 
     Only for what is shared with its file (`on_disk`) or never written to: changes of a private copy
     would be lost.
+
+    Args:
+        *arrays: any arrays, or views of them; those that are not mapped stay as they are.
     """
     for array in arrays:
         base: Any = array

@@ -1,5 +1,7 @@
-"""How a long job tells the person who waits how far it is: one callable, handed down from the
-command line.
+"""Progress reports of long jobs: one callable, handed down from the command line.
+
+A job calls it with pieces done, pieces in all, and what is being done; a bar or a board shows it to
+the person who waits.
 """
 
 from __future__ import annotations
@@ -14,19 +16,33 @@ class Progress(Protocol):
     """Whoever wants to know how far a job is."""
 
     def __call__(self, done: int, total: int | None, what: str) -> None:
-        """Told after every piece of work: pieces done, pieces in all (None: nobody knows), what is
-        being done.
+        """Take a report, after every piece of work.
+
+        Args:
+            done: pieces done.
+            total: pieces in all; None where nobody knows.
+            what: what is being done.
         """
 
 
 def silent(done: int, total: int | None, what: str) -> None:
-    """The progress nobody looks at: the default of every job."""
+    """The progress nobody looks at: the default of every job.
+
+    Args:
+        done: pieces done.
+        total: pieces in all, or None.
+        what: what is being done.
+    """
 
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error, gone when the block ends; nothing at all where that is not
-    a terminal.
+    """A progress bar on standard error, gone when the block ends.
+
+    Nothing is shown where that is not a terminal.
+
+    Yields:
+        The progress to hand to a job.
     """
     from rich.console import Console
     from rich.progress import (
@@ -53,6 +69,7 @@ def progress_bar() -> Iterator[Progress]:
         last: tuple[int, int | None] = (0, None)
 
         def report(done: int, total: int | None, what: str) -> None:
+            """Show done out of total pieces and what is being done; a new total resets the time."""
             nonlocal last
             if total != last[1] or done < last[0]:
                 display.reset(task, total=total)  # a new stage: its remaining time is its own
@@ -67,8 +84,15 @@ COMPILING = "compiling, once on this machine: a minute or two"
 
 @contextmanager
 def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
-    """The same progress, which within the block also hears of kernels being compiled, and then
-    again what it heard last.
+    """The same progress, which within the block also hears of numba kernels being compiled.
+
+    After the last compilation it hears again what it heard last.
+
+    Args:
+        progress: who is told.
+
+    Yields:
+        The progress to hand to the job.
     """
     from numba.core import event
 
@@ -76,17 +100,22 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
     under_way = 0
 
     def tell(done: int, total: int | None, what: str) -> None:
+        """Pass on done, total and what, and keep them."""
         nonlocal last
         last = (done, total, what)
         progress(done, total, what)
 
     class Compiles(event.Listener):
+        """Listener of numba's compilations."""
+
         def on_start(self, event: object) -> None:
+            """A compilation began (event): say so."""
             nonlocal under_way
             under_way += 1
             progress(0, None, COMPILING)
 
         def on_end(self, event: object) -> None:
+            """A compilation ended (event): after the last one, say again what was said before."""
             nonlocal under_way
             under_way -= 1
             if not under_way:
@@ -97,15 +126,24 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
 
 
 class Board:
-    """How far many jobs are that run at once: a bar for each that runs, one for all, and a line for
-    each that ended.
+    """How far many jobs are that run at once.
+
+    A bar for each that runs, one for all, and a line for each that ended.
+
+    Attributes:
+        n_ended: jobs that are over.
+        n_failed: those of them that failed.
     """
 
     def __init__(
         self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """say: takes the lines; clock: seconds that only go on, whatever the computer's clock is
-        set to.
+        """A board on which no job has begun.
+
+        Args:
+            n_jobs: jobs in all.
+            say: takes the lines.
+            clock: seconds that only go on, whatever the computer's clock is set to.
         """
         self._n = n_jobs
         self._say = say
@@ -115,11 +153,24 @@ class Board:
         self.n_ended = self.n_failed = 0
 
     def told(self, name: str, done: int, total: int | None, what: str) -> None:
-        """A job is so far: pieces done, pieces in all, what is being done."""
+        """Take the report of one job.
+
+        Args:
+            name: of the job.
+            done: pieces done.
+            total: pieces in all; None where nobody knows.
+            what: what is being done.
+        """
         self._running[name] = min(done / total, 1.0) if total else self._running.get(name, 0.0)
 
     def ended(self, name: str, sentence: str, failed: bool) -> None:
-        """A job is over."""
+        """A job is over: count it and say a line, with the time left.
+
+        Args:
+            name: of the job.
+            sentence: how it ended, to follow the name.
+            failed: whether it failed.
+        """
         self._running.pop(name, None)
         self.n_ended = self.n_ended + 1
         self.n_failed = self.n_failed + failed
@@ -141,7 +192,7 @@ class Board:
 
     @property
     def lines(self) -> list[tuple[str, float]]:
-        """The jobs that run, and how much of each is done."""
+        """The names of the jobs that run, in order, and the share (0 to 1) of each that is done."""
         return sorted(self._running.items())
 
 
@@ -157,7 +208,14 @@ def _span(seconds: float) -> str:
 
 @contextmanager
 def progress_board(n_jobs: int) -> Iterator[Board]:
-    """A board on standard error; bars only where that is a terminal, the lines always."""
+    """A board on standard error; bars only where that is a terminal, the lines always.
+
+    Args:
+        n_jobs: jobs in all.
+
+    Yields:
+        The board to report to.
+    """
     from rich.console import Console
     from rich.live import Live
     from rich.table import Table

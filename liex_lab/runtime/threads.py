@@ -1,4 +1,4 @@
-"""How many cores a kernel or a product may use: one, or as many as there are."""
+"""Threads of numba kernels and of BLAS, prefetching of an iterator, a task in the background."""
 
 from __future__ import annotations
 
@@ -11,8 +11,15 @@ Item = TypeVar("Item")
 
 
 def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
-    """The same items, each made by a thread while the one before it is used; what goes wrong is
-    raised in its turn.
+    """Prefetch: the same items, each made by a thread while the one before it is used.
+
+    What goes wrong while an item is made is raised in its turn.
+
+    Args:
+        items: what is iterated over, one item ahead, on a thread of its own.
+
+    Yields:
+        The items, in their order.
     """
     left = iter(items)
     end = object()
@@ -28,8 +35,15 @@ def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
 
 @contextmanager
 def meanwhile(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
-    """What `make` makes on a thread of its own while the block runs; what is yielded waits for it,
-    and raises what went wrong. A block that ends before is not held up.
+    """Run one function in the background, on a thread of its own, while the block runs.
+
+    A block that ends before is not held up.
+
+    Args:
+        make: the function.
+
+    Yields:
+        A function that waits for the result and returns it, or raises what went wrong.
     """
     maker = ThreadPoolExecutor(1)
     coming = maker.submit(make)
@@ -41,11 +55,14 @@ def meanwhile(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
 
 @contextmanager
 def threads(parallel: bool) -> Iterator[None]:
-    """Within the block, parallel kernels run on one thread unless `parallel`.
+    """Within the block, parallel numba kernels run on all threads or on one.
 
     One kernel serves both: two numba functions made from one Python function, with and without
     parallel=True, share an entry in numba's cache, and whichever was compiled first is loaded for
     both.
+
+    Args:
+        parallel: whether as many threads as before, else one.
     """
     import numba
 

@@ -1,4 +1,4 @@
-"""The only door for results: a session folder is written and read here."""
+"""Session folders: the on-disk format of one recording's results, written and read here only."""
 
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.session import Session

@@ -1,4 +1,9 @@
-"""Corrections applied: to the track of a session, and to the bouts of its ethogram."""
+"""Application of human corrections: flips and joint moves to the track, bout edits to the ethogram.
+
+A flip makes the track again from the observations with the association constrained in its span. A
+moved joint is fitted by weighted least squares over joint angles (inverse kinematics), so that
+bones keep their lengths and joints their limits. Bout edits cut and replace half-open intervals.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +41,13 @@ _HELD = 20.0  # how much more a joint that a person placed counts than one that 
 
 @dataclass(frozen=True)
 class CorrectedTrack:
-    """A track with the corrections of flips and joints in it. turned: rows in which exchanging head
-    and tail may have changed the pose; moved: rows with joints that a person placed; flips: the
-    table `flips`.
+    """A track with the corrections of flips and joints in it.
+
+    Attributes:
+        track: the corrected track.
+        turned: (k,) rows in which exchanging head and tail may have changed the pose.
+        moved: (m,) rows with joints that a person placed.
+        flips: the rows of the table `flips`, frames counted by row.
     """
 
     track: Track
@@ -48,12 +57,22 @@ class CorrectedTrack:
 
     @property
     def changed(self) -> bool:
-        """Whether any pose is another one."""
+        """Whether any pose is another one than was measured."""
         return bool(len(self.turned) + len(self.moved))
 
 
 def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> CorrectedTrack:
-    """The track of a session, opened raw, with the standing corrections of its log."""
+    """Track of a session with the standing corrections of its log.
+
+    Args:
+        session: the session, opened raw.
+        log: its corrections; bout edits are not looked at here.
+        skeleton: the skeleton that the session was made with.
+
+    Raises:
+        SessionError: the session holds no observations to make the track of again, or a joint was
+            moved in a frame that has no pose.
+    """
     track = track_of(session, skeleton)
     index = session.frames["frame_index"].to_numpy(np.int64)
     flips = tuple(read_flips(session))
@@ -69,8 +88,9 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
 def _turned_round(
     session: Session, track: Track, index: Rows, spans: Sequence[FlipSpan]
 ) -> tuple[Track, tuple[Flip, ...], Rows]:
-    """The track made again from what the single frames said, with the spans turned round; far from
-    them it stays.
+    """The track made again from the observations, with the spans turned round.
+
+    Rows farther than `MARGIN` from every span keep what they had.
     """
     seen, subject = read_evidence(session)
     wanted = [Flip(*_rows_of(index, span), 1.0, True, HUMAN) for span in spans]
@@ -90,11 +110,25 @@ def _turned_round(
 def place_joints(
     track: Track, index: Rows, moves: Sequence[JointMove], camera: Camera, T_arena_camera: SE3
 ) -> Rows:
-    """Put joints where a person says, in place, and let the others follow; returns the rows that
-    this changed.
+    """Put joints where a person says, in place, and let the others follow; returns changed rows.
 
-    A local fit of the chain: bones keep their lengths and joints their limits, and those that
-    nobody placed stay as near as they can to where they were.
+    Least-squares fit of the kinematic tree (inverse kinematics by Levenberg-Marquardt): bones keep
+    their lengths and joints their limits. The residual of a joint that a person placed counts 20
+    times that of the others, which stay as near as they can to where they were. The rows get the
+    flag `corrected`.
+
+    Args:
+        track: the track, n rows, changed in place.
+        index: (n,) the camera's frame count of each row, ascending.
+        moves: the joints that were placed, arena frame, mm.
+        camera: the depth camera, for the pixels of the joints.
+        T_arena_camera: carries the camera frame into the arena frame.
+
+    Returns:
+        (k,) rows that were changed.
+
+    Raises:
+        SessionError: a joint was moved in a frame that has no pose.
     """
     if not moves:
         return np.zeros(0, np.int64)
@@ -134,6 +168,7 @@ def place_joints(
 
 
 def _rows_of(index: Rows, span: FlipSpan) -> tuple[int, int]:
+    """First row of a span of frames, and the first row after it."""
     return int(np.searchsorted(index, span.start_frame)), int(
         np.searchsorted(index, span.stop_frame)
     )
@@ -142,10 +177,18 @@ def _rows_of(index: Rows, span: FlipSpan) -> tuple[int, int]:
 def edited_bouts(
     bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.DataFrame
 ) -> pd.DataFrame:
-    """The columns of `tables.BOUTS` of an ethogram with a person's edits, one after the other.
+    """Ethogram with a person's edits applied, one after the other.
 
-    Each clears the bout that it edits, then its own span: a bout that reaches into it keeps what
-    lies outside. What a person says has the source human, the score 1 and no model.
+    Each edit clears the bout that it edits, then its own span: a bout that reaches into the span
+    keeps what lies outside. What a person says has the source human, the score 1 and no model.
+
+    Args:
+        bouts: the table `bouts` of the session.
+        edits: the edits, in the order in which they were made.
+        frames: the table `frames`, for the times of the rows.
+
+    Returns:
+        A table with the columns of `tables.BOUTS`.
     """
     rows = _spans(bouts, frames)
     for edit in edits:
@@ -161,8 +204,18 @@ def edited_bouts(
 def spliced_bouts(
     bouts: pd.DataFrame, other: pd.DataFrame, rows: Rows, frames: pd.DataFrame
 ) -> pd.DataFrame:
-    """The bouts of one ethogram, and in some rows of the recording those of another; one word
-    across a seam is one bout.
+    """Ethogram that takes some rows of the recording from another ethogram.
+
+    One word across a seam is one bout.
+
+    Args:
+        bouts: the table `bouts` that holds everywhere else.
+        other: the table `bouts` that holds in `rows`.
+        rows: (k,) rows of the recording, ascending, at least one.
+        frames: the table `frames`, for the times of the rows.
+
+    Returns:
+        A table with the columns of `tables.BOUTS`.
     """
     times = frames["time_ns"].to_numpy(np.int64)
     inside = _spans(other, frames)
@@ -183,8 +236,9 @@ def spliced_bouts(
 
 
 def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """Bouts as rows with their ends on the recording's clock: the frames' own times where they are
-    one.
+    """Bouts as dicts with start and stop on the recording's clock, ns.
+
+    A time within 1 ns of a frame's is that frame's own.
     """
     times = frames["time_ns"].to_numpy(np.int64)
     rows: list[dict[str, Any]] = []
@@ -211,7 +265,7 @@ def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[di
 
 
 def _table(rows: Sequence[dict[str, Any]], frames: pd.DataFrame) -> pd.DataFrame:
-    """Rows in order of time as the table; a piece of a bout without a frame is none."""
+    """Bouts in order of time as the table `bouts`; a piece of a bout without a frame is dropped."""
     times = frames["time_ns"].to_numpy(np.int64)
     count = frame_count(frames["frame_index"].to_numpy(np.int64))
     first = int(times[0])

@@ -1,4 +1,4 @@
-"""Tracks that grow by parts, and dataclasses of arrays by their columns."""
+"""Growing array buffer of a track, filled part by part."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ if TYPE_CHECKING:
 
 
 class Columnar(Protocol):
-    """A dataclass of a skeleton and arrays with one row for each frame: `Observations`, `Track`."""
+    """A dataclass of a skeleton and arrays with one row per frame: `Observations`, `Track`."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
 def columns_of(rows: Columnar) -> dict[str, NDArray[Any]]:
-    """The arrays of a dataclass by name, in its own order."""
+    """Arrays of a dataclass by name, in the order of its fields.
+
+    Args:
+        rows: the dataclass; fields that are no arrays are left out.
+    """
     return {
         one.name: value
         for one in fields(rows)
@@ -30,8 +34,13 @@ def columns_of(rows: Columnar) -> dict[str, NDArray[Any]]:
 
 
 class TrackBuffer:
-    """A track that grows by parts, in arrays made for the expected number of frames, so that
-    nothing is held twice.
+    """A track that grows by parts, in arrays made for the expected number of frames.
+
+    Nothing is held twice as long as the expectation holds; beyond it the arrays grow by half.
+
+    Args:
+        skeleton: the skeleton of the track.
+        n_expected: frames to make room for.
     """
 
     def __init__(self, skeleton: Skeleton, n_expected: int) -> None:
@@ -40,14 +49,22 @@ class TrackBuffer:
 
     @staticmethod
     def of(track: Track) -> TrackBuffer:
-        """One that holds a track as it is."""
+        """A buffer that holds a track as it is, not copied.
+
+        Args:
+            track: all rows so far.
+        """
         held = TrackBuffer(track.skeleton, 0)
         held._room = track
         held._n = track.n_frames
         return held
 
     def append(self, part: Track) -> None:
-        """Take the next rows."""
+        """Append the next rows.
+
+        Args:
+            part: a track of the same skeleton.
+        """
         needed = self._n + part.n_frames
         if needed > self._room.n_frames:
             more = max(needed - self._room.n_frames, self._room.n_frames // 2)

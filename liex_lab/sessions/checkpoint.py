@@ -1,9 +1,9 @@
-"""An unfinished session: a folder beside the final place that says how far the work has come, so
-that it can go on.
+"""Checkpoint and restart of an unfinished session: append-only files and a record of their lengths.
 
-What was seen in the frames lies in it as plain arrays that only grow; the logs (replay, MCAP) grow
-beside them. Every few seconds `checkpoint.json` takes down, by a rename, how long all of them were
-at one moment. Whatever lies behind that is cut off before the work goes on.
+An unfinished session is a folder beside the final place. The observations of its frames lie in it
+as plain arrays that only grow; the logs (replay, MCAP) grow beside them. Every few seconds
+`checkpoint.json` records, by an atomic rename, how many bytes of each were valid at one moment.
+Whatever lies behind that is truncated before the work goes on.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from liex_lab.errors import SessionError
 from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.lock import take_lock
 
-EVERY_S = (
-    3.0  # between two checkpoints: as much work is lost at most, besides what it takes to begin
-)
+# between two checkpoints: as much work is lost at most, besides what it takes to begin
+EVERY_S = 3.0
 _STATE = "checkpoint.json"
 _LOCK = "lock"
 _SEEN = "seen"
@@ -47,12 +46,17 @@ Clock = Callable[[], float]
 
 @dataclass
 class State:
-    """How far a session is. n_frames: written and seen; seconds: spent on them; runs: parts that
-    each log is in, one for each time that the work was begun and for each of the stretches that
-    others wrote.
+    """How far a session is: the content of checkpoint.json.
 
-    logs: for each part of each log its bytes, in the order of writing: "session.mcap" -> [1200,
-    5030].
+    Attributes:
+        key: SHA-256 of the facts that the session is made from; only the same ones go on.
+        n_frames: frames written, with their observations.
+        seconds: time spent on them, s.
+        runs: parts that each log is in, one for each time that the work was begun and one for each
+            shard that another process wrote.
+        logs: for each log the bytes of each of its parts, in the order of writing: "session.mcap"
+            -> [1200, 5030].
+        stretches: how many of the parts are shards taken over.
     """
 
     key: str
@@ -64,13 +68,27 @@ class State:
 
 
 class Checkpoint:
-    """The folder of an unfinished session, held by this process alone."""
+    """The folder of an unfinished session, locked by this process alone.
+
+    Attributes:
+        folder: the folder.
+        state: how far the session is.
+        seconds_before: time spent in earlier runs, s.
+        seen: the observations on disk.
+    """
 
     def __init__(
         self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic
     ) -> None:
-        """Begin, or go on where a session of the same facts (JSON) was left. clock: seconds that
-        never jump.
+        """Begin, or go on where a session of the same facts was left.
+
+        Args:
+            folder: the folder NAME.part; made if needed.
+            facts: what the session is made from, as JSON knows it.
+            clock: seconds that never jump.
+
+        Raises:
+            SessionError: another process is writing the session.
         """
         folder.mkdir(parents=True, exist_ok=True)
         check_free(folder)
@@ -98,12 +116,16 @@ class Checkpoint:
 
     @property
     def due(self) -> bool:
-        """Whether the last checkpoint was long enough ago."""
+        """Whether the last checkpoint was `EVERY_S` ago or longer."""
         return self._clock() - self._last >= EVERY_S
 
     def save(self, n_frames: int, seconds: float, logs: Mapping[str, int]) -> None:
-        """Take down that everything up to a frame is on disk; logs: the bytes of each log's present
-        part.
+        """Record that everything up to a frame is on disk.
+
+        Args:
+            n_frames: frames written, with their observations.
+            seconds: time spent on them, s, earlier runs included.
+            logs: bytes of the present part of each log.
         """
         self.seen.flush()
         present = {
@@ -122,8 +144,14 @@ class Checkpoint:
         )
 
     def take(self, n_frames: int, seconds: float, logs: Mapping[str, Path]) -> None:
-        """Take over the next part of each log, written by another process; what was seen in it is
-        in `seen` already.
+        """Take over the next part of each log, a shard that another process wrote.
+
+        Its observations are in `seen` already.
+
+        Args:
+            n_frames: frames that the session has then.
+            seconds: time spent on them, s.
+            logs: the file of each log; it is moved.
         """
         self.seen.flush()
         sizes = {}
@@ -143,15 +171,16 @@ class Checkpoint:
         self.state, self._last = state, self._clock()
 
     def begin_to_take(self) -> None:
-        """Take down that nothing is there yet, so that what others write meanwhile is kept."""
+        """Record that nothing is there yet, so that what others write meanwhile is kept."""
         if not (self.folder / _STATE).is_file():
             self._keep(State(self.state.key, runs=0))
             self.state.runs = 1
 
     @property
     def n_parts(self) -> int:
-        """Parts of each log: one, and one more for each time the work went on or a stretch was
-        taken over.
+        """How many parts each log is in.
+
+        One, and one more for each time the work went on or a shard was taken over.
         """
         return self.state.runs
 
@@ -161,25 +190,35 @@ class Checkpoint:
         return max(0, self.n_parts - 1 - self.state.stretches)
 
     def part(self, log: str, number: int) -> Path:
-        """Where a part of a log lies; the first one under the log's own name."""
+        """Path of a part of a log; the first one lies under the log's own name.
+
+        Args:
+            log: the log's name, one of `LOGS`.
+            number: which part, from 0.
+        """
         path = self.folder / log
         return path if number == 0 else path.with_name(f"{path.stem}-{number}{path.suffix}")
 
     def parts(self, log: str) -> list[tuple[Path, int | None]]:
-        """The parts of a log in order, with the bytes of each that count; None for all of the
-        present one.
+        """Parts of a log in order, with the bytes of each that count.
+
+        Args:
+            log: the log's name, one of `LOGS`.
+
+        Returns:
+            (path, bytes) of each part; None for all bytes of the present one.
         """
         sizes: list[int | None] = [*self.state.logs.get(log, [])[: self.n_parts - 1], None]
         return [(self.part(log, k), size) for k, size in enumerate(sizes)]
 
     @property
     def logs(self) -> dict[str, Path]:
-        """Each log's name in the finished session, and where it lies when it is joined."""
+        """Each log's name in the finished session, and the path where it lies once it is joined."""
         joined = "" if self.n_parts == 1 else "whole-"
         return {log: self.folder / f"{joined}{log}" for log in LOGS}
 
     def join_logs(self) -> None:
-        """Logs that were written in parts, for the work was interrupted, become one each."""
+        """Join logs that were written in parts into one file each."""
         from liex_lab.sessions.joining import join_mcap, join_rrd
 
         if self.n_parts > 1:
@@ -187,8 +226,9 @@ class Checkpoint:
                 join(self.parts(log), whole)
 
     def drop_parts(self) -> None:
-        """The joined logs take the place of their parts, from which the work could have gone on
-        until now.
+        """Put the joined logs in the place of their parts.
+
+        Until now the work could have gone on from the parts.
         """
         if self.n_parts > 1:
             for log, whole in self.logs.items():
@@ -197,7 +237,11 @@ class Checkpoint:
                 whole.replace(self.folder / log)
 
     def tidy(self, folder: Path) -> None:
-        """Remove what is no part of the finished session from where it is now, and let go of it."""
+        """Remove what is no part of the finished session, and let go of the lock.
+
+        Args:
+            folder: where the session is now.
+        """
         self.seen.close()
         for name in OWN:
             path = folder / name
@@ -208,7 +252,12 @@ class Checkpoint:
         self._held.close()
 
     def leave(self, keep: bool) -> None:
-        """Let go of the folder; keep: so that the work can go on later, otherwise nothing stays."""
+        """Let go of the folder without finishing the session.
+
+        Args:
+            keep: leave it there if it has a checkpoint, so that the work can go on later; otherwise
+                nothing stays.
+        """
         self.seen.close()
         if not (keep and (self.folder / _STATE).is_file()):
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -242,8 +291,12 @@ class Checkpoint:
 
 
 class Columns:
-    """Arrays on disk that grow by rows, one file each, and a small text that says what they hold,
-    in order.
+    """Arrays on disk that grow by rows.
+
+    One binary file each, and columns.json with names, dtypes and row shapes in order.
+
+    Args:
+        folder: where the files lie; it exists.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -252,7 +305,15 @@ class Columns:
         self._files: dict[str, IO[bytes]] = {}
 
     def append(self, columns: Mapping[str, NDArray[Any]]) -> None:
-        """The next rows (n, ...) of every column."""
+        """Append the next rows of every column.
+
+        Args:
+            columns: arrays (n, ...) by name; always the same names, dtypes and row shapes, in the
+                same order.
+
+        Raises:
+            ValueError: the columns are others than before.
+        """
         kinds = {
             name: (values.dtype.str, list(values.shape[1:])) for name, values in columns.items()
         }
@@ -275,19 +336,20 @@ class Columns:
         return 0
 
     def flush(self) -> None:
-        """Hand everything to the system."""
+        """Hand everything written so far to the operating system."""
         for file in self._files.values():
             file.flush()
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         for file in self._files.values():
             file.close()
         self._files.clear()
 
     def read(self) -> dict[str, NDArray[Any]]:
-        """All rows of every column, in memory that the system may take back; empty where none was
-        written.
+        """All rows of every column, mapped from the files; empty where none was written.
+
+        The arrays are private copies on write; the system may take their memory back.
         """
         self.flush()
         return {
@@ -298,7 +360,12 @@ class Columns:
 
     @staticmethod
     def cut(folder: Path, n: int) -> bool:
-        """Cut every column back to n rows; False where one has fewer."""
+        """Truncate every column to its first rows; False where one has fewer.
+
+        Args:
+            folder: where the files lie.
+            n: rows to keep.
+        """
         kinds = _read_kinds(folder)
         if kinds is None:
             return n == 0
@@ -313,10 +380,15 @@ class Columns:
 
 
 def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
-    """Have the recording's hash, which takes long for hours of it, from an interrupted run where
-    its files are as then.
+    """Compute the recording's SHA-256, or take it from an interrupted run of the same files.
 
-    folder: of the unfinished session.
+    Hashing hours of recording takes long. A hash that took longer than `EVERY_S` is kept in
+    input.json, and holds as long as names, sizes and times of the files are the same.
+
+    Args:
+        recording: the recording, which holds its hash afterwards.
+        folder: the folder of the unfinished session.
+        progress: told how many MB were read.
     """
     stamp = recording.stamp
     try:
@@ -333,7 +405,11 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
 
 
 def check_free(folder: Path) -> None:
-    """Refuse an unfinished session's folder that another process writes."""
+    """Raise SessionError where another process writes the unfinished session of a folder.
+
+    Args:
+        folder: the folder NAME.part.
+    """
     if (folder / _LOCK).is_file():
         held = take_lock(folder / _LOCK)
         if held is None:

@@ -1,5 +1,8 @@
-"""Corrections that a person asks for, checked against the session: from seconds, pixels and words
-to entries.
+"""Corrections as a person states them, checked against the session and made into log entries.
+
+Seconds become frames, a pixel becomes a point of the arena frame (back-projection through the
+pinhole camera at the depth read there), words are looked up in the ethogram's vocabulary. Times are
+taken to be typed with three decimals. Used by `liex correct` and by the dashboard.
 """
 
 from __future__ import annotations
@@ -26,8 +29,15 @@ _WORD_LENGTH = 60
 
 
 def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
-    """Head and tail are exchanged from start_s to stop_s, seconds since the first frame, stop
-    exclusive.
+    """Correction that exchanges head and tail in a span of time.
+
+    Args:
+        session: the session.
+        start_s: start, s since the first frame.
+        stop_s: stop, s, exclusive.
+
+    Raises:
+        SessionError: the span holds no frame.
     """
     first, last = rows_between(session, start_s, stop_s, "a span to flip")
     count = frame_count(session.frames["frame_index"].to_numpy(np.int64))
@@ -35,10 +45,17 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
 
 
 def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> JointMove:
-    """A joint of one frame, the camera's count, lies at place_mm (3,), arena frame.
+    """Correction that puts a joint of one frame to a position.
 
-    Raises SessionError where there is no such frame, joint or pose, or where the place is farther
-    from where the joint was than the animal is long.
+    Args:
+        session: the session.
+        frame: the frame, the camera's count.
+        joint: the joint's name.
+        place_mm: (3,) position, mm, arena frame.
+
+    Raises:
+        SessionError: there is no such frame, joint or pose, or the position is farther from where
+            the joint was than the animal is long.
     """
     row, was = _joint_row(session, frame, joint)
     place = np.asarray(place_mm, float)
@@ -60,10 +77,21 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
 def joint_move_at_pixel(
     session: Session, frame: int, joint: str, u_px: float, v_px: float
 ) -> JointMove:
-    """A joint of one frame lies under the pixel (u_px, v_px) of the depth picture.
+    """Correction that puts a joint of one frame under a pixel of the depth picture.
 
-    The depth there is that of the skin; the joint is put as deep under it as it usually lies: the
-    median over frames of the recording in which the pose is trusted.
+    The depth read there is that of the skin: the median over 3 x 3 pixels. The joint is put as deep
+    under it as it usually lies: the median over up to 24 frames of the recording in which the pose
+    is trusted.
+
+    Args:
+        session: the session.
+        frame: the frame, the camera's count.
+        joint: the joint's name.
+        u_px: column, px; 0 is the centre of the first one.
+        v_px: row, px; 0 is the centre of the first one.
+
+    Raises:
+        SessionError: the pixel is outside the picture or has no depth, or see `joint_move`.
     """
     from liex_lab.recordings import open_recording
 
@@ -92,7 +120,13 @@ def joint_move_at_pixel(
 
 
 def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:
-    """The median depth (mm) read in the three by three pixels around one, NaN where nothing was."""
+    """Median depth (mm) read in the 3 x 3 pixels around one; NaN where nothing was read.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        u_px: column, px; rounded.
+        v_px: row, px; rounded.
+    """
     v = round(v_px)
     u = round(u_px)
     near = depth[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2]
@@ -124,8 +158,14 @@ def _inset_mm(session: Session, recording: Any, joint: str) -> float:
 
 
 def bout_at(session: Session, at_s: float) -> dict[str, Any]:
-    """The bout that a time lies in. Raises SessionError, with the nearest ones, where there is
-    none.
+    """Row of the table `bouts` that a time lies in.
+
+    Args:
+        session: the session.
+        at_s: time, s since the first frame.
+
+    Raises:
+        SessionError: no bout holds the time; the message names the nearest ones.
     """
     bouts = session.bouts
     inside = bouts[(bouts["start_s"] <= at_s + _ROUNDED_S) & (bouts["stop_s"] > at_s + _ROUNDED_S)]
@@ -145,16 +185,36 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
 def add_bout(
     session: Session, action: str, start_s: float, stop_s: float, *, new_word: bool = False
 ) -> BoutEdit:
-    """From start_s to stop_s the animal does `action`; what other bouts say of that time goes.
+    """Edit that adds a bout; what other bouts say of that time goes.
 
-    new_word: the action need not be one of the ethogram's words.
+    Args:
+        session: the session.
+        action: what the animal does.
+        start_s: start, s since the first frame.
+        stop_s: stop, s, exclusive.
+        new_word: the action need not be one of the ethogram's words.
+
+    Raises:
+        SessionError: the span holds no frame, or the word is not known.
+        LiexError: the action is not a printable word of up to 60 letters.
     """
     word = _word(session, action, new_word)
     return BoutEdit("add", word, *span_ns(session, start_s, stop_s))
 
 
 def rename_bout(session: Session, at_s: float, action: str, *, new_word: bool = False) -> BoutEdit:
-    """The bout at at_s is one of `action`; the word that it has already confirms it."""
+    """Edit that gives a bout another action; the word that it has already confirms it.
+
+    Args:
+        session: the session.
+        at_s: a time within the bout, s since the first frame.
+        action: what the animal does.
+        new_word: the action need not be one of the ethogram's words.
+
+    Raises:
+        SessionError: no bout holds the time, or the word is not known.
+        LiexError: the action is not a printable word of up to 60 letters.
+    """
     bout = bout_at(session, at_s)
     word = _word(session, action, new_word)
     span = _span_of(session, bout)
@@ -162,7 +222,17 @@ def rename_bout(session: Session, at_s: float, action: str, *, new_word: bool = 
 
 
 def recut_bout(session: Session, at_s: float, start_s: float, stop_s: float) -> BoutEdit:
-    """The bout at at_s goes from start_s to stop_s."""
+    """Edit that gives a bout another start and stop.
+
+    Args:
+        session: the session.
+        at_s: a time within the bout as it is, s since the first frame.
+        start_s: new start, s.
+        stop_s: new stop, s, exclusive.
+
+    Raises:
+        SessionError: no bout holds the time, or the new span holds no frame.
+    """
     bout = bout_at(session, at_s)
     word = str(bout["action"])
     return BoutEdit(
@@ -171,15 +241,32 @@ def recut_bout(session: Session, at_s: float, start_s: float, stop_s: float) -> 
 
 
 def delete_bout(session: Session, at_s: float) -> BoutEdit:
-    """The bout at at_s is none."""
+    """Edit that removes a bout.
+
+    Args:
+        session: the session.
+        at_s: a time within the bout, s since the first frame.
+
+    Raises:
+        SessionError: no bout holds the time.
+    """
     bout = bout_at(session, at_s)
     span = _span_of(session, bout)
     return BoutEdit("delete", "", *span, str(bout["action"]), *span)
 
 
 def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
-    """The whole ethogram as a person has labelled it: `labels` is a table of actions.labels, of
-    this session alone or with its name as session_id.
+    """Edits that replace the whole ethogram by a person's labels.
+
+    Time between the labels is cleared.
+
+    Args:
+        session: the session.
+        labels: a table of `liex_lab.actions.labels`, of this session alone or with its name as
+            session_id.
+
+    Raises:
+        SessionError: none of the labels lies within the session.
     """
     from liex_lab.actions.ethogram import Ethogram
     from liex_lab.actions.labels import words_of
@@ -208,7 +295,17 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
 
 
 def rows_between(session: Session, start_s: float, stop_s: float, what: str) -> tuple[int, int]:
-    """The rows of a span given in seconds, stop exclusive."""
+    """First row of a span of time, and the first row after it.
+
+    Args:
+        session: the session.
+        start_s: start, s since the first frame.
+        stop_s: stop, s, exclusive.
+        what: what the span is, for the error message.
+
+    Raises:
+        SessionError: the span holds no frame.
+    """
     time_s = session.frames["time_s"].to_numpy()
     first, last = (int(np.searchsorted(time_s, at - _ROUNDED_S)) for at in (start_s, stop_s))
     if not (start_s < stop_s and first < last):
@@ -220,8 +317,21 @@ def rows_between(session: Session, start_s: float, stop_s: float, what: str) -> 
 
 
 def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
-    """A span of frames on the recording's clock: of the first frame inside, and of the first one
-    outside.
+    """Span of frames on the recording's clock, ns.
+
+    It starts with the first frame inside and stops with the first one outside, or with the end of
+    the last frame.
+
+    Args:
+        session: the session.
+        start_s: start, s since the first frame.
+        stop_s: stop, s, exclusive.
+
+    Returns:
+        (start, stop), ns.
+
+    Raises:
+        SessionError: the span holds no frame.
     """
     first, last = rows_between(session, start_s, stop_s, "a bout")
     times = session.frames["time_ns"].to_numpy(np.int64)
@@ -257,7 +367,7 @@ def _word(session: Session, action: str, new_word: bool) -> str:
 
 
 def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
-    """The row of a frame, and where (3,) mm a joint of it is."""
+    """Row of a frame, and the position (3,) mm of a joint of it, arena frame."""
     joints = list(session.metadata["animal"]["joints"])
     if joint not in joints:
         raise SessionError(f"there is no joint '{joint}'; known are {', '.join(joints)}")

@@ -1,10 +1,10 @@
-"""What people correct in a session: head and tail exchanged in a span, a joint moved, bouts of the
-ethogram.
+"""Append-only log of human corrections to a session: flips, moved joints, edited bouts.
 
 A session's own files are never written again. Beside them lies the folder `corrected`:
 `corrections.json` is the log, to which entries are only ever added (one may take back another), and
-the tables are what the session's own become with the entries that stand. `Session.open` reads
-those; `Session.open(path, raw=True)` reads what was measured.
+the tables are what the session's own become with the entries that stand. The log states the hashes
+of the tables that it was made on and the SHA-256 of its own content. `Session.open` reads the
+corrected tables; `Session.open(path, raw=True)` reads what was measured.
 """
 
 from __future__ import annotations
@@ -37,8 +37,12 @@ EDITS = ("add", "rename", "recut", "delete")
 
 @dataclass(frozen=True)
 class FlipSpan:
-    """Head and tail are exchanged in the frames start_frame to stop_frame, the camera's count, stop
-    exclusive.
+    """Head and tail are exchanged in a span of frames.
+
+    Attributes:
+        kind: the word for it in the log.
+        start_frame: first frame, the camera's count.
+        stop_frame: the first frame after the span.
     """
 
     kind: ClassVar[str] = "flip"
@@ -46,13 +50,22 @@ class FlipSpan:
     stop_frame: int
 
     def __str__(self) -> str:
-        """What is said in a list."""
+        """The sentence for a list of corrections."""
         return f"head and tail exchanged in frames {self.start_frame} to {self.stop_frame - 1}"
 
 
 @dataclass(frozen=True)
 class JointMove:
-    """In one frame, the camera's count, a joint lies at (x_mm, y_mm, z_mm) of the arena frame."""
+    """In one frame a joint lies at another position.
+
+    Attributes:
+        kind: the word for it in the log.
+        frame: the frame, the camera's count.
+        joint: the joint's name.
+        x_mm: position in the arena frame, mm.
+        y_mm: position in the arena frame, mm.
+        z_mm: height above the floor, mm.
+    """
 
     kind: ClassVar[str] = "joint"
     frame: int
@@ -62,7 +75,7 @@ class JointMove:
     z_mm: float
 
     def __str__(self) -> str:
-        """What is said in a list."""
+        """The sentence for a list of corrections."""
         return (
             f"{self.joint} of frame {self.frame} to ({self.x_mm:.1f}, {self.y_mm:.1f}, "
             f"{self.z_mm:.1f}) mm"
@@ -71,10 +84,20 @@ class JointMove:
 
 @dataclass(frozen=True)
 class BoutEdit:
-    """From start_ns to stop_ns, the recording's clock, stop exclusive, the animal does `action`; ''
-    is nothing that has a name. was_start_ns to was_stop_ns: the bout that is edited and loses its
-    time first; equal where there was none. edit: a word of EDITS; was: the edited bout's action,
-    for the reader.
+    """In a span of time the animal does something else than the ethogram says.
+
+    Attributes:
+        kind: the word for it in the log.
+        edit: a word of `EDITS`.
+        action: what the animal does; '' is nothing that has a name.
+        start_ns: start on the recording's clock, ns.
+        stop_ns: stop, ns, exclusive.
+        was: action of the bout that is edited, for the reader.
+        was_start_ns: start of the bout that is edited, ns; it loses its time first.
+        was_stop_ns: its stop, ns; equal to its start where there was none.
+
+    Raises:
+        ValueError: the edit is not known, or the span is empty.
     """
 
     kind: ClassVar[str] = "bout"
@@ -91,7 +114,7 @@ class BoutEdit:
             raise ValueError(f"{self.edit} from {self.start_ns} to {self.stop_ns}")
 
     def __str__(self) -> str:
-        """What is said in a list."""
+        """The sentence for a list of corrections."""
         seconds = f"{(self.stop_ns - self.start_ns) * 1e-9:.3f} s"
         if self.edit == "rename":
             return f"{self.was} of {seconds} is {self.action}"
@@ -107,10 +130,14 @@ _UNDO = "undo"
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the log: a correction, or, where `what` is None, that the entry number `undoes`
-    is taken back.
+    """One line of the log: a correction, or that an earlier entry is taken back.
 
-    made_at: ISO 8601 with zone.
+    Attributes:
+        number: of the entry, from 1.
+        author: who made it.
+        made_at: when, ISO 8601 with time zone.
+        what: the correction; None where the entry takes another one back.
+        undoes: number of the entry that is taken back; 0 for a correction.
     """
 
     number: int
@@ -120,7 +147,7 @@ class Entry:
     undoes: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """As the log keeps it."""
+        """The entry as corrections.json keeps it."""
         about = {"number": self.number, "author": self.author, "made_at": self.made_at}
         if self.what is None:
             return {**about, "kind": _UNDO, "undoes": self.undoes}
@@ -128,7 +155,16 @@ class Entry:
 
     @staticmethod
     def from_dict(entry: Mapping[str, Any]) -> Entry:
-        """What `to_dict` made. Raises ValueError, KeyError or TypeError where it is none."""
+        """The entry that `to_dict` made into a table.
+
+        Args:
+            entry: one entry of corrections.json.
+
+        Raises:
+            ValueError: a value cannot be used.
+            KeyError: a key is missing, or the kind is not known.
+            TypeError: a value is of another type.
+        """
         about = (int(entry["number"]), str(entry["author"]), str(entry["made_at"]))
         if entry["kind"] == _UNDO:
             return Entry(*about, None, int(entry["undoes"]))
@@ -144,8 +180,13 @@ def _typed(value: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True)
 class Log:
-    """All entries, first to last; made_of: which poses and bouts they correct, see `basis`; files:
-    bytes and hash of each corrected table; facts: what session.json would say instead.
+    """All entries, first to last, and what they were applied to.
+
+    Attributes:
+        made_of: which poses and bouts they correct, see `basis`.
+        entries: the entries in the order in which they were made.
+        files: bytes and SHA-256 of each corrected table by name.
+        facts: sections that session.json would have instead, a subset of `FACTS`.
     """
 
     made_of: str
@@ -162,11 +203,24 @@ class Log:
         )
 
     def corrections(self, kind: type[Any]) -> list[Any]:
-        """The standing corrections of one kind."""
+        """The standing corrections of one kind.
+
+        Args:
+            kind: `FlipSpan`, `JointMove` or `BoutEdit`.
+        """
         return [entry.what for entry in self.standing if isinstance(entry.what, kind)]
 
     def added(self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = "") -> Log:
-        """The log with further entries: first those that are taken back, then new ones."""
+        """The log with further entries: first those that take others back, then new corrections.
+
+        Args:
+            what: new corrections.
+            undo: numbers of standing entries to take back.
+            author: who makes them; "" takes who is logged in.
+
+        Raises:
+            SessionError: an entry to take back does not stand.
+        """
         known = {entry.number for entry in self.standing}
         for number in undo:
             if number not in known:
@@ -184,7 +238,7 @@ class Log:
         return Log(self.made_of, (*self.entries, *new), self.files, self.facts)
 
     def to_json(self) -> str:
-        """The content of corrections.json."""
+        """The content of corrections.json, with its own hash in it."""
         document = {
             "schema_version": SCHEMA_VERSION,
             "made_of": self.made_of,
@@ -197,15 +251,16 @@ class Log:
 
 
 def _sum(document: Mapping[str, Any]) -> str:
-    """The hash of a log's content, but for itself: what is read and merged into session.json's was
-    written by us.
+    """SHA-256 of a log's content without its own `sum`.
+
+    What is read and merged into session.json's sections was then written by liex_lab.
     """
     stated = {key: value for key, value in document.items() if key != "sum"}
     return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
 
 
 def author_name() -> str:
-    """Who is logged in, as far as the system tells."""
+    """Name of who is logged in, as far as the system tells; else 'unknown'."""
     try:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):
@@ -213,15 +268,25 @@ def author_name() -> str:
 
 
 def corrected_folder(session: Path) -> Path:
-    """The folder of the corrections; while it is being replaced, the one that was there before."""
+    """Folder of a session's corrections; while it is being replaced, the one that was there before.
+
+    Args:
+        session: the session folder.
+    """
     folder = session / FOLDER
     old = session / f"{FOLDER}.old"
     return old if old.is_dir() and not folder.is_dir() else folder
 
 
 def basis(session: Path, metadata: Mapping[str, Any]) -> str:
-    """What the corrections of a session are made of: the hash of its poses, its own bouts and
-    flips.
+    """Fingerprint of what the corrections of a session are made on: its own poses, bouts and flips.
+
+    Args:
+        session: the session folder.
+        metadata: the content of session.json, which may state the hashes already.
+
+    Returns:
+        The first 16 hexadecimal digits of each table's SHA-256, joined by '-'.
     """
     stated = metadata.get("files") or {}
     found = []
@@ -236,9 +301,13 @@ def basis(session: Path, metadata: Mapping[str, Any]) -> str:
 
 
 def read_log(session: Path) -> Log:
-    """The corrections of the session in this folder; an empty log where there are none.
+    """Read the corrections of a session; an empty log where there are none.
 
-    Raises SessionError where the log is damaged or was written by a later version.
+    Args:
+        session: the session folder.
+
+    Raises:
+        SessionError: the log is damaged or was written by a later version.
     """
     path = corrected_folder(session) / LOG
     if not path.is_file():
@@ -281,5 +350,11 @@ def read_log(session: Path) -> Log:
 
 
 def applies(log: Log, session: Path, metadata: Mapping[str, Any]) -> bool:
-    """Whether the log has corrections that stand, and they were made on these poses and bouts."""
+    """Whether the log has corrections that stand, and they were made on these poses and bouts.
+
+    Args:
+        log: the corrections.
+        session: the session folder.
+        metadata: the content of session.json.
+    """
     return bool(log.standing) and log.made_of == basis(session, metadata)

@@ -1,5 +1,7 @@
-"""What the track of a session was made of, kept beside it: so that it can be made again after a
-human's correction.
+"""Observations behind a session's track (observations.npz), kept to make the track again later.
+
+They hold the pose hypotheses of every single frame, before association and smoothing, and the
+animal and camera that they are of. After a human's correction the track is made again from them.
 """
 
 from __future__ import annotations
@@ -32,7 +34,15 @@ _BLOCK = 16_384  # frames that are in memory at a time
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
-    """Write observations.npz: every frame's hypotheses, and whom they are of; no pickle."""
+    """Write observations.npz, a compressed NumPy archive without pickle.
+
+    Blocks of frames are written one after the other, so that hours of recording need little memory.
+
+    Args:
+        folder: the folder that the file goes into.
+        seen: the hypotheses of every frame.
+        subject: animal and camera that they are of.
+    """
     facts = {
         "skeleton": subject.skeleton.table,
         "length_mm": subject.length_mm,
@@ -57,7 +67,14 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
 
 
 def read_skeleton(session: Session) -> Skeleton | None:
-    """The skeleton that a session was made with; None for one that does not hold it."""
+    """The skeleton that a session was made with; None for a session that does not hold it.
+
+    Args:
+        session: the session.
+
+    Raises:
+        SessionError: the file is damaged.
+    """
     path = session.path / FILE
     if not path.is_file():
         return None
@@ -66,7 +83,18 @@ def read_skeleton(session: Session) -> Skeleton | None:
 
 
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
-    """What `write_evidence` wrote. Raises SessionError for a session that has nothing of it."""
+    """Read what `write_evidence` wrote.
+
+    Args:
+        session: the session.
+
+    Returns:
+        The hypotheses of every frame, and the animal and camera that they are of.
+
+    Raises:
+        SessionError: the session holds no observations, as those of earlier versions, or the file
+            is damaged.
+    """
     path = session.path / FILE
     if not path.is_file():
         raise SessionError(
@@ -105,7 +133,11 @@ def _check_shapes(seen: Observations, n_frames: int) -> None:
 
 
 def read_flips(session: Session) -> list[Flip]:
-    """The table `flips`, with frames counted by row."""
+    """The table `flips`, with frames counted by row.
+
+    Args:
+        session: the session.
+    """
     index = session.frames["frame_index"].to_numpy()
     with reading_from(session.path / "flips.parquet"):
         return [
@@ -122,7 +154,12 @@ def read_flips(session: Session) -> list[Flip]:
 
 
 def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
-    """The origin of a session, as it was told when the session was first written."""
+    """Provenance of a session, as it was stated when the session was first written.
+
+    Args:
+        session: the session.
+        skeleton: the skeleton that it was made with.
+    """
     about = session.metadata
     camera = session.metadata["camera"]
     source = about["input"]
@@ -153,7 +190,7 @@ def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
 
 
 def _camera_gaps(session: Session) -> list[Gap]:
-    """What the camera did not deliver and stamps that were moved, out of the table."""
+    """Frames that the camera did not deliver and moved timestamps, out of the table `gaps`."""
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
     found = []
     for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
@@ -174,5 +211,5 @@ def _camera_gaps(session: Session) -> list[Gap]:
 
 
 def _rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """A short table row by row."""
+    """Rows of a short table as dicts."""
     return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]

@@ -1,5 +1,7 @@
-"""What a session leaves behind that could not be measured: failed.json, with the reason and what to
-do about it.
+"""Report of a session that could not be measured (failed.json): the reason and what to do about it.
+
+Also the atomic write that all small JSON files of a session use: write under another name, fsync,
+rename.
 """
 
 from __future__ import annotations
@@ -20,8 +22,18 @@ _REPORT = "report it to the makers of liex_lab with the lines under traceback"
 
 
 def describe_failure(error: BaseException, stage: str, frame: int | None) -> dict[str, Any]:
-    """What is to be said about an error. stage: what was being done; frame: the last one that was
-    measured, if any.
+    """Table of what is to be said about an error, the content of failed.json.
+
+    Errors that are not of a user's making carry their traceback.
+
+    Args:
+        error: the error.
+        stage: what was being done.
+        frame: the last frame that was measured; None if none was.
+
+    Returns:
+        stage, frame, reason, remedy, kind, at (ISO 8601, UTC), machine, versions, and perhaps
+        traceback.
     """
     ours = not isinstance(error, LiexError | OSError | MemoryError)
     if isinstance(error, LiexError):
@@ -51,13 +63,25 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
 
 
 def write_failure(folder: Path, failure: dict[str, Any]) -> None:
-    """Write failed.json into the session's folder, whole or not at all."""
+    """Write failed.json into a session's folder, whole or not at all.
+
+    Args:
+        folder: the session folder; made if needed.
+        failure: what `describe_failure` returned.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FAILED_FILE, json.dumps(failure, indent=2, default=str) + "\n")
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text file under another name and rename it, so that nobody ever reads half of it."""
+    """Write a text file atomically, so that nobody ever reads half of it.
+
+    It is written under another name beside its place, synchronised to disk and renamed.
+
+    Args:
+        path: the file; one that is there is replaced.
+        text: its content, written as UTF-8.
+    """
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with beside.open("w", encoding="utf-8") as file:
@@ -71,8 +95,13 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def read_failure(folder: Path) -> dict[str, Any] | None:
-    """The failed.json in a folder, None where there is none; a damaged one says so as its
-    reason.
+    """The failed.json in a folder; None where there is none.
+
+    Args:
+        folder: the session folder.
+
+    Returns:
+        What `describe_failure` returned; of a damaged file a table that says so as its reason.
     """
     path = folder / FAILED_FILE
     if not path.is_file():

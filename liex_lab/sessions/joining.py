@@ -1,5 +1,9 @@
-"""Logs that were written in parts, for the work was interrupted, made one: bytes are copied,
-nothing is unpacked.
+"""Concatenation of Rerun (.rrd) and MCAP logs that were written in parts.
+
+Bytes are copied and nothing is unpacked. An .rrd file is a header of 12 bytes and messages, each
+with a kind and a length of 8 bytes each; the joined file has the messages of all parts and no
+index. An MCAP file is chunks and message indexes, whose offsets are shifted, and a summary with
+chunk indexes, statistics and CRC-32, which is written anew (https://mcap.dev/spec).
 """
 
 from __future__ import annotations
@@ -41,10 +45,18 @@ _BLOCK = 1 << 22
 
 
 def rrd_messages(file: IO[bytes], size: int, start: int = RRD_HEAD) -> Iterator[tuple[int, int]]:
-    """(offset, bytes) of the messages of an .rrd file from `start` on, up to its end message if it
-    has one.
+    """Offset and length of each message of an .rrd file, up to its end message if it has one.
 
-    Raises SessionError where a message goes beyond `size`.
+    Args:
+        file: the open .rrd file.
+        size: bytes of it that count.
+        start: offset of the first message to look at.
+
+    Yields:
+        (offset, bytes); the bytes include the message's own header of 16.
+
+    Raises:
+        SessionError: a message goes beyond `size`, so the file was not written whole.
     """
     at = start
     while at < size:
@@ -62,8 +74,16 @@ def rrd_messages(file: IO[bytes], size: int, start: int = RRD_HEAD) -> Iterator[
 
 
 def join_rrd(parts: Parts, out: Path) -> None:
-    """One .rrd with the messages of all parts; without their indexes, which count from each part's
-    beginning.
+    """Write one .rrd with the messages of all parts.
+
+    Their indexes are left out, for they count from each part's own beginning.
+
+    Args:
+        parts: the parts in order, with the bytes of each that count.
+        out: the file to write.
+
+    Raises:
+        SessionError: a part is shorter than it should be.
     """
     with out.open("wb") as whole:
         for k, (path, size) in enumerate(parts):
@@ -78,8 +98,17 @@ def join_rrd(parts: Parts, out: Path) -> None:
 
 
 def join_mcap(parts: Parts, out: Path) -> None:
-    """One MCAP file with the chunks of all parts; the last one is whole and gets its channels
-    numbered as the first.
+    """Write one MCAP file with the chunks of all parts.
+
+    The last part is a whole file; where its channels are numbered otherwise than those of the first
+    part, it is written anew with the numbers of the first (`renumber`).
+
+    Args:
+        parts: the parts in order, with the bytes of each that count.
+        out: the file to write.
+
+    Raises:
+        SessionError: a part is shorter than it should be, or the last one is not whole.
     """
     last = parts[-1][0]
     known = _known_to(last)

@@ -1,6 +1,4 @@
-"""How a study's sessions are listed for those who look at them: what both jobs and views may know
-of each.
-"""
+"""Entry of a study's session list, shared by the jobs that make it and the views that show it."""
 
 from __future__ import annotations
 
@@ -12,10 +10,15 @@ WHO = ("subject_id", "group", "cage", "sex", "batch")
 
 @dataclass(frozen=True)
 class Entry:
-    """A session as the study lists it. key: its name in the study; folder: None where it was not
-    measured.
+    """A session as the study lists it.
 
-    who: those of `WHO` that are known.
+    Attributes:
+        key: its name in the study.
+        state: done, failed, new, begun, changed or excluded.
+        reason: why it is in this state.
+        remedy: what to do about it.
+        folder: the session folder; None where it was not measured.
+        who: those of `WHO` (subject, group, cage, sex, batch) that are known.
     """
 
     key: str

@@ -1,4 +1,4 @@
-"""Skeletons in a Rerun viewer while the recording goes on."""
+"""Live stream of depth and skeletons to a Rerun viewer, in a scene of metres."""
 
 from __future__ import annotations
 
@@ -19,8 +19,15 @@ _DEPTH_EVERY = 5  # frames; a picture takes longer to send than a skeleton
 
 
 class LiveView:
-    """A stream of depth and skeletons: into a viewer of this machine ('viewer'), one at an address,
-    or a file .rrd.
+    """A stream of depth and skeletons while the recording goes on.
+
+    Args:
+        name: the recording's name.
+        camera: the depth camera.
+        T_arena_camera: carries the camera frame (mm) into the arena frame.
+        skeleton: the animal's skeleton.
+        to: 'viewer' starts a viewer on this machine; a name ending in .rrd is a file to write; else
+            the address of a viewer.
     """
 
     def __init__(
@@ -52,7 +59,12 @@ class LiveView:
         self._first_ns: int | None = None
 
     def show(self, frame: DepthFrame, row: Track) -> None:
-        """The skeleton of one frame (a track of one row), and now and then the picture."""
+        """Show the skeleton of one frame and, every fifth frame, the depth picture.
+
+        Args:
+            frame: the frame.
+            row: its track of one row; without a pose the last skeleton goes.
+        """
         self._first_ns = frame.time_ns if self._first_ns is None else self._first_ns
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=np.timedelta64(frame.time_ns - self._first_ns, "ns"))
@@ -68,6 +80,6 @@ class LiveView:
             self._stream.log(DEPTH, rr.DepthImage(depth, meter=MM_PER_UNIT))
 
     def close(self) -> None:
-        """Send what is held back."""
+        """Send what is held back, and end the stream."""
         self._stream.flush()
         self._stream.disconnect()

@@ -1,5 +1,6 @@
-"""One process at a time: a lock on a file that the system takes back when its holder ends, however
-it ends.
+"""Exclusive advisory file lock (flock, or msvcrt.locking on Windows): one process at a time.
+
+The system takes the lock back when its holder ends, however it ends.
 """
 
 from __future__ import annotations
@@ -15,11 +16,16 @@ from liex_lab.errors import SessionError
 
 
 def take_lock(path: Path) -> IO[bytes] | None:
-    """Hold `path`, made if needed; None where another process holds it. Close the file to let go of
-    it.
+    """Lock a file, which is made if needed; None where another process holds it.
 
     A folder that was renamed or removed in between is no longer the one that was asked for: None,
     too.
+
+    Args:
+        path: the lock file.
+
+    Returns:
+        The open file; closing it releases the lock.
     """
     file = path.open("ab")
     try:
@@ -35,8 +41,14 @@ def take_lock(path: Path) -> IO[bytes] | None:
 
 @contextmanager
 def locked(path: Path, held: str) -> Iterator[None]:
-    """Hold `path` within the block. Raises SessionError with `held`, half a sentence, where another
-    one does.
+    """Hold a lock within the block, and remove its file afterwards.
+
+    Args:
+        path: the lock file.
+        held: half a sentence for the error, such as 'the study is being measured'.
+
+    Raises:
+        SessionError: another process holds it.
     """
     file = take_lock(path)
     if file is None:
@@ -53,7 +65,7 @@ def locked(path: Path, held: str) -> Iterator[None]:
 
 
 def _lock(file: IO[bytes]) -> None:
-    """Raises OSError where another process holds it."""
+    """Lock an open file without waiting. Raises OSError where another process holds it."""
     if sys.platform == "win32":
         import msvcrt
 

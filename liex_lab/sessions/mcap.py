@@ -1,8 +1,9 @@
-"""The MCAP file for Foxglove: depth, camera, skeleton, transforms and action states, lengths in
-metres.
+"""MCAP log of a session for Foxglove: depth, camera, skeleton, transforms, action states; metres.
 
-Depth streams in as it comes; everything small is written at the end from the same track the tables
-are made of.
+Messages follow Foxglove's schemas (RawImage 16UC1 in mm, CameraCalibration, FrameTransforms,
+SceneUpdate, PosesInFrame, ImageAnnotations, Log) and one JSON schema of our own for actions. Depth
+streams in as it comes; everything small is written at the end from the same track the tables are
+made of.
 """
 
 from __future__ import annotations
@@ -55,15 +56,21 @@ _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
 
 class McapWriter:
-    """Writes `session.mcap`. Call `add` for the depth of consecutive frames, then `finish` once, or
-    `abandon`.
+    """Writer of `session.mcap`.
+
+    Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`.
     """
 
     def __init__(
         self, path: Path, origin: Provenance, *, level: int = 0, chunk_size: int = 128 * 1024
     ) -> None:
-        """level: of compression, 0 for the usual one, 22 for the smallest file; chunk_size: bytes
-        packed at once.
+        """Open the file.
+
+        Args:
+            path: the file to write.
+            origin: camera, its position and the skeleton.
+            level: Zstandard compression level, 0 for the usual one, 22 for the smallest file.
+            chunk_size: bytes packed at once.
         """
         self._origin = origin
         self._context = (
@@ -93,7 +100,15 @@ class McapWriter:
         self._calibrated_ns: int | None = None
 
     def add(self, times_ns: Sequence[int], depth: Sequence[NDArray[np.uint16]]) -> None:
-        """Depth (H, W) uint16 mm of consecutive frames."""
+        """Write the depth of consecutive frames, and the calibration about once a second.
+
+        Args:
+            times_ns: times of the n frames, ns.
+            depth: n pictures (H, W) uint16 mm, 0 where unread.
+
+        Raises:
+            OSError: the system refused to write.
+        """
         for time_ns, image in zip(times_ns, depth, strict=True):
             if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
                 self._log_camera(int(time_ns))
@@ -113,7 +128,17 @@ class McapWriter:
     def finish(
         self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
     ) -> None:
-        """Skeleton, transforms, actions and notes of the whole track; closes the file."""
+        """Write skeleton, transforms, actions and notes of the whole track, and close the file.
+
+        Args:
+            rows: the track as the tables see it.
+            bouts: the table `bouts`.
+            words: the ethogram's vocabulary; a word's place in it is its index in the messages.
+            problems: sentences about the recording, logged as warnings at the first frame.
+
+        Raises:
+            OSError: the system refused to write.
+        """
         track = rows.track
         for part in blocks(track.n_frames, _BLOCK):
             self._log_track(track[part])
@@ -139,8 +164,10 @@ class McapWriter:
                 self._transforms.log(messages.FrameTransforms(transforms=[root]), log_time=time_ns)
 
     def flushed(self) -> int:
-        """Hand everything to the system; returns the file's bytes. Raises what the system said
-        against it.
+        """Hand everything to the operating system; returns the file's bytes.
+
+        Raises:
+            OSError: the system refused to write.
         """
         self._writer.flush()
         self._file.flush()
@@ -148,15 +175,17 @@ class McapWriter:
         return self._file.size
 
     def abandon(self) -> None:
-        """Close the file, whole or not. Raises what the system said against writing it."""
+        """Close the file, whole or not.
+
+        Raises:
+            OSError: the system refused to write.
+        """
         self._writer.close()
         self._file.close()
         self._file.check()
 
     def _log_camera(self, time_ns: int) -> None:
-        """Calibration and the camera's place, about once a second, so that a viewer may start
-        anywhere.
-        """
+        """Write calibration and camera pose, about once a second: a viewer may start anywhere."""
         camera = self._origin.camera
         place = self._origin.T_arena_camera
         self._calibrated_ns = time_ns

@@ -1,4 +1,4 @@
-"""Where a session may be written, and where it lies until it is whole."""
+"""Rules for where a session may be written, and the names of unfinished folders."""
 
 from __future__ import annotations
 
@@ -15,12 +15,26 @@ _HASHED = {".parquet", ".csv", ".json", ".toml"}
 
 
 def part_folder(path: Path) -> Path:
-    """Where the session `path` lies until it is whole."""
+    """Folder NAME.part in which a session lies until it is whole.
+
+    Args:
+        path: the session folder to be.
+    """
     return path.with_name(f"{path.name}.part")
 
 
 def check_place(path: Path, overwrite: bool) -> None:
-    """Refuse to write over what must not be lost, or where no folder can be."""
+    """Refuse to write over what must not be lost, or where no folder can be.
+
+    A folder with nothing in it but failed.json may be replaced.
+
+    Args:
+        path: the session folder to be.
+        overwrite: whether a session that is there already may be replaced.
+
+    Raises:
+        SessionError: the session may not be written there.
+    """
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(
@@ -43,8 +57,14 @@ def check_place(path: Path, overwrite: bool) -> None:
 
 
 def file_facts(folder: Path, logs: Mapping[str, Path]) -> dict[str, Any]:
-    """Bytes and SHA-256 of the tables and of what is small, bytes of the logs, for `liex
-    verify`.
+    """Bytes and SHA-256 of the tables and small files, bytes of the logs, for `liex verify`.
+
+    Args:
+        folder: the folder of the unfinished session.
+        logs: path of each log by its name in the finished session.
+
+    Returns:
+        For each file name a table with `bytes` and, but for logs, `sha256`.
     """
     found: dict[str, Any] = {}
     for path in sorted(folder.iterdir()):

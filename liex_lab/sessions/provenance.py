@@ -1,5 +1,7 @@
-"""What a session says about its origin: recording, camera, animal, plan, software, and the cost of
-the run.
+"""Provenance record of a session: recording, camera, animal, plan, software versions.
+
+It is the part of session.json that is known before the first frame, and the metadata of every
+Parquet file. Hashes are the first 16 hexadecimal digits of SHA-256 over sorted JSON.
 """
 
 from __future__ import annotations
@@ -47,15 +49,30 @@ _PACKAGES = (
 class Provenance:
     """What is known about a recording before its first frame is written.
 
-    name: the session's id; individual: the animal's name in it; T_arena_camera and
-    floor_distance_mm: the camera's place above the floor; input_sha256: of the recording's bytes;
-    profile: how its stored numbers were read, where a profile says so; plan_toml: the plan as
-    resolved; n_frames: expected, None when unknown; gaps: what the camera did not deliver, and
-    stamps that were moved; problems: sentences about the recording; subject: any of subject_id,
-    group, cage, sex, batch; model: name and sha256 of the model; animal_size: spine_mm and its
-    origin; optics: what was undone of lens and water, for then `camera` is the ideal one; arena:
-    the shape of the floor; zones: those that a person has drawn on it; replay_depth,
-    replay_candidates: what the replay is to hold.
+    Attributes:
+        name: the session's id.
+        skeleton: the skeleton that is fitted.
+        camera: the depth camera; the ideal one where lens or water were undone.
+        T_arena_camera: carries the camera frame (mm) into the arena frame.
+        floor_distance_mm: distance of the camera from the floor, mm.
+        input_sha256: SHA-256 of the recording's bytes.
+        plan_toml: the plan as resolved, TOML text.
+        format: the recording's format.
+        profile: how its stored numbers were read, where a profile says so.
+        individual: the animal's name in the session.
+        n_frames: frames to be expected; None when unknown.
+        gaps: frames that the camera did not deliver, and timestamps that were moved.
+        problems: sentences about the recording.
+        truncated: whether the recording ends in the middle of a frame.
+        subject: any of subject_id, group, cage, sex, batch.
+        session_start_time: ISO 8601 with time zone; empty when unknown.
+        model: name and sha256 of the pose model.
+        animal_size: spine_mm, its origin, and girth over what is usual for that length.
+        optics: what was undone of lens and water.
+        arena: the shape of the floor.
+        zones: those that a person has drawn on it.
+        replay_depth: whether the replay is to hold the depth.
+        replay_candidates: whether it is to hold every hypothesis of single frames.
     """
 
     name: str
@@ -86,8 +103,14 @@ class Provenance:
     def of(
         recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any
     ) -> Provenance:
-        """The facts of a recording, the floor it was taken above and the plan; `more` are further
-        fields.
+        """Provenance of a recording, the floor it was taken above and the plan.
+
+        Args:
+            recording: the open recording.
+            floor: the floor that was found in it.
+            skeleton: the skeleton that is fitted.
+            plan: all settings of the run; what it states goes before what the recording states.
+            **more: further fields, or others than these.
         """
         told = recording.metadata
         stated = plan.session
@@ -123,17 +146,20 @@ class Provenance:
 
     @property
     def calibration_hash(self) -> str:
-        """Hash of the camera's numbers and its place in the arena."""
+        """Hash of the camera's numbers, its pose in the arena and what of the optics was undone."""
         place = {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist()}
         return _hash({**place, "optics": self.optics} if self.optics else place)
 
     @property
     def recording_id(self) -> str:
-        """The same for the same recording and plan: Rerun merges files whose id is equal."""
+        """Id of the replay, the same for the same recording, plan and model.
+
+        Rerun merges files whose id is equal.
+        """
         return f"{self.name}-{_hash([self.input_sha256, self.plan_toml, self.model])}"
 
     def table_metadata(self) -> dict[str, Any]:
-        """What every parquet file says about itself, besides its columns."""
+        """What every Parquet file says about itself, besides its columns."""
         return {
             "version": package_version("liex_lab"),
             "schema_version": SCHEMA_VERSION,
@@ -185,7 +211,14 @@ class Provenance:
 
 
 def plan_table(plan_toml: str) -> dict[str, Any]:
-    """The plan as a table for session.json."""
+    """The plan as a nested table for session.json.
+
+    Args:
+        plan_toml: the plan as TOML text.
+
+    Raises:
+        SessionError: the text is not TOML.
+    """
     try:
         return tomllib.loads(plan_toml)
     except tomllib.TOMLDecodeError as error:
@@ -196,7 +229,11 @@ def plan_table(plan_toml: str) -> dict[str, Any]:
 
 @cache
 def package_version(name: str) -> str:
-    """The installed version of a package, or 'unknown' when it runs from a plain folder."""
+    """Installed version of a package, or 'unknown' when it runs from a plain folder.
+
+    Args:
+        name: the package's name as pip knows it.
+    """
     try:
         return version(name)
     except PackageNotFoundError:
@@ -204,7 +241,7 @@ def package_version(name: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
+    """Versions of Python and of the packages that a result depends on, by name."""
     return {
         "python": platform.python_version(),
         **{name: package_version(name) for name in _PACKAGES},

@@ -1,4 +1,4 @@
-"""Files of a session that may be damaged: reading them gives an answer or one sentence."""
+"""Error translation for reading files of a session: whatever goes wrong becomes one sentence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from liex_lab.errors import LiexError, SessionError, one_line
 
 @contextmanager
 def reading_from(path: Path) -> Iterator[Path]:
-    """Within the block, whatever goes wrong is a damaged file's fault: a SessionError names it."""
+    """Within the block, turn any error into a SessionError that names the file as damaged.
+
+    A LiexError passes as it is.
+
+    Args:
+        path: the file that is read in the block; it is what the `with` statement gives.
+
+    Raises:
+        SessionError: anything went wrong in the block.
+    """
     try:
         yield path
     except LiexError:

@@ -1,6 +1,7 @@
-"""The last part of an MCAP file with its channels and schemas numbered as in the parts before it.
+"""Rewriting of an MCAP file with other channel and schema ids.
 
-Foxglove's writer numbers them as they come; a part without depth begins with others.
+Foxglove's writer numbers channels as they come; the last part of a log that has no depth begins
+with others than the parts before it, to which it is to be joined (see `liex_lab.sessions.joining`).
 """
 
 from __future__ import annotations
@@ -17,10 +18,18 @@ Known = tuple[list[Schema], list[Channel]]
 
 
 def renumber(path: Path, first: Known, last: Known, out: Path) -> Known:
-    """Write the MCAP file `path`, which knows what `last` holds, to `out` in the numbers of
-    `first`; returns all known.
+    """Write an MCAP file again with the channel and schema ids of another one.
 
-    What only the last part knows gets numbers of its own.
+    What only the file itself knows gets ids of its own, beyond those taken.
+
+    Args:
+        path: the MCAP file.
+        first: schemas and channels with the wanted ids.
+        last: schemas and channels of `path`.
+        out: the file to write.
+
+    Returns:
+        Schemas and channels of both, as `out` has them.
     """
     schemas, schema_of = _joined(first[0], last[0], "name")
     channels, channel_of = _joined(first[1], last[1], "topic")
@@ -56,8 +65,9 @@ def renumber(path: Path, first: Known, last: Known, out: Path) -> Known:
 
 
 def _joined(first: list, last: list, name: str) -> tuple[list, dict[int, int]]:
-    """All records, those of `last` that `first` does not have with new ids; and the new id of each
-    one of `last`.
+    """All records of both lists, and the new id of each one of `last`.
+
+    Records of `last` that `first` does not have get new ids.
     """
     joined = {getattr(one, name): one for one in first}
     ids = {}

@@ -1,5 +1,7 @@
-"""Everything tabular of a session, written into a folder: from a track, and from what was measured
-of it.
+"""Tables of a session, written into a folder as Parquet, CSV and a column dictionary.
+
+They are made from a track and from what was measured of it; the same code writes a session's own
+tables and those of its corrections.
 """
 
 from __future__ import annotations
@@ -24,14 +26,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Results:
-    """A track as rows, and where it comes from; `flips`: what was found out about head and tail."""
+    """A track as rows, and where it comes from.
+
+    Attributes:
+        origin: what is known about the recording.
+        rows: the track as the tables see it.
+        flips: where head and tail may have been exchanged.
+    """
 
     origin: Provenance
     rows: Rows
     flips: Sequence[Flip] = ()
 
     def write_track(self, folder: Path) -> None:
-        """The tables of the track itself: frames, poses, rotations, gaps, flips, sessions."""
+        """Write the tables of the track itself: frames, poses, rotations, gaps, flips, sessions.
+
+        Args:
+            folder: the folder that the Parquet files go into.
+        """
         rows = self.rows
         described = self.origin.table_metadata()
         own: dict[str, Any] = {
@@ -48,8 +60,15 @@ class Results:
     def write_measured(
         self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[Column]
     ) -> None:
-        """The tables of behaviour, summary.csv, and columns.json, which describes every table there
-        is.
+        """Write the tables of behaviour, summary.csv, and columns.json, which describes all tables.
+
+        Args:
+            folder: the folder that the files go into.
+            results: tables by name; a table without any column described is left out.
+            columns: descriptions of columns beyond those of `tables.TABLES`.
+
+        Raises:
+            SessionError: a table has a column that is not described.
         """
         described = self.origin.table_metadata()
         for name, result in results.items():
@@ -91,7 +110,7 @@ class Results:
         }
 
     def counts(self) -> dict[str, Any]:
-        """How many frames there are, and how they were measured: `frames` of session.json."""
+        """Counts of frames and of how they were measured: section `frames` of session.json."""
         rows = self.rows
         track = self.rows.track
         row = self.session_row()

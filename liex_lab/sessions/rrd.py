@@ -1,8 +1,9 @@
-"""The Rerun replay: depth, skeleton, scalars and actions on the timelines `frame` and `time`, in a
-scene of metres.
+"""Rerun replay log (.rrd): depth, skeleton, scalars and actions on timelines `frame` and `time`.
 
-Depth streams in as it comes; everything small is written at the end from the same track the tables
-are made of.
+Lengths are metres, the arena is right-handed with z up. Depth is stored without loss: RVL (Wilson
+2017, run-length and variable-length coding), or PNG where sensor noise makes that smaller. Depth
+streams in as it comes; everything small is written at the end from the same track the tables are
+made of.
 """
 
 from __future__ import annotations
@@ -89,11 +90,16 @@ _JOINT = [255, 80, 60, 255]
 
 
 class ReplayWriter:
-    """Writes `session.rrd`. Call `add` for the depth of consecutive frames, then `finish` once, or
-    `abandon`.
+    """Writer of `session.rrd`.
 
-    corrected: a replay of what people corrected, to be shown with that one: it has neither depth
-    nor the scene, and its own entities (see `corrected_entity`).
+    Call `add` for the depth of consecutive frames, then `finish` once, or `abandon`.
+
+    Args:
+        path: the file to write.
+        origin: camera, arena, zones and skeleton, and what the replay is to hold.
+        blueprint: the layout, a Rerun blueprint; None for none.
+        corrected: write the replay of what people corrected, to be shown with that one: it has
+            neither depth nor the scene, and its own entities (see `corrected_entity`).
     """
 
     def __init__(
@@ -120,12 +126,20 @@ class ReplayWriter:
             self._log_scene()
 
     def go_on(self, first_ns: int) -> None:
-        """The file continues another one, whose first frame was at `first_ns`."""
+        """Continue another file's timeline.
+
+        Args:
+            first_ns: time of the first frame of that file, ns.
+        """
         self._first_ns = first_ns
 
     def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
-        """Depth (H, W) uint16 mm of consecutive frames; nothing where the replay is to be without
-        depth.
+        """Write depth of consecutive frames; nothing where the replay is to be without depth.
+
+        Args:
+            frame_index: the camera's count of the n frames.
+            times_ns: their times, ns.
+            depth: n pictures (H, W) uint16 mm, 0 where unread.
         """
         if not self._origin.replay_depth:
             return
@@ -161,9 +175,18 @@ class ReplayWriter:
         problems: Sequence[str],
         candidates: Observations | None = None,
     ) -> None:
-        """Skeleton, scalars, lanes and notes of the whole track; closes the file. words: the
-        ethogram's vocabulary; candidates: what single frames thought possible, where that is to be
-        seen, too.
+        """Write skeleton, scalars, lanes and notes of the whole track, and close the file.
+
+        Args:
+            rows: the track as the tables see it.
+            kinematics: the table `kinematics`.
+            bouts: the table `bouts`.
+            words: the ethogram's vocabulary, which takes the colours of `PALETTE` in order.
+            problems: sentences about the recording, logged as warnings.
+            candidates: the pose hypotheses of single frames, where they are to be shown, too.
+
+        Raises:
+            SessionError: the file was not written whole.
         """
         self._send_depth()
         index = rows.frame_index
@@ -211,10 +234,12 @@ class ReplayWriter:
         self.abandon()
 
     def flushed(self) -> int:
-        """Hand everything to the system; returns the file's bytes. Raises SessionError where
-        something is missing.
+        """Hand everything to the operating system; returns the file's bytes.
 
         Rerun does not tell when the disk is full, so the messages on disk are counted.
+
+        Raises:
+            SessionError: messages are missing.
         """
         self._send_depth()
         self._stream.flush()
@@ -261,9 +286,7 @@ class ReplayWriter:
                 self._stream.log(f"{OVERLAY}/{where}", in_picture, static=True)
 
     def _outlines(self) -> list[tuple[str, Array, int]]:
-        """The walls, whose name is empty, and the zones on the floor: name, corners (n, 2) mm,
-        colour.
-        """
+        """Walls and zones on the floor: name (empty for the walls), corners (n, 2) mm, colour."""
         walls = self._origin.arena.outline_mm()
         zones = zip(self._origin.zones, cycle(PALETTE), strict=False)
         drawn = [(zone.name, zone.outline_mm(), colour) for zone, colour in zones]
@@ -283,9 +306,7 @@ class ReplayWriter:
     def _log_skeleton(
         self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]
     ) -> None:
-        """Joints and bones in the arena, and over the picture; a frame without a pose shows
-        none.
-        """
+        """Joints and bones in the arena and over the picture; a frame without a pose shows none."""
         track = rows.track
         skeleton = rows.track.skeleton
         names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
@@ -346,8 +367,9 @@ class ReplayWriter:
         dot: Any,
         line: Any,
     ) -> None:
-        """Points (k, J, 2 or 3) of the k frames that are `seen` out of those of `when`, as dots and
-        as bones.
+        """Points (k, J, 2 or 3) of the k posed frames, as dots and as bones.
+
+        `seen` marks the k frames out of those of `when`.
         """
         skeleton = self._origin.skeleton
         size = points.shape[-1]
@@ -366,8 +388,10 @@ class ReplayWriter:
     def _send_spheres(
         self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]
     ) -> None:
-        """Around each joint (k, J, 3) of the k frames `seen` a sphere that holds it with 95 %;
-        sd_mm (k, J).
+        """Sphere around each joint that holds it with 95 %; joints_mm (k, J, 3), sd_mm (k, J).
+
+        The radius is 2.795 standard deviations of an isotropic Gaussian in space (a chi
+        distribution with 3 degrees of freedom). `seen` marks the k frames out of those of `when`.
         """
         size = np.repeat(_HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 1), 3, axis=1) / MM_PER_UNIT
         spheres = rr.Ellipsoids3D.columns(
@@ -377,9 +401,7 @@ class ReplayWriter:
         self._stream.send_columns(UNCERTAINTY, when, [*spheres.partition(n_spheres)])
 
     def _log_root(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
-        """The frame of the body's base; while the animal is lost it stays where it was seen
-        last.
-        """
+        """Axes of the body's base; while the animal is lost they stay where it was seen last."""
         track = rows.track
         seen = track.posed
         if not seen.any():
@@ -453,7 +475,10 @@ class ReplayWriter:
     def _log_lane(
         self, entity: str, spans: Sequence[Any], colours: dict[str, int], end: tuple[int, float]
     ) -> None:
-        """One lane of half-open spans (start_frame, stop_frame, start_s, stop_s, word), ordered."""
+        """One lane of half-open spans in order of time.
+
+        A span is (start_frame, stop_frame, start_s, stop_s, word).
+        """
         labels = [word.replace("_", " ") for word in colours]
         kind = rr.StateConfiguration(
             values=list(colours), labels=labels, colors=_rgba(list(colours.values()))
@@ -476,8 +501,12 @@ class ReplayWriter:
 
 
 def corrected_entity(entity: str) -> str:
-    """Where the replay of corrections keeps what the session's own keeps at `entity`: below the
-    same camera.
+    """Entity path in the replay of corrections of what the session's own replay keeps at `entity`.
+
+    It lies below the same camera or arena, so that both are drawn in one scene.
+
+    Args:
+        entity: the path in the session's own replay.
     """
     for above in (f"{IMAGE}/", "arena/"):
         if entity.startswith(above):
@@ -502,9 +531,17 @@ class _Renamed:
 
 
 def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
-    """A depth picture (H, W) without loss, and how: RVL, which takes half of what raw pictures do
-    and is quick; where noise makes that large, PNG if it is smaller (Huffman's code alone: noise
-    has no runs to look for).
+    """Encode a depth picture without loss.
+
+    RVL takes half of what raw pictures do and is quick. Where noise makes it large, beyond 0.54
+    bytes per pixel, PNG is taken if it is smaller (Huffman coding alone: noise has no runs to look
+    for).
+
+    Args:
+        depth: (H, W) uint16 mm, 0 where unread.
+
+    Returns:
+        The bytes, and their media type: 'application/rvl' or 'image/png'.
     """
     import cv2
 
@@ -517,8 +554,16 @@ def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
 
 
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
-    """Depth in mm between which the colours spread: the floor as the first frame shows it, and 80
-    mm above it.
+    """Range of depth over which the colours spread: the floor of the first frame, and 80 mm above.
+
+    A floor tilted by 10 degrees is covered, but not the walls.
+
+    Args:
+        depth: (H, W) uint16 mm of the first frame, 0 where unread.
+        floor_distance_mm: distance of the camera from the floor, mm.
+
+    Returns:
+        (near, far), mm.
     """
     read = depth[depth > 0]
     near, far = (

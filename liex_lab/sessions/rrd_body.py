@@ -1,5 +1,7 @@
-"""The body in the replay: its surface in rigid parts, each carried by a joint; a frame costs a few
-transforms.
+"""Rigid skinning of the animal's body surface for the Rerun replay.
+
+Every triangle follows one joint, so a frame costs a few rigid transforms instead of a mesh. The
+trunk at home pose is cut at its joints, and each vertex belongs to its nearest bone.
 """
 
 from __future__ import annotations
@@ -25,8 +27,13 @@ _SKIN = [176, 190, 205, 150]
 
 @dataclass(frozen=True)
 class BodyPart:
-    """A piece of the surface in the frame of the joint that carries it: vertices (V, 3) mm at scale
-    1, faces (F, 3), normals (V, 3).
+    """A piece of the surface, in the frame of the joint that carries it.
+
+    Attributes:
+        joint: the joint's index.
+        vertices: (V, 3) mm at scale 1.
+        faces: (F, 3) vertex indices.
+        normals: (V, 3) unit vectors.
     """
 
     joint: int
@@ -36,9 +43,16 @@ class BodyPart:
 
 
 def body_parts(skeleton: Skeleton, girth: float = 1.0) -> list[BodyPart]:
-    """The trunk of the default animal at home, cut at its joints; each part reaches one ring of
-    faces farther, so that a bent body shows no gap. girth: of the animal, over what is usual for
-    its length.
+    """Trunk of the default animal at home pose, cut at its joints.
+
+    Each part reaches one ring of faces farther, so that a bent body shows no gap.
+
+    Args:
+        skeleton: the skeleton, which has a surface.
+        girth: of the animal, over what is usual for its length.
+
+    Returns:
+        One part per joint that carries any face.
     """
     surface = Surface.of(skeleton)
     home = Pose.home(skeleton)
@@ -64,7 +78,7 @@ def body_parts(skeleton: Skeleton, girth: float = 1.0) -> list[BodyPart]:
 
 
 def _carriers(skeleton: Skeleton, vertices: Array) -> NDArray[np.int64]:
-    """(V,) for each vertex the joint from which the nearest bone starts, at home."""
+    """(V,) for each vertex the parent joint of the nearest bone at home pose."""
     home = Pose.home(skeleton).joints(skeleton)
     off = []
     for parent, child in skeleton.edges:
@@ -77,7 +91,7 @@ def _carriers(skeleton: Skeleton, vertices: Array) -> NDArray[np.int64]:
 
 
 def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
-    """(V, 3) unit normals: of the faces around each vertex, weighted by their areas."""
+    """(V, 3) unit normals: the mean of the faces around each vertex, weighted by their areas."""
     corners = vertices[faces]
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     out = np.zeros(vertices.shape)
@@ -87,7 +101,13 @@ def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
 
 
 def log_body(stream: Any, skeleton: Skeleton, girth: float) -> list[int]:
-    """Log the parts once; returns the joints that carry one."""
+    """Log the body's parts once; returns the joints that carry one.
+
+    Args:
+        stream: the Rerun stream.
+        skeleton: the skeleton, which has a surface.
+        girth: of the animal, over what is usual for its length.
+    """
     parts = body_parts(skeleton, girth)
     for part in parts:
         mesh = rr.Mesh3D(
@@ -103,7 +123,15 @@ def log_body(stream: Any, skeleton: Skeleton, girth: float) -> list[int]:
 
 
 def send_body(stream: Any, track: Track, rows: slice, when: list[Any], carriers: list[int]) -> None:
-    """Where the parts are in some frames of a track; without a pose they shrink to nothing."""
+    """Log where the body's parts are in some frames; without a pose they shrink to nothing.
+
+    Args:
+        stream: the Rerun stream.
+        track: the track.
+        rows: the frames, consecutive rows of the track.
+        when: the time columns of these frames.
+        carriers: the joints that carry a part, as `log_body` returned them.
+    """
     part = track[rows]
     seen = part.posed
     pose = Pose(part.root, part.angles_rad, part.scale)[seen]

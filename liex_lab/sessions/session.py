@@ -1,4 +1,8 @@
-"""A session: the folder of one recording's results, and the only door to it."""
+"""Reader of a session folder: Parquet tables, JSON metadata, Rerun and MCAP logs of one recording.
+
+A table is read when it is asked for. Where people corrected the session, the corrected tables take
+the place of the measured ones (see `liex_lab.sessions.corrections`).
+"""
 
 from __future__ import annotations
 
@@ -60,8 +64,20 @@ _OPTIONAL = {
 
 
 class Session:
-    """The results of one recording, read from its folder when asked for. Tables are pandas data
-    frames.
+    """The results of one recording, read from its folder when asked for.
+
+    Tables are pandas data frames. Make one with `Session.open`.
+
+    Attributes:
+        path: the session folder.
+        metadata: the content of session.json, with what corrections changed in it.
+        log: the corrections that apply; an empty log where there are none, where they were made on
+            another measurement, or where they are not wanted.
+
+    Args:
+        path: the session folder.
+        metadata: the content of session.json.
+        log: the corrections that apply; None for none.
     """
 
     def __init__(self, path: Path, metadata: dict[str, Any], log: Log | None = None) -> None:
@@ -71,10 +87,16 @@ class Session:
 
     @staticmethod
     def open(path: str | Path, *, raw: bool = False) -> Session:
-        """The session in the folder `path`, checked for its version and for missing files.
+        """Open the session in a folder, checked for its version and for missing files.
 
-        raw: as it was measured, without what people corrected (see
-        `liex_lab.sessions.corrections`).
+        Args:
+            path: the session folder.
+            raw: as it was measured, without what people corrected (see
+                `liex_lab.sessions.corrections`).
+
+        Raises:
+            SessionError: the folder is no session, is damaged, lacks a file, or was written by a
+                newer version.
         """
         folder = Path(path)
         document = folder / "session.json"
@@ -111,53 +133,67 @@ class Session:
             return str(self.metadata["session_id"])
 
     def file(self, name: str) -> Path:
-        """Where a file of the session lies: the corrected one where there is one, else the
-        session's own.
+        """Path of a file of the session: the corrected one where there is one, else its own.
+
+        Args:
+            name: the file's name, such as 'poses.parquet'.
         """
         return corrected_folder(self.path) / name if name in self.log.files else self.path / name
 
     def has(self, name: str) -> bool:
-        """Whether the session holds a file."""
+        """Whether the session holds a file.
+
+        Args:
+            name: the file's name, such as 'summary.csv'.
+        """
         return self.file(name).is_file()
 
     @cached_property
     def frames(self) -> pd.DataFrame:
-        """One row per recorded frame: time, gap, predicted error, flag."""
+        """Table `frames`, one row per recorded frame: time, gap, predicted error, flag."""
         return self.table("frames")
 
     @cached_property
     def poses(self) -> pd.DataFrame:
-        """One row per recorded frame and joint: position, pixel, sd."""
+        """Table `poses`, one row per recorded frame and joint: position (mm), pixel, sd (mm)."""
         return self.table("poses")
 
     @cached_property
     def rotations(self) -> pd.DataFrame:
-        """One row per recorded frame and joint, and one for the root's rigid transform."""
+        """Table `rotations`, one row per recorded frame and joint, and one for the root.
+
+        The root's row is its rigid transform, which has a translation, too. Rotations are rotation
+        vectors, rad; translations mm.
+        """
         return self.table("rotations")
 
     @cached_property
     def kinematics(self) -> pd.DataFrame:
-        """One row per recorded frame: speed, heading, heights."""
+        """Table `kinematics`, one row per recorded frame: speed (mm/s), heading, heights (mm)."""
         return self.table("kinematics")
 
     @cached_property
     def bouts(self) -> pd.DataFrame:
-        """The ethogram: one row per bout."""
+        """The ethogram: table `bouts`, one row per bout."""
         return self.table("bouts")
 
     @cached_property
     def gaps(self) -> pd.DataFrame:
-        """One row per stretch of frames that are missing or without a pose."""
+        """Table `gaps`, one row per stretch of frames that are missing or without a pose."""
         return self.table("gaps")
 
     @cached_property
     def flips(self) -> pd.DataFrame:
-        """One row per stretch in which head and tail may have been exchanged."""
+        """Table `flips`, one row per stretch in which head and tail may have been exchanged."""
         return self.table("flips")
 
     @cached_property
     def summary(self) -> pd.DataFrame:
-        """The behaviour summary, one row per animal."""
+        """The behaviour summary, one row per animal.
+
+        Raises:
+            SessionError: the session was written without behaviour measures.
+        """
         import pandas as pd
 
         path = self.file("summary.csv")
@@ -180,15 +216,16 @@ class Session:
 
     @cached_property
     def camera(self) -> Camera:
-        """The depth camera, an ideal one in air; `metadata["camera"]["optics"]` says what was
-        undone for that.
+        """The depth camera, an ideal pinhole one in air; px.
+
+        `metadata["camera"]["optics"]` says what of lens and water was undone for that.
         """
         with reading_from(self.path / "session.json"):
             return Camera.from_dict(self.metadata["camera"])
 
     @cached_property
     def T_arena_camera(self) -> SE3:
-        """Carries points of the camera frame into the arena frame."""
+        """Rigid transform that carries points of the camera frame (mm) into the arena frame."""
         with reading_from(self.path / "session.json"):
             return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
 
@@ -200,19 +237,24 @@ class Session:
 
     @cached_property
     def zones(self) -> list[Zone]:
-        """The zones that were drawn."""
+        """The zones that a person has drawn on the floor."""
         with reading_from(self.path / "session.json"):
             return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
     @property
     def plan(self) -> str:
-        """The plan as resolved, TOML text."""
+        """The plan with all settings as resolved for this run, TOML text."""
         with reading_from(self.path / "plan.toml") as path:
             return path.read_text(encoding="utf-8")
 
     def narrowed(self, **wanted: Sequence[str]) -> Session:
-        """The same session of whose named tables no more is read than these columns, as far as it
-        has them: of hours of recording all of them take much memory.
+        """The same session, of whose named tables no more is read than some columns.
+
+        Of hours of recording all columns take much memory. A column that a table does not have is
+        left out.
+
+        Args:
+            **wanted: table name to the names of its columns, as `frames=["time_s", "flag"]`.
         """
         import pyarrow.parquet as pq
 
@@ -230,8 +272,16 @@ class Session:
     def table(
         self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
     ) -> pd.DataFrame:
-        """A table by its name; of a long one perhaps only some columns, and the rows of some
-        frames.
+        """Read a table by its name, or a part of it.
+
+        Args:
+            name: the table's name, such as 'poses'.
+            columns: only these columns; None takes all.
+            frame_index: only the rows of these frames, the camera's count; then no more than one
+                row group of the file is in memory at a time. None takes all rows.
+
+        Raises:
+            SessionError: there is no such table, or it is damaged.
         """
         import pandas as pd
 

@@ -1,8 +1,8 @@
-"""Stretches of a recording that other processes look at, side by side: each is written whole in a
-folder of its own.
+"""Shards of a recording, measured by several processes side by side, each in its own folder.
 
-They lie inside the unfinished session until it takes them over, in order. A stretch may be written
-twice, by a worker that died and another one: it becomes whole by a rename, and both say the same.
+They lie inside the unfinished session until it takes them over, in order. A shard may be written
+twice, by a worker that died and by another one: it becomes whole by an atomic rename, and both say
+the same.
 """
 
 from __future__ import annotations
@@ -29,14 +29,22 @@ _SEEN = "seen"
 
 
 def stretch_folder(unfinished: Path, start: int, stop: int) -> Path:
-    """Where frames start to stop (exclusive) of the unfinished session in a folder lie when they
-    are whole.
+    """Path where a shard of an unfinished session lies when it is whole.
+
+    Args:
+        unfinished: the folder of the unfinished session.
+        start: first row of the shard.
+        stop: the first row after it.
     """
     return unfinished / STRETCHES / f"{start:09d}-{stop:09d}"
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether a stretch is there with all that it says it has."""
+    """Whether a shard is there with all that it says it has.
+
+    Args:
+        folder: the shard's folder.
+    """
     try:
         sizes = json.loads((folder / _SIZES).read_text(encoding="utf-8"))
         return all((folder / log).stat().st_size == sizes[log] for log in LOGS)
@@ -45,8 +53,13 @@ def is_whole(folder: Path) -> bool:
 
 
 def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
-    """Make a whole stretch the next part of an unfinished session, which has n_frames
-    frames then.
+    """Make a whole shard the next part of an unfinished session; its folder is removed.
+
+    Args:
+        held: the unfinished session, held by this process.
+        folder: the shard's folder.
+        n_frames: frames that the session has then.
+        seconds: time spent on them, s.
     """
     held.seen.append(Columns(folder / _SEEN).read())
     held.take(n_frames, seconds, {log: folder / log for log in LOGS})
@@ -54,12 +67,19 @@ def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> 
 
 
 class StretchWriter:
-    """Depth of consecutive frames and what was seen in them. In a `with` block: whole at its end,
-    or not there.
+    """Writer of a shard: depth of consecutive frames and their observations.
+
+    In a `with` block the shard is whole at its end, or not there.
     """
 
     def __init__(self, folder: Path, origin: Provenance, first_ns: int | None) -> None:
-        """first_ns: when the recording's first frame was; None where that is in this stretch."""
+        """Begin the shard in a folder beside its own.
+
+        Args:
+            folder: the shard's folder.
+            origin: what is known about the recording.
+            first_ns: time of the recording's first frame, ns; None where that is in this shard.
+        """
         from liex_lab.sessions.mcap import McapWriter
         from liex_lab.sessions.rrd import ReplayWriter
 
@@ -78,7 +98,12 @@ class StretchWriter:
         return self
 
     def add(self, frames: Sequence[DepthFrame], seen: Columnar) -> None:
-        """The next frames."""
+        """Write the next frames.
+
+        Args:
+            frames: consecutive frames.
+            seen: their observations, one row per frame.
+        """
         from liex_lab.recordings.rvl import to_millimetres
 
         depth = [to_millimetres(frame.depth) for frame in frames]

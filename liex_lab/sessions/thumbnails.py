@@ -1,5 +1,7 @@
-"""A few depth pictures kept along the way, cut around the animal, so that the report can show what
-was fitted.
+"""Thumbnails of depth pictures, cut around the animal, so that the report can show what was fitted.
+
+They are an evenly spaced sample of a stream of unknown length: when too many frames are held, every
+second one is dropped and the spacing doubles.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ _HALF_SPINES = 1.15  # half the side of the picture, in spine lengths
 
 
 class Keepsakes:
-    """Evenly spaced frames of a stream: when too many are held, every second one is let go."""
+    """Evenly spaced frames of a stream, at most 32 at a time."""
 
     def __init__(self) -> None:
         self._every = 1
@@ -29,7 +31,11 @@ class Keepsakes:
         self._kept: dict[int, NDArray[np.uint16]] = {}  # row -> depth
 
     def add(self, depth: NDArray[np.uint16]) -> None:
-        """The depth of the next frame, (H, W) uint16 mm."""
+        """Take the next frame.
+
+        Args:
+            depth: (H, W) uint16 mm, 0 where unread.
+        """
         if self._seen % self._every == 0:
             self._kept[self._seen] = depth
             self._thin_out()
@@ -41,8 +47,11 @@ class Keepsakes:
             self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
 
     def again(self, n_frames: int, read: Callable[[int], NDArray[np.uint16]]) -> None:
-        """As if the first `n_frames` had been added; `read` gives the depth of one of them by its
-        row.
+        """Put the sample into the state as if the first frames had been added.
+
+        Args:
+            n_frames: how many frames.
+            read: depth (H, W) uint16 mm of one of them by its row.
         """
         for row in range(n_frames):
             if row % self._every == 0:
@@ -52,8 +61,15 @@ class Keepsakes:
         self._seen = n_frames
 
     def save(self, folder: Path, rows: Rows, camera: Camera) -> list[dict[str, Any]]:
-        """Write up to sixteen 16-bit PNG pictures, mm, 0 unread, and say where in the frame each
-        was cut.
+        """Write up to sixteen 16-bit PNG pictures, mm, 0 where unread; returns where each was cut.
+
+        Args:
+            folder: the session folder, which gets the folder `thumbnails`.
+            rows: the track as the tables see it; only frames with a measured pose are taken.
+            camera: the depth camera, for the size of the animal in px.
+
+        Returns:
+            For each picture file, frame_index, left_px, top_px, width_px and height_px.
         """
         import cv2
 

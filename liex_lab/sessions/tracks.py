@@ -1,4 +1,4 @@
-"""A session's tables as the track that they were made from."""
+"""Track of a session, read back from its Parquet tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,11 @@ _SCALARS = ("scale", "predicted_error_mm", "residual_mm", "n_foreground_px", "p_
 
 
 def skeleton_of(session: Session) -> Skeleton:
-    """The skeleton of a session: as it was then, or, of an older session, as it is now."""
+    """Skeleton of a session: as it was then or, for an older session, as it is now.
+
+    Args:
+        session: the session.
+    """
     kept = read_skeleton(session)
     if kept is not None:
         return kept
@@ -36,7 +40,15 @@ def skeleton_of(session: Session) -> Skeleton:
 
 
 def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
-    """The track of a session, whole; what an older session does not tell is as in `Track.empty`."""
+    """The whole track of a session; what an older session does not tell is as in `Track.empty`.
+
+    Args:
+        session: the session.
+        skeleton: its skeleton; None reads it.
+
+    Raises:
+        SessionError: the tables have other numbers of rows than the frames and joints need.
+    """
     skeleton = skeleton or skeleton_of(session)
     frames = session.frames
     n = len(session.frames)
@@ -73,8 +85,9 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
 
 
 def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
-    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6); of an
-    older session these alone are known.
+    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6).
+
+    Of an older session the standard deviations alone are known; the rest is NaN.
     """
     out = np.zeros((len(sd), 6, 6))
     out[:, range(6), range(6)] = sd**2
@@ -84,7 +97,11 @@ def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
 
 
 def wall_of(session: Session) -> Array:
-    """(n,) distance from the nearest wall, mm; NaN where it is not known."""
+    """(n,) distance of the animal from the nearest wall, mm; NaN where it is not known.
+
+    Args:
+        session: the session.
+    """
     frames = session.frames
     return (
         frames["wall_distance_mm"].to_numpy(float)

@@ -1,4 +1,4 @@
-"""A session's replay in a window of Rerun's viewer, at a moment."""
+"""Launcher of the Rerun viewer that shows a session's replay at a moment in time."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ _PATIENCE_S = 30.0  # for a viewer to come up
 
 @dataclass(frozen=True)
 class Shown:
-    """A viewer that shows a replay: its process, and Rerun's client that commands it."""
+    """A viewer that shows a replay.
+
+    Attributes:
+        process: the viewer's process.
+        client: Rerun's client that commands it.
+    """
 
     process: subprocess.Popen[bytes]
     client: Any
 
     def wait(self) -> None:
-        """Until the viewer is closed."""
+        """Wait until the viewer is closed."""
         self.process.wait()
 
     def close(self) -> None:
@@ -42,8 +47,12 @@ def has_screen() -> bool:
 
 
 def replays_with(replay: Path) -> list[Path]:
-    """What is opened for a session's replay: where there are corrections theirs first, for the
-    first layout holds.
+    """Files to open for a session's replay, in order.
+
+    Where there are corrections, their replay comes first, for the first file's layout holds.
+
+    Args:
+        replay: the session's own .rrd, or one that lies somewhere by itself.
     """
     from liex_lab.sessions.corrections import REPLAY
     from liex_lab.sessions.session import Session
@@ -56,10 +65,17 @@ def replays_with(replay: Path) -> list[Path]:
 
 
 def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
-    """Open a .rrd in a window at a time, s since its first frame.
+    """Open a replay in a window at a moment; returns the viewer.
 
-    The viewer listens on 127.0.0.1 alone and ends with this process. Raises LiexError where it does
-    not come up.
+    The viewer listens on 127.0.0.1 alone and ends with this process.
+
+    Args:
+        replay: the .rrd file.
+        at_s: the moment, s since its first frame.
+        headless: show no window, for tests.
+
+    Raises:
+        LiexError: there is no such file, no screen, or the viewer does not come up within 30 s.
     """
     if not replay.is_file():
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")

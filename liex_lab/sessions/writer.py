@@ -1,5 +1,8 @@
-"""Writing a session: a folder beside the final place, renamed when whole; interrupted, the work
-goes on there.
+"""Writer of a session folder that survives interruption, made whole by one atomic rename.
+
+The session grows in the folder NAME.part beside its final place. Depth streams straight into the
+Rerun replay and the MCAP file; tables are written at the end. A checkpoint every few seconds lets
+an interrupted run go on there (see `liex_lab.sessions.checkpoint`).
 """
 
 from __future__ import annotations
@@ -55,16 +58,27 @@ ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in
 
 
 class SessionWriter:
-    """Begins a session; takes depth and track part by part; `close` writes the tables and puts it
-    in its place.
+    """Begins a session, takes depth and track part by part, and puts it in its place with `close`.
 
     Depth goes straight to session.rrd and session.mcap, so memory does not grow with it. Use it in
     a `with` block: an exception goes on, and leaves nothing behind but a folder NAME.part where
     there is a checkpoint in it. A writer of the same session then begins with `n_frames` frames
     that need not be given again.
 
-    blueprint: makes the replay's layout from session.json's content; report: writes report.html
-    into the folder.
+    Attributes:
+        path: where the session will be.
+        origin: what is known about the recording before its first frame.
+
+    Args:
+        path: the session folder to be.
+        origin: what is known about the recording before its first frame.
+        overwrite: replace a session that is there already.
+        blueprint: makes the replay's layout from session.json's content as known so far; None for
+            no layout.
+        report: writes report.html into the folder; None for no report.
+
+    Raises:
+        SessionError: the place is taken, or another process is writing there.
     """
 
     def __init__(
@@ -139,14 +153,17 @@ class SessionWriter:
 
     @property
     def n_frames(self) -> int:
-        """Frames that are in the session already; more than none where an interrupted one
-        goes on.
+        """Frames that are in the session already.
+
+        More than none where an interrupted session goes on.
         """
         return len(self._index)
 
     def go_on(self, depth: Callable[[int], NDArray[np.float32]]) -> None:
-        """Look once more at the few frames of the report, where some are in already; depth: of a
-        row, (H, W) mm.
+        """Look once more at the few frames kept for the report, where some frames are in already.
+
+        Args:
+            depth: depth (H, W) float32 mm of a frame by its row.
         """
         from liex_lab.recordings.rvl import to_millimetres
 
@@ -158,10 +175,16 @@ class SessionWriter:
         track_part: Track | None = None,
         seen: Columnar | None = None,
     ) -> None:
-        """Consecutive frames and, unless `close` gets the whole track, their part of it.
+        """Write consecutive frames.
 
-        seen: what was seen in them, kept on disk until the session is whole: the work can go on
-        from there, see `seen`.
+        Args:
+            frames: the next frames.
+            track_part: their rows of the track, unless `close` gets the whole track.
+            seen: their observations, one row per frame, kept on disk until the session is whole: an
+                interrupted run can go on from there, see `seen`.
+
+        Raises:
+            SessionError: the track part is of other frames, or a log could not be written.
         """
         from liex_lab.recordings.rvl import to_millimetres
 
@@ -193,8 +216,10 @@ class SessionWriter:
         self._seconds += time.perf_counter() - began
 
     def seen(self, kind: Callable[..., Kept]) -> Kept:
-        """What was seen in all frames so far, as `add` got it; kind: made of the skeleton and its
-        columns in order.
+        """The observations of all frames so far, as `add` got them; they lie on disk.
+
+        Args:
+            kind: called with the skeleton and the columns in order, such as `Observations`.
         """
         kept = self._checkpoint.seen.read()
         return kind(
@@ -226,25 +251,37 @@ class SessionWriter:
 
     @property
     def room(self) -> Room:
-        """Where a track of hours may lie until the session is whole: on the disk that it will be
-        on.
+        """Allocator of arrays on the session's disk.
+
+        A track of hours may lie there until the session is whole.
         """
         return on_disk(self._folder)
 
     @property
     def track(self) -> Track:
-        """The track so far."""
+        """The track so far, one row per frame."""
         return self._held.track
 
     @track.setter
     def track(self, track: Track) -> None:
-        """Replace the track, for one that was smoothed over the whole recording."""
+        """Replace the track by one that was smoothed over the whole recording.
+
+        Args:
+            track: one row for every frame written.
+
+        Raises:
+            SessionError: the track is of other frames.
+        """
         _check_times(np.array(self._times_ns, np.int64), track)
         self._held = TrackBuffer.of(track)
 
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
-        """The track of all frames so far, what was found out about its flips, and what it was made
-        of.
+        """Take the track of all frames so far, and write what it was made of to observations.npz.
+
+        Args:
+            tracked: the track, and where head and tail may be exchanged.
+            seen: the observations of all frames.
+            subject: animal and camera that the track is of.
         """
         self.track = tracked.track
         self._flips = tracked.flips
@@ -269,8 +306,11 @@ class SessionWriter:
         )
 
     def note(self, **sections: Any) -> None:
-        """Add facts found on the way to session.json: tables are merged, lists extended, the rest
-        replaced.
+        """Add facts found on the way to session.json.
+
+        Args:
+            **sections: section name to content; tables are merged, lists extended, the rest
+                replaced.
         """
         for name, value in sections.items():
             known = self._document.get(name)
@@ -294,11 +334,20 @@ class SessionWriter:
         record: Mapping[str, Any] | None = None,
         timings_s: Mapping[str, float] | None = None,
     ) -> Session:
-        """Write everything else and put the session in its place.
+        """Write everything else and put the session in its place; returns it opened.
 
-        results: tables by name (kinematics, bouts, summary and others); columns: describe theirs,
-        of bouts those beyond `tables.BOUTS`; actions: the ethogram's vocabulary, word ->
-        definition; record: what else session.json should hold (see `note`).
+        The report is written last; where that fails the session is kept all the same.
+
+        Args:
+            results: tables by name (kinematics, bouts, summary and others).
+            columns: descriptions of their columns; of bouts, of those beyond `tables.BOUTS`.
+            actions: the ethogram's vocabulary, word to definition.
+            record: what else session.json is to hold (see `note`).
+            timings_s: time spent on each part of the work, s.
+
+        Raises:
+            SessionError: the recording holds no frame, the track is of other frames, a column is
+                not described, or a log could not be written.
         """
         from liex_lab.sessions.session import Session
 
@@ -412,19 +461,34 @@ class SessionWriter:
 
 
 def seen_rows(frames: Sequence[DepthFrame], seen: Columnar) -> dict[str, NDArray[Any]]:
-    """What is kept on disk of consecutive frames: what was seen in them, their count and their
-    time.
+    """Columns kept on disk of consecutive frames: observations, camera's frame count, time (ns).
+
+    Args:
+        frames: n consecutive frames.
+        seen: their observations, n rows.
+
+    Returns:
+        Arrays (n, ...) by name.
     """
     index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
     return {**columns_of(seen), INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
 
 
 def unfinished(path: Path, origin: Provenance) -> Checkpoint:
-    """The unfinished session that will be at `path`, begun or gone on with."""
+    """Open the unfinished session of a place, begun or gone on with.
+
+    Args:
+        path: where the session will be.
+        origin: what is known about the recording; only a session of the same facts goes on.
+
+    Raises:
+        SessionError: another process is writing it.
+    """
     return Checkpoint(part_folder(path), {"n_frames": origin.n_frames, **origin.document()})
 
 
 def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:
+    """Raises SessionError where a track is not of exactly the frames at times_ns (n,)."""
     if not np.array_equal(times_ns, track.times_ns):
         raise SessionError(
             f"a track has one row for every frame written, got {track.n_frames} rows for "

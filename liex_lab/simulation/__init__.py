@@ -1,1 +1,1 @@
-"""Virtual recordings with truth: bodies, postures, sensors, scenes and what goes wrong in them."""
+"""Simulated depth recordings with exact truth: bodies, poses, sensors, scenes, corruptions."""

@@ -1,5 +1,9 @@
-"""Kernels that compose an ideal depth picture: floor and wall along the rays, meshes drawn over
-them.
+"""Depth renderer: floor and wall by ray casting, meshes by z-buffer, then the sensor model.
+
+A ray (x, y, 1) of a pixel, turned into the arena frame, meets the floor at depth height / -d_z and
+a vertical wall at distance / (outward . d_xy); meshes keep the largest 1 / z under each pixel's
+centre. `draw_windows` makes training patches with their learned background, `frames_parallel` whole
+pictures.
 """
 
 from __future__ import annotations
@@ -21,18 +25,27 @@ from liex_lab.simulation._sensor_kernels import (
 )
 
 # columns of a wall: its outward normal in the floor (2), distance from the arena's origin, height,
-# depth of the
-# rounding that multiple reflections leave at its foot and how far that reaches, all mm; distance 0
-# is no wall
+# depth of the rounding that multiple reflections leave at its foot and how far that reaches, all
+# mm; distance 0 is no wall
 WALL_COLUMNS = 6
 
 
 @njit(cache=True)
 def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, rough, depth, what):
-    """Ideal depth and kind of a window (H, W) on a floor with at most one straight wall.
+    """Ideal depth and kind of a patch (H, W) on a floor with at most one straight wall.
 
-    rotation (3, 3) and height mm: T_arena_camera; picture: (width, height), outside it nothing is
-    read; uneven (H, W) times `rough` mm raises the floor.
+    Args:
+        u0: column of the patch's first pixel in the whole picture.
+        v0: its row.
+        picture: (2,) width and height of the whole picture, px; outside it nothing is read.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        rotation: (3, 3) of T_arena_camera.
+        height: of the camera above the floor, mm.
+        wall: (WALL_COLUMNS,) the wall.
+        uneven: (H, W) heights of the floor, over `rough`.
+        rough: mm that a unit of `uneven` raises the floor.
+        depth: (H, W) float32 mm, filled, 0 = nothing.
+        what: (H, W) uint8 kinds, filled with NOTHING or STILL.
     """
     rows, columns = depth.shape
     for r in range(rows):
@@ -68,8 +81,9 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
 
 @njit(cache=True)
 def merge(inverse, label, top, left, depth, what):
-    """Put a drawn mesh (inverse depth, h, w) at row `top`, column `left` in front of what is
-    farther, as `label`.
+    """Put a drawn mesh (inverse depth, h, w) at row `top`, column `left` before what is farther.
+
+    The pixels that it takes get the kind `label` in `what`.
     """
     for r in range(inverse.shape[0]):
         for c in range(inverse.shape[1]):
@@ -82,8 +96,19 @@ def merge(inverse, label, top, left, depth, what):
 
 @njit(cache=True)
 def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label, depth, what):
-    """Draw a mesh over a picture or window (H, W) whose first pixel is (u0, v0), touching only the
-    mesh's own box.
+    """Rasterise a mesh over a picture or patch, touching only the mesh's own bounding box.
+
+    Args:
+        vertices: (V, 3) mm.
+        faces: (F, 3) int32 triangles.
+        rotation: (3, 3) from the vertices' frame into the camera frame.
+        translation: (3,) likewise, mm.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        u0: column of the first pixel in the whole picture.
+        v0: its row.
+        label: kind of the pixels that are drawn.
+        depth: (H, W) float32 mm, changed in place.
+        what: (H, W) uint8 kinds, changed in place.
     """
     low_u = 1e9
     low_v = 1e9
@@ -147,9 +172,7 @@ def _window(
     depth_out,
     background_out,
 ):
-    """One training window: the still scene, its estimate, the animal, perhaps a thing beside it,
-    and the sensor.
-    """
+    """One training patch: still scene, its learned background, animal, perhaps an object, noise."""
     shape = depth_out.shape
     state = np.array([seed], np.uint64)
     field = np.empty(shape, np.float32)
@@ -227,6 +250,27 @@ def draw_windows(
     depth_out,
     background_out,
 ):
+    """Render n training patches and their learned backgrounds, one thread a patch.
+
+    Args:
+        animal: (n, V, 3) meshes of the animals, mm, arena frame.
+        faces: (F, 3) int32 their triangles.
+        thing: (n, W, 3) meshes of the objects beside them, mm, arena frame.
+        thing_faces: (G, 3) int32 their triangles.
+        has_thing: (n,) bool, which objects are there.
+        R_arena_camera: (n, 3, 3) rotations of the cameras.
+        height: (n,) of the cameras above the floor, mm.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        picture: (n, 2) int64 width and height of the whole pictures, px.
+        origin: (n, 2) int64 picture pixel (u, v) of each patch's first.
+        wall: (n, WALL_COLUMNS) walls.
+        rough: (n,) unevenness of the floors, mm.
+        sensor: (n, N_PARAMETERS) of the sensors.
+        seed: (n,) uint64 of the noise, not 0.
+        table: (2^13,) float32 normal quantiles.
+        depth_out: (n, S, S) uint16 in steps of the sensor's unit, filled, 0 = unread.
+        background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
+    """
     for i in prange(len(animal)):
         _window(
             animal[i],
@@ -265,8 +309,22 @@ def frame(
     table,
     out,
 ):
-    """One full frame (H, W) uint16 mm: the still scene (H, W) mm, the animal and perhaps a thing,
-    and the sensor.
+    """Render one full frame: the still scene, the animal, perhaps an object, and the sensor.
+
+    Args:
+        still: (H, W) float32 mm, the ideal still scene, 0 = nothing.
+        animal: (V, 3) mesh, mm, arena frame.
+        faces: (F, 3) int32 its triangles.
+        thing: (W, 3) mesh of the object, mm, arena frame.
+        thing_faces: (G, 3) int32 its triangles.
+        has_thing: whether the object is there.
+        rotation: (3, 3) of T_camera_arena.
+        translation: (3,) of T_camera_arena, mm.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        sensor: (N_PARAMETERS,) of the sensor.
+        seed: uint64 of the noise, not 0.
+        table: (2^13,) float32 normal quantiles.
+        out: (H, W) uint16 in steps of the sensor's unit, filled, 0 = unread.
     """
     state = np.array([seed], np.uint64)
     depth = still.copy()
@@ -298,8 +356,22 @@ def frames_parallel(
     table,
     out,
 ):
-    """`frame` for a batch: animal, thing, has_thing, sensor, seed and out (n, ...) differ, the rest
-    is shared.
+    """Render n full frames of one scene, one thread a frame; see `frame`.
+
+    Args:
+        still: (H, W) float32 mm, shared.
+        animal: (n, V, 3) meshes, mm, arena frame.
+        faces: (F, 3) int32, shared.
+        thing: (n, W, 3) meshes of the objects, mm, arena frame.
+        thing_faces: (G, 3) int32, shared.
+        has_thing: (n,) bool.
+        rotation: (3, 3) of T_camera_arena, shared.
+        translation: (3,) of T_camera_arena, mm, shared.
+        intrinsics: (4,) fx, fy, cx, cy, px, shared.
+        sensor: (n, N_PARAMETERS).
+        seed: (n,) uint64, not 0.
+        table: (2^13,) float32 normal quantiles.
+        out: (n, H, W) uint16 in steps of the sensor's unit, filled, 0 = unread.
     """
     for i in prange(len(animal)):
         frame(

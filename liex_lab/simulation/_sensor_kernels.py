@@ -1,10 +1,15 @@
-"""Kernels of the sensor models: what a PrimeSense, a Kinect v2 or a light field makes of an ideal
-depth picture.
+"""Noise models of depth sensors: structured light, time of flight, plenoptic (light field).
 
-Every random number comes from a small generator whose state (1,) uint64 belongs to one picture, so
-a picture depends on its seed alone, never on threads or on order. Arguments that all kernels share:
-depth (H, W) mm, 0 = nothing in range; what (H, W) uint8: NOTHING, STILL (background), ANIMAL,
-OBJECT; `p`: one row of sensor parameters, indexed as below.
+PrimeSense: disparity f b / z, quantised to eighths of a pixel, with projector shadow. Kinect v2:
+axial noise that grows as z^2 with radial and slope terms, and flying pixels at edges. Light field:
+smooth range noise growing as z^2, texture-less gaps and mismatches. Before any of them, `soften`
+lets fur blur the outline; `sense` chooses the model.
+
+Every random number comes from a xorshift64 generator (Marsaglia 2003) whose state (1,) uint64
+belongs to one picture, so a picture depends on its seed alone, never on threads or on order.
+Arguments that all kernels share: depth (H, W) float32 mm, 0 = nothing in range; what (H, W) uint8:
+NOTHING, STILL (background), ANIMAL, OBJECT; `p`: one row (N_PARAMETERS,) of sensor parameters,
+indexed as below.
 """
 
 from __future__ import annotations
@@ -77,20 +82,25 @@ def advance(state):
 
 @njit(cache=True)
 def uniform(state):
-    """A number in [0, 1)."""
+    """A number in [0, 1) with 24 random bits, advancing state (1,)."""
     return np.float64(advance(state) >> np.uint64(40)) * (1.0 / 16777216.0)
 
 
 @njit(cache=True)
 def normal(state, table):
-    """A standard normal number, to the resolution of the table."""
+    """A standard normal number by inversion, to the resolution of the quantile table (2^13,)."""
     return table[np.int64(advance(state) >> np.uint64(_SHIFT))]
 
 
 @njit(cache=True)
 def smooth_field(state, table, spacing, out):
-    """Fill out (H, W) with noise of unit deviation at its nodes, `spacing` pixels apart, linear
-    between them.
+    """Value noise: normal numbers at nodes `spacing` pixels apart, bilinear between them.
+
+    Args:
+        state: (1,) uint64 of the generator, advanced.
+        table: (2^13,) float32 normal quantiles.
+        spacing: of the nodes, px; the lattice's offset is random.
+        out: (H, W) float32, filled; of unit deviation at its nodes.
     """
     height, width = out.shape
     n_columns = int(width / spacing) + 3
@@ -126,11 +136,18 @@ def smooth_field(state, table, spacing, out):
 
 @njit(cache=True)
 def soften(depth, what, p, state, table, field):
-    """What fur does before any sensor looks: lumps, a bias of dark hair, and an outline that
-    returns less, in place.
+    """What fur does before any sensor: lumps, a bias of dark hair, an outline that returns less.
 
-    `erosion` pixels of the animal's outline go to whatever stands behind, and a share of the next
-    ones, after FUR.
+    `p[EROSION]` pixels of the animal's outline go to whatever stands behind, and a share 0.5
+    `p[FUR]` of the next ones.
+
+    Args:
+        depth: (H, W) float32 mm, changed in place.
+        what: (H, W) uint8 kinds, changed in place where the outline is lost.
+        p: (N_PARAMETERS,) of the sensor.
+        state: (1,) uint64 of the generator, advanced.
+        table: (2^13,) float32 normal quantiles.
+        field: (H, W) float32 scratch space.
     """
     height, width = depth.shape
     smooth_field(state, table, p[GRID] * 1.3, field)
@@ -192,12 +209,19 @@ def _step(depth, v, u):
 
 @njit(cache=True)
 def primesense(depth, what, p, focal, state, table, out):
-    """Structured light: out (H, W) uint16 mm, 0 = unread. See `soften` and the module's head for
-    the arguments.
+    """Structured light: disparity f b / z with smooth noise, quantised to eighths of a pixel.
 
-    Disparity f b / z is read over a window (smooth errors, outlines displaced by about a pixel), in
-    eighths of a pixel; what the projector cannot see, beside anything that stands up, is unread,
-    and so are grazing surfaces.
+    Disparity is read over a window (smooth errors, outlines displaced by about a pixel); what the
+    projector cannot see, beside anything that stands up, is unread, and so are grazing surfaces.
+
+    Args:
+        depth: (H, W) float32 mm, 0 = nothing in range.
+        what: (H, W) uint8 kinds.
+        p: (N_PARAMETERS,) of the sensor.
+        focal: px.
+        state: (1,) uint64 of the generator, advanced.
+        table: (2^13,) float32 normal quantiles.
+        out: (H, W) uint16 mm, filled, 0 = unread.
     """
     height, width = depth.shape
     field = np.empty((height, width), np.float32)
@@ -253,11 +277,21 @@ def _shadow(row, fb, side, shadow):
 
 @njit(cache=True)
 def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
-    """Time of flight: out (H, W) uint16 mm, 0 = unread. (centre_u, centre_v): the optical axis in
-    window pixels.
+    """Time of flight: range noise by distance, angle and slope, and flying pixels at outlines.
 
     Noise grows with the squared distance, towards the corners and on slopes, part of it smooth; at
     an outline a pixel mixes the near and the far surface (flying pixels) or is unread.
+
+    Args:
+        depth: (H, W) float32 mm, 0 = nothing in range.
+        what: (H, W) uint8 kinds.
+        p: (N_PARAMETERS,) of the sensor.
+        focal: px.
+        centre_u: column of the optical axis, px of the window.
+        centre_v: row of the optical axis, px of the window.
+        state: (1,) uint64 of the generator, advanced.
+        table: (2^13,) float32 normal quantiles.
+        out: (H, W) uint16 mm, filled, 0 = unread.
     """
     height, width = depth.shape
     field = np.empty((height, width), np.float32)
@@ -288,12 +322,20 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
 
 @njit(cache=True)
 def light_field(depth, what, p, state, table, out):
-    """A plenoptic camera: out (H, W) uint16 in steps of p[UNIT] mm, 0 = unread.
+    """A plenoptic camera: depth from matched texture, with large and mostly smooth range noise.
 
-    Depth comes from matched texture. Range noise is large and mostly smooth; outlines lie some
-    pixels off, often outwards; where the surface bears no texture (DARK of the animal's, HOLES of
-    the rest) there is no reading, or (FLYING > 0.5) what lies around was drawn over it; patches are
-    matched wrongly, the rarer the larger OUTLIERS.
+    Outlines lie some pixels off, often outwards; where the surface bears no texture (DARK of the
+    animal's, HOLES of the rest) there is no reading, or (FLYING > 0.5) what lies around was drawn
+    over it; patches are matched wrongly, the rarer the larger OUTLIERS. Range noise grows with (z /
+    TYPICAL_MM)^2.
+
+    Args:
+        depth: (H, W) float32 mm, 0 = nothing in range.
+        what: (H, W) uint8 kinds.
+        p: (N_PARAMETERS,) of the sensor.
+        state: (1,) uint64 of the generator, advanced.
+        table: (2^13,) float32 normal quantiles.
+        out: (H, W) uint16 in steps of `p[UNIT]` mm, filled, 0 = unread.
     """
     height, width = depth.shape
     fields = np.empty((6, height, width), np.float32)
@@ -342,8 +384,19 @@ def light_field(depth, what, p, state, table, out):
 
 @njit(cache=True)
 def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
-    """One picture through its sensor: depth and what are consumed, `field` (H, W) float32 is
-    scratch space.
+    """One picture through `soften` and its sensor's model; depth and what are consumed.
+
+    Args:
+        depth: (H, W) float32 mm, 0 = nothing in range; changed.
+        what: (H, W) uint8 kinds; changed.
+        p: (N_PARAMETERS,) of the sensor; `p[KIND]` chooses the model.
+        focal: px.
+        centre_u: column of the optical axis, px of the window.
+        centre_v: row of the optical axis, px of the window.
+        state: (1,) uint64 of the generator, advanced.
+        table: (2^13,) float32 normal quantiles.
+        field: (H, W) float32 scratch space.
+        out: (H, W) uint16 in steps of `p[UNIT]` mm, filled, 0 = unread.
     """
     soften(depth, what, p, state, table, field)
     if int(p[KIND]) == PRIMESENSE_KIND:

@@ -1,4 +1,8 @@
-"""Virtual recordings by address: synthetic:walk?seed=3&frames=300 and what else moves."""
+"""Addresses of synthetic recordings, `synthetic:<kind>?<key>=<value>&...`, opened like a file.
+
+Example: synthetic:walk?seed=3&frames=300. The query part is parsed as that of a URL; every key is
+checked against those that the kind knows, with the nearest one named in the error.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +31,25 @@ _SIZES = (0.5, 2.9)  # of the home length
 
 
 def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
-    """The virtual recording of an address, as in
-    synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65.
+    """The virtual recording of an address.
 
-    walk: a mouse, swim: a fish, gesture: a hand, move: the animal of a skeleton's TOML,
-    animal=snake.toml. Each setting may be left out: seed 0, 300 frames, the animal's usual sensor,
-    and a size drawn from the seed. track-easy and track-hard: the test sequences of
-    `simulation.tracking_sequences`, of a mouse, or animal=fish or animal=hand, with a seed or more
-    frames others of their kind. camera: taken for the one that made the pictures, to see what a
-    wrong one does.
+    An example is synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65. Kinds: walk, a
+    mouse; swim, a fish; gesture, a hand; move, the animal of a skeleton's TOML, animal=snake.toml.
+    Each setting may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn
+    from the seed. track-easy and track-hard are the test sequences of
+    `simulation.tracking_sequences`, of a mouse, or with animal=fish or animal=hand of those; with a
+    seed or more frames they are others of their kind.
+
+    Args:
+        address: of the recording, beginning with synthetic:.
+        camera: taken for the one that made the pictures, to see what a wrong one does; None is the
+            true one.
+
+    Returns:
+        A recording with truth (a `TrueRecording`).
+
+    Raises:
+        RecordingError: the kind, a setting or its value is not known, or the animal is lacking.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
     if kind not in _KINDS:

@@ -1,5 +1,10 @@
-"""What goes wrong while a real animal is recorded, as a script of events, and how each of them
-looks in the picture.
+"""Corruptions of depth recordings as a script: holes, occluders, distractors, lost frames.
+
+A script deals shuffled decks of the events in `EVENTS`, so that each kind keeps coming back: discs
+without readings (holes), a bar across the line of sight (occluder), a second object (object), an
+animal that sinks into the floor's noise or into glare (faint), stretches at two to three times the
+speed (fast), and frames that are missing (dropped). Objects enter the rendered scene; `Loss` is
+applied to the finished pictures; `visible_share` tells how much of the animal an occluder leaves.
 """
 
 from __future__ import annotations
@@ -12,7 +17,7 @@ from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.objects import N_PARTS, THING_FACES, draw_thing, rounded
-from liex_lab.simulation.scene import Stage
+from liex_lab.simulation.scene import SimulatedScene
 
 Array = NDArray[np.float64]
 Beside = Callable[
@@ -49,8 +54,13 @@ TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max(
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happens in frames start to stop (exclusive); kind: a word of `EVENTS`, or
-    'hidden', the frames in which less than half of the animal can be seen.
+    """Something that happens in frames `start` to `stop`.
+
+    Attributes:
+        kind: a word of `EVENTS`, or 'hidden', the frames in which less than half of the animal can
+            be seen.
+        start: first frame.
+        stop: one past the last frame.
     """
 
     kind: str
@@ -61,11 +71,19 @@ class Event:
 def draw_script(
     rng: np.random.Generator, n_frames: int, step_s: float
 ) -> tuple[list[Event], NDArray[np.int64]]:
-    """Events over n frames, and how many steps of the camera's clock lie before each frame (n,), 1
-    as a rule.
+    """Events over n frames, and the camera's clock steps before each frame.
 
     The events come in shuffled decks, the first with one of each, so that none is long absent.
     Frames that are dropped are missing afterwards: an event 'dropped' is the one frame after them.
+    Besides, 2 % of the frames follow a single frame that is missing.
+
+    Args:
+        rng: source of randomness.
+        n_frames: length of the recording as it is kept.
+        step_s: between two frames, s.
+
+    Returns:
+        The events in order of time, and (n_frames,) int64 steps before each frame, 1 as a rule.
     """
     events = []
     steps = np.ones(n_frames, np.int64)
@@ -88,7 +106,16 @@ def draw_script(
 
 
 def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArray[np.int64]:
-    """How many times as fast (n,) the animal moves."""
+    """How many times as fast the animal moves in each frame.
+
+    Args:
+        rng: source of randomness.
+        events: the script; those of kind 'fast' count.
+        n_frames: length of the recording.
+
+    Returns:
+        (n_frames,) int64: 2 or 3 during 'fast', else 1.
+    """
     times = np.ones(n_frames, np.int64)
     for event in events:
         if event.kind == "fast":
@@ -105,9 +132,20 @@ def draw_things(
     beside: Beside,
     floats: bool = True,
 ) -> Array:
-    """Meshes (n, 2 V, 3) mm of the occluder and of a second object in each frame; behind the camera
-    where there is none. joints (n, J, 3) mm: the animal's, arena frame, where eye (3,) is the
-    camera.
+    """Meshes of the occluder and of a second object in each frame; far behind the lens if none.
+
+    Args:
+        rng: source of randomness.
+        events: the script; those of kind 'occluder' and 'object' count.
+        eye: (3,) position of the camera, mm, arena frame.
+        joints: (n, J, 3) of the animal, mm, arena frame.
+        length_mm: of the animal, mm.
+        beside: makes the second object from a generator, joints and a length.
+        floats: the animal is above the floor, so that the occluder passes at 0.65 of the camera's
+            height; else at up to three body lengths.
+
+    Returns:
+        (n, 2 V, 3) mm, arena frame: the occluder's vertices, then the second object's.
     """
     one = int(THING_FACES.max()) + 1
     things = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
@@ -141,10 +179,26 @@ def _passing(
 
 
 def beside_animal(
-    rng: np.random.Generator, stage: Stage, joints: Array, length_mm: float, kinds: tuple[str, ...]
+    rng: np.random.Generator,
+    stage: SimulatedScene,
+    joints: Array,
+    length_mm: float,
+    kinds: tuple[str, ...],
 ) -> Array:
-    """A thing (n, V, 3) mm that stands beside the animal's way for a while, near it where there is
-    room.
+    """An object that stands beside the animal's path for a while, near it where there is space.
+
+    Of 60 random positions the one is taken whose gap to the path is nearest to half a body length,
+    at a cost for reaching over the walls or standing on the path.
+
+    Args:
+        rng: source of randomness.
+        stage: the scene with its walls.
+        joints: (n, J, 3) of the animal over the event, mm, arena frame.
+        length_mm: of the animal, mm.
+        kinds: of objects to choose from, see `objects.draw_thing`.
+
+    Returns:
+        (n, V, 3) mm, arena frame, the same in every frame.
     """
     mesh = draw_thing(rng, str(rng.choice(kinds)), length_mm)
     way = joints[..., :2].reshape(-1, 2)
@@ -166,7 +220,16 @@ def beside_animal(
 
 
 def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
-    """A block or a ball (n, V, 3) mm that is held beside a hand for a while, at about its depth."""
+    """A block or a ball that is held beside a hand for a while, at about its depth.
+
+    Args:
+        rng: source of randomness.
+        joints: (n, J, 3) of the hand over the event, mm, arena frame.
+        length_mm: of the hand, mm.
+
+    Returns:
+        (n, V, 3) mm, arena frame, the same in every frame.
+    """
     centre = np.zeros((N_PARTS, 3))
     radii = np.zeros((N_PARTS, 3))
     radii[0] = rng.uniform(*_HELD, 3) * length_mm
@@ -188,9 +251,12 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
 
 @dataclass(frozen=True)
 class Loss:
-    """Readings that are lost in n frames: discs, u, v and radius px, of frame i in discs[i];
-    faint_mm (n,): what stands out from the still scene by less is read as the still scene; dropout
-    (n,): this share of the animal's surroundings is not read.
+    """Readings that are lost in n frames.
+
+    Attributes:
+        discs: of frame i in discs[i]: (k, 3) centre u, v and radius, px, in which nothing is read.
+        faint_mm: (n,) what stands out from the still scene by less is read as the still scene, mm.
+        dropout: (n,) share of the animal's surroundings that is not read.
     """
 
     discs: tuple[Array, ...]
@@ -206,7 +272,20 @@ class Loss:
         length_mm: float,
         floats: bool,
     ) -> Loss:
-        """What is lost in n frames of these events; joints (n, J, 3) mm: camera frame."""
+        """What is lost in the frames of a script.
+
+        Args:
+            rng: source of randomness.
+            events: the script; those of kind 'faint' and 'holes' count.
+            camera: the camera.
+            joints: (n, J, 3) of the animal, mm, camera frame.
+            length_mm: of the animal, mm.
+            floats: 'faint' is then dropout of 40 to 75 % of the readings; else what is lower than
+                0.2 to 0.4 body lengths is lost in the floor.
+
+        Returns:
+            The loss of n frames.
+        """
         n = len(joints)
         discs: list[Array] = [np.zeros((0, 3))] * n
         faint = np.zeros(n)
@@ -239,9 +318,15 @@ class Loss:
         middle_px: Array,
         reach_px: Array,
     ) -> None:
-        """Take the readings out of depths (n, H, W) mm, the frames from `first` on. still (H, W)
-        mm, where anything is lost in it; middle_px (n, 2) and reach_px (n,): where the animal is in
-        the picture.
+        """Take the readings out of depth pictures, in place.
+
+        Args:
+            depths: (k, H, W) float32 mm, the frames from `first` on; changed.
+            still: (H, W) float32 mm, the still scene; None where there is none to be lost in.
+            first: number of the first picture's frame.
+            seeds: (n,) uint64 of all frames, for the dropout's pattern.
+            middle_px: (n, 2) the animal's centre in the picture, px.
+            reach_px: (n,) radius about it within which dropout happens, px.
         """
         height, width = depths.shape[1:]
         v, u = np.mgrid[:height, :width]
@@ -261,12 +346,19 @@ class Loss:
 
 
 def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
-    """Share (n,) of the animal's vertices (n, V, 3) that no thing (n, W, 3) hides, 1 in frames
-    other than `rows`.
+    """Share of the animal's vertices that no object hides, 1 in frames other than `rows`.
 
-    Camera frame.
+    A vertex counts as hidden where it projects into the convex hull of the occluder's projection,
+    for the occluder lies nearer.
 
-    A vertex is hidden where it projects into the convex outline of an occluder, which lies nearer.
+    Args:
+        vertices: (n, V, 3) of the animal, mm, camera frame.
+        things: (n, W, 3) of the occluder, mm, camera frame.
+        camera: the camera.
+        rows: frames in which there is an occluder.
+
+    Returns:
+        (n,) from 0 to 1.
     """
     from scipy.spatial import Delaunay
 
@@ -279,7 +371,14 @@ def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[
 
 
 def hidden_spans(share: Array) -> list[Event]:
-    """The stretches in which less than half of the animal is seen."""
+    """The spans of frames in which less than half of the animal is seen.
+
+    Args:
+        share: (n,) visible share of the animal.
+
+    Returns:
+        Events of kind 'hidden', in order of time.
+    """
     hidden = np.concatenate([[False], share < 0.5, [False]])
     edges = np.flatnonzero(hidden[1:] != hidden[:-1])
     return [Event("hidden", int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

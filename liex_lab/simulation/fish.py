@@ -1,5 +1,9 @@
-"""A zebrafish in a tank before a light-field camera: its bodies, its bends, and where in the water
-it hangs.
+"""Pose prior of a zebrafish in a tank: bodies, travelling waves of bending, depth in the water.
+
+The midline's yaw at arc length s (0 at the base joint, 1 at the end of the chain) is two arcs,
+joined by a logistic step, plus a travelling wave whose amplitude grows along the body, A (0.35 +
+0.65 s) sin(2 pi s / L - phase), plus four small standing waves (`bend_profile`). The kinds of
+posture are those of zebrafish ethograms: glide, scoot, J-turn, C-turn and S-bend.
 """
 
 from __future__ import annotations
@@ -16,13 +20,13 @@ from liex_lab.body.surface import Body
 from liex_lab.body.variation import joint_reaches, vary_body
 from liex_lab.geometry import SE3
 from liex_lab.simulation.pose_prior import root_rotation
-from liex_lab.simulation.scene import Setting
+from liex_lab.simulation.scene import SceneSpec
 from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, Sensor
 from liex_lab.simulation.species import Postures
 
 Array = NDArray[np.float64]
 
-TANK = Setting(
+TANK = SceneSpec(
     camera_mm=(230.0, 330.0),
     tilt_rad=float(np.radians(6.0)),
     walls_mm=(30.0, 110.0),
@@ -40,25 +44,55 @@ _FRONT = 0.47  # of the body bends as one arc, the rest as another (as in people
 
 
 @dataclass(frozen=True)
-class FishHabits:
-    """A zebrafish that swims anywhere in a tank, seen from above by a Raytrix R5."""
+class FishSpecies:
+    """A zebrafish that swims anywhere in a tank, seen from above by a Raytrix R5.
+
+    Attributes:
+        skeleton: of the fish, the preset's if not given.
+        sensors: makes of cameras that look at it.
+        setting: ranges of its tank.
+        things: kinds of distractors beside it.
+        sizes: smallest and largest fish over the nominal size, 25 and 40 mm over 30.
+        floats: True, for it is anywhere above the floor.
+        frame_ns: between two frames of a recording, ns.
+    """
 
     skeleton: Skeleton = field(default_factory=lambda: Skeleton.load("fish"))
     sensors: tuple[Sensor, ...] = (RAYTRIX_R5_SENSOR,)
-    setting: Setting = TANK
+    setting: SceneSpec = TANK
     things: tuple[str, ...] = ("pellet", "plant", "fish")
     sizes: tuple[float, float] = (25.0 / 30.0, 40.0 / 30.0)
     floats: bool = True
     frame_ns: int = 20_000_000
 
     def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
-        """N fish."""
+        """Fish of a family of shapes.
+
+        Args:
+            rng: source of randomness.
+            family: one of `body.shape.FAMILIES`.
+            n: how many.
+
+        Returns:
+            A batch of n bodies.
+        """
         return vary_body(rng, self.skeleton, family, n)
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
     ) -> Postures:
-        """Fish that glide, scoot and turn, mostly level, at any height over the floor."""
+        """Fish that glide, scoot and turn, mostly level, at any height over the floor.
+
+        Args:
+            rng: source of randomness.
+            size: (n,) of the fish over home size.
+            shape: (n) their bodies.
+            camera_mm: (n,) heights of the cameras above the floor, mm; no fish comes nearer to one
+                than 180 mm.
+
+        Returns:
+            The poses with girths and kinds, indices into `KINDS`.
+        """
         n = len(size)
         kind = rng.choice(len(KINDS), n, p=SHARES)
         steep = np.where(rng.random(n) < 0.12, 25.0, 8.0)
@@ -73,16 +107,32 @@ class FishHabits:
         return Postures(pose, size, kind)
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
-        """Its tail is part of the skeleton."""
+        """None, for the tail is part of the skeleton.
+
+        Args:
+            rng: not used.
+            n: not used.
+
+        Returns:
+            None.
+        """
         return None
 
 
 def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.int64]) -> Array:
-    """Yaw (n, J) rad at each joint for kinds (n,) of posture, within the skeleton's limits.
+    """Yaw at each joint for kinds of posture, within the skeleton's limits.
 
     Two arcs, a wave that travels down the body, and a little of every part's own. Degrees are those
     of a chain of 20 bones; the hind half bends about twice as much as the front half, up to some 7
     degrees a joint in a turn.
+
+    Args:
+        rng: source of randomness.
+        skeleton: of the fish.
+        kind: (n,) int64, indices into `KINDS`.
+
+    Returns:
+        (n, J) rad.
     """
     n = len(kind)
     way = rng.choice([-1.0, 1.0], n)
@@ -128,10 +178,23 @@ def bend_profile(
     middle: Array,
     own: Array,
 ) -> Array:
-    """Yaw (n, J) rad of two arcs with a wave over them.
+    """Yaw at each joint of two arcs with a travelling wave over them.
 
-    front, hind, amplitude (n,): degrees a joint; phase rad, length of the wave and where the arcs
-    meet (n,), of the body's length; own (n, 4): slow waves that stand, degrees.
+    With s the joint's share of the body's length, the arcs join in a logistic step of width 0.05 at
+    `middle`; the wave is amplitude (0.35 + 0.65 s) sin(2 pi s / length - phase).
+
+    Args:
+        skeleton: of the fish; only joints that can yaw bend, within their limits.
+        front: (n,) bend of the front arc, degrees a joint of 20.
+        hind: (n,) bend of the hind arc, degrees a joint of 20.
+        amplitude: (n,) of the travelling wave, degrees a joint of 20.
+        phase: (n,) of the travelling wave, rad.
+        length: (n,) of the travelling wave, over the body's length.
+        middle: (n,) where the arcs meet, over the body's length.
+        own: (n, 4) amplitudes of standing waves, degrees a joint of 20.
+
+    Returns:
+        (n, J) rad, 0 at the base joint.
     """
     s = joint_reaches(skeleton)
     joint = 20.0 / max(1, skeleton.n_joints - 1)
@@ -149,8 +212,16 @@ def bend_profile(
 
 
 def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
-    """Poses (n) with these bends (n, J) and base rotations (n, 3, 3), their joints' mean at the
-    origin.
+    """Poses with given bends and orientations, the mean of their joints at the origin.
+
+    Args:
+        skeleton: of the animal.
+        yaw: (n, J) bend at each joint, rad.
+        rotation: (n, 3, 3) of the base joint, arena frame.
+        size: (n,) over home size.
+
+    Returns:
+        Poses (n) in the arena frame.
     """
     angles = np.zeros((*yaw.shape, 3))
     angles[..., 2] = yaw
@@ -160,7 +231,17 @@ def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
 
 
 def clearance(skeleton: Skeleton, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
-    """How far (n,) mm the bodies of poses (n) reach below and above the origin, at most."""
+    """How far bodies reach below and above the origin, at most.
+
+    Args:
+        skeleton: of the animal.
+        pose: (n) around the origin.
+        shape: (n) their bodies, `BodyShape`.
+        size: (n,) over home size.
+
+    Returns:
+        Reach below (n,) and above (n,), mm.
+    """
     assert isinstance(shape, BodyShape)
     z = pose.joints(skeleton)[..., 2]
     thick = size * shape.half_height.max(axis=-1)

@@ -1,5 +1,9 @@
-"""Any animal of which nothing but a skeleton and a surface is known: how it may lie, hang
-and move.
+"""Pose prior and locomotion of any animal of which only a skeleton and a surface are known.
+
+Joint angles are drawn by a Gaussian copula over the kinematic tree: a standard normal number runs
+down every chain as an AR(1) process (correlation 0.75 with the parent's), and its quantile says
+where between the limits the joint stands (`draw_angles`). An animal on the floor falls into the
+lowest of eight tilts, as gravity would have it; one with view frame 'camera' hangs at any height.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from liex_lab.geometry import SE3
 from liex_lab.simulation.locomotion import smoothed, wander
 from liex_lab.simulation.pose_prior import root_rotation
 from liex_lab.simulation.recording import SyntheticSession, assemble
-from liex_lab.simulation.scene import ARENA, Setting, Stage
+from liex_lab.simulation.scene import ARENA, SceneSpec, SimulatedScene
 from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, SENSORS, Sensor
 from liex_lab.simulation.species import Postures
 
@@ -37,9 +41,16 @@ _CHANGE_S = 0.5  # a posture is held about this long
 
 
 @dataclass(frozen=True)
-class GenericHabits:
-    """An animal that lies on the floor, or (view frame 'camera') hangs above it, in any posture its
-    joints allow.
+class GenericSpecies:
+    """An animal that lies on the floor, or (view frame 'camera') hangs above it, in any posture.
+
+    Its joints' limits are all that restricts the postures; other attributes are as in `Species`.
+
+    Attributes:
+        skeleton: of the animal.
+        sizes: smallest and largest animal over the nominal size.
+        things: kinds of distractors beside it.
+        frame_ns: between two frames of a recording, ns.
     """
 
     skeleton: Skeleton
@@ -49,17 +60,17 @@ class GenericHabits:
 
     @cached_property
     def floats(self) -> bool:
-        """Whether it is somewhere above the floor."""
+        """Whether it is somewhere above the floor: its view frame is 'camera'."""
         return self.skeleton.view.frame != VIEWS[0]
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
-        """Cameras that resolve it."""
+        """Makes of cameras that resolve it: the Raytrix R5 below 35 mm of length."""
         return (RAYTRIX_R5_SENSOR,) if self.skeleton.length < _SMALL_MM else SENSORS
 
     @cached_property
-    def setting(self) -> Setting:
-        """A place in which it is seen as a whole from anywhere, and not too small."""
+    def setting(self) -> SceneSpec:
+        """A scene in which it is seen as a whole from anywhere, and not too small."""
         length = self.skeleton.length
         scale = float(np.clip(self.skeleton.relative_size, 0.3, 2.0))
         # seen across the picture, with room to go about; no camera of this kind reads nearer than
@@ -70,23 +81,53 @@ class GenericHabits:
             2.2 * length * max(sensor.camera.fx / sensor.camera.height for sensor in self.sensors),
         )
         walls = (ARENA.walls_mm[0] * scale, ARENA.walls_mm[1] * scale)
-        return Setting(camera_mm=(near, 1.6 * near), walls_mm=walls, scale=scale)
+        return SceneSpec(camera_mm=(near, 1.6 * near), walls_mm=walls, scale=scale)
 
     def window_px(self, length_mm: float) -> int:
-        """Pixels a side that hold an animal of this mean length, wherever it is."""
+        """Side of a square patch, px, that holds an animal of this mean length wherever it is.
+
+        Args:
+            length_mm: mean length of the animals, mm.
+
+        Returns:
+            The side, a multiple of 8 px.
+        """
         nearest = self.setting.camera_mm[0] * (1.0 - _NEAR_SHARE if self.floats else 0.9)
         focal = max(sensor.camera.fx / sensor.stride for sensor in self.sensors)
         px = 1.1 * self.sizes[1] * length_mm * focal / nearest + 32.0
         return 8 * int(np.ceil(px / 8.0))
 
     def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
-        """N bodies, varied in girth and proportions."""
+        """Bodies of a family, varied in girth and proportions.
+
+        Args:
+            rng: source of randomness.
+            family: one of `body.shape.FAMILIES`.
+            n: how many.
+
+        Returns:
+            A batch of n bodies.
+        """
         return vary_body(rng, self.skeleton, family, n)
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
     ) -> Postures:
-        """Postures within the joints' limits, smooth along the chains."""
+        """Postures within the joints' limits, smooth along the chains.
+
+        On the floor they lie as low as they can, 85 % of them, and up to 2 mm (times the scene's
+        scale) above it; those that float are anywhere from the floor to 0.55 of the camera's
+        height.
+
+        Args:
+            rng: source of randomness.
+            size: (n,) over home size.
+            shape: (n) their bodies.
+            camera_mm: (n,) heights of the cameras above the floor, mm.
+
+        Returns:
+            The poses with girths; all kinds are 0.
+        """
         n = len(size)
         angles = draw_angles(rng, self.skeleton, n)
         heading = rng.uniform(-np.pi, np.pi, n)
@@ -105,7 +146,15 @@ class GenericHabits:
         return Postures(pose, size, np.zeros(n, np.int64))
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
-        """Its tail, if it has one, is part of the skeleton."""
+        """None, for its tail, if it has one, is part of the skeleton.
+
+        Args:
+            rng: not used.
+            n: not used.
+
+        Returns:
+            None.
+        """
         return None
 
     def _extent(self, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
@@ -134,11 +183,20 @@ class GenericHabits:
 
 
 def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
-    """Angles (n, J, 3) rad about the free axes, within the limits, each like its parent's; some
-    bodies nearly straight.
+    """Joint angles about the free axes, within the limits, each like its parent's.
 
     A standard normal number goes down every chain; its quantile says where between the limits the
-    joint stands.
+    joint stands. A factor from a beta distribution pulls each body towards its home pose, so that
+    some are nearly straight. An axis whose range is wider than 200 degrees counts as unlimited and
+    turns by up to 45 degrees either way.
+
+    Args:
+        rng: source of randomness.
+        skeleton: of the animal.
+        n: how many.
+
+    Returns:
+        (n, J, 3) rad, 0 at the base joint.
     """
     from scipy.special import ndtr
 
@@ -171,7 +229,7 @@ def moving_session(
     seed: int | list[int],
     n_frames: int,
     *,
-    habits: GenericHabits,
+    habits: GenericSpecies,
     sensor: Sensor | None = None,
     family: str = "train",
     noise: float = 1.0,
@@ -180,8 +238,25 @@ def moving_session(
     spine_mm: float | None = None,
     name: str = "moving",
 ) -> SyntheticSession:
-    """n_frames of one animal that goes about and changes its posture; arguments as in
-    `SyntheticSession.draw`.
+    """A recording of one animal that goes about and changes its posture.
+
+    A posture is held for about half a second and blended into the next by a Gaussian kernel; the
+    path is that of `locomotion.wander`.
+
+    Args:
+        seed: or seeds, that everything is drawn from.
+        n_frames: length of the recording, at the rate of `habits.frame_ns`.
+        habits: the species.
+        sensor: the camera's make; None is the last of the species'.
+        family: of body shapes, see `vary_body`.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels stripped off the animal's outline.
+        thing_share: of the frames with a distractor in view.
+        spine_mm: length of the animal, mm; None draws it.
+        name: of the recording.
+
+    Returns:
+        The recording with its truth.
     """
     rng = np.random.default_rng(seed)
     skeleton = habits.skeleton
@@ -189,7 +264,7 @@ def moving_session(
     length = (
         skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
     )
-    stage = Stage.draw(rng, sensor.camera, length, habits.setting)
+    stage = SimulatedScene.draw(rng, sensor.camera, length, habits.setting)
     shape = habits.shapes(rng, family, 1)
     step_s = habits.frame_ns * 1e-9
     size = np.full(n_frames, length / skeleton.length)

@@ -1,6 +1,11 @@
-"""Synthetic recordings in which an animal moves as one: a mouse walks, turns, pauses, rears,
-hunches and curls; a fish scoots, glides, turns, rises, dives and rests; any animal wanders through
-its place and stays within the picture.
+"""Locomotion models of a walking mouse and a swimming fish: random walks in an arena.
+
+Headings follow a correlated random walk, an AR(1) turning rate or a script of turns, with a pull
+towards the middle that grows near walls; a step that would leave the arena is not taken. Postures
+are drawn stretch by stretch from the animal's pose prior and blended by a Gaussian kernel. The
+mouse walks, turns, pauses, rears, hunches and curls. The fish swims burst and glide: its speed
+decays as exp(-t / 0.35 s) between bouts, a bend begins in front and a wave runs from head to tail
+while it scoots, glides, turns, rises, dives and rests.
 """
 
 from __future__ import annotations
@@ -10,12 +15,12 @@ from numpy.typing import NDArray
 
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.simulation.fish import FishHabits, bend_profile, clearance, hung
+from liex_lab.simulation.fish import FishSpecies, bend_profile, clearance, hung
 from liex_lab.simulation.pose_prior import KINDS, Posture, draw_postures, root_rotation, stand
 from liex_lab.simulation.recording import SyntheticSession, assemble
-from liex_lab.simulation.scene import Stage, floor_point
+from liex_lab.simulation.scene import SimulatedScene, floor_point
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, RAYTRIX_R5_SENSOR, Sensor
-from liex_lab.simulation.species import MouseHabits
+from liex_lab.simulation.species import MouseSpecies
 
 Array = NDArray[np.float64]
 
@@ -58,19 +63,33 @@ def walking_session(
     erosion_px: int = 0,
     thing_share: float = 0.0,
     spine_mm: float | None = None,
-    habits: MouseHabits | None = None,
+    habits: MouseSpecies | None = None,
     name: str = "walking",
 ) -> SyntheticSession:
-    """n_frames of one animal at 30 frames/s, drawn from the seed; arguments as in
-    `SyntheticSession.draw`.
+    """A recording of one mouse that goes about at 30 frames/s, drawn from the seed.
+
+    Args:
+        seed: or seeds, that everything is drawn from.
+        n_frames: length of the recording.
+        sensor: the camera's make.
+        family: of body shapes, see `draw_shapes`.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels stripped off the animal's outline.
+        thing_share: of the frames with a distractor in view.
+        spine_mm: length of the animal, mm; None draws it.
+        habits: the species; None the preset mouse.
+        name: of the recording.
+
+    Returns:
+        The recording with its truth.
     """
     rng = np.random.default_rng(seed)
-    habits = MouseHabits() if habits is None else habits
+    habits = MouseSpecies() if habits is None else habits
     skeleton = habits.skeleton
     spine = (
         skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
     )
-    stage = Stage.draw(rng, sensor.camera, spine)
+    stage = SimulatedScene.draw(rng, sensor.camera, spine)
     shape = habits.shapes(rng, family, 1)
     kinds, spines_per_s = _walk_script(rng, n_frames)
     posture = _flow(rng, skeleton, shape[0].broadcast(n_frames), kinds)
@@ -149,7 +168,7 @@ def _smooth(rows: Array) -> Array:
 
 
 def _path(
-    rng: np.random.Generator, stage: Stage, spine_mm: float, speed: Array
+    rng: np.random.Generator, stage: SimulatedScene, spine_mm: float, speed: Array
 ) -> tuple[Array, Array]:
     """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back
     before a wall.
@@ -194,19 +213,33 @@ def swimming_session(
     erosion_px: int = 0,
     thing_share: float = 0.0,
     spine_mm: float | None = None,
-    habits: FishHabits | None = None,
+    habits: FishSpecies | None = None,
     name: str = "swimming",
 ) -> SyntheticSession:
-    """n_frames of one fish at 50 frames/s, drawn from the seed; arguments as in
-    `SyntheticSession.draw`.
+    """A recording of one fish that swims in bouts at 50 frames/s, drawn from the seed.
+
+    Args:
+        seed: or seeds, that everything is drawn from.
+        n_frames: length of the recording.
+        sensor: the camera's make.
+        family: of body shapes, see `vary_body`.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels stripped off the animal's outline.
+        thing_share: of the frames with a distractor in view.
+        spine_mm: length of the fish, mm; None draws it.
+        habits: the species; None the preset zebrafish.
+        name: of the recording.
+
+    Returns:
+        The recording with its truth.
     """
     rng = np.random.default_rng(seed)
-    habits = FishHabits() if habits is None else habits
+    habits = FishSpecies() if habits is None else habits
     skeleton = habits.skeleton
     length = (
         skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
     )
-    stage = Stage.draw(rng, sensor.camera, length, habits.setting)
+    stage = SimulatedScene.draw(rng, sensor.camera, length, habits.setting)
     shape = habits.shapes(rng, family, 1)
     step_s = habits.frame_ns * 1e-9
     speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
@@ -284,7 +317,7 @@ def _swim_script(
 
 def wander(
     rng: np.random.Generator,
-    stage: Stage,
+    stage: SimulatedScene,
     length: float,
     speed: Array,
     turning: Array,
@@ -292,11 +325,23 @@ def wander(
     water: tuple[float, float],
     step_s: float,
 ) -> tuple[Array, Array]:
-    """Positions (n, 3) mm of the body's middle between two heights of the water, and headings (n,)
-    rad.
+    """Path of an animal through a scene, between two heights, and its headings.
 
-    The fish turns away from walls and from the border of the picture; where there is no way on it
-    stays.
+    The heading integrates `turning` and a pull towards the middle of the picture near walls and the
+    picture's border; where there is no way on, the animal stays.
+
+    Args:
+        rng: source of randomness.
+        stage: the scene with walls and camera.
+        length: of the animal, mm.
+        speed: (n,) body lengths/s.
+        turning: (n,) rad/s, positive to the left.
+        pitch: (n,) rad, positive upwards.
+        water: lowest and highest middle of the body, mm above the floor.
+        step_s: between two frames, s.
+
+    Returns:
+        Positions (n, 3) of the body's middle, mm, arena frame, and headings (n,) rad.
     """
     n = len(speed)
     centre = stage.camera.unproject(
@@ -330,7 +375,15 @@ def wander(
 
 
 def smoothed(rows: Array, frames: float) -> Array:
-    """Columns of (n, k) passed through a bell of that many frames, ends held."""
+    """Columns convolved with a Gaussian kernel, the end values held beyond both ends.
+
+    Args:
+        rows: (n, k) samples.
+        frames: standard deviation of the kernel, in samples.
+
+    Returns:
+        (n, k).
+    """
     reach = int(4 * frames)
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
     padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")

@@ -1,5 +1,8 @@
-"""Things beside the animal: blocks, balls, cables, a hand, pellets, plants, a fish; meshes made of
-rounded parts.
+"""Superellipsoid meshes of distractors: blocks, balls, cables, hands, pellets, plants, fish.
+
+A superellipsoid is |x / a|^p + |y / b|^p + |z / c|^p = 1: p = 2 is an ellipsoid, a large p a block
+with rounded edges. A unit sphere's vertices are scaled to it along their rays (`rounded`). Every
+object has `N_PARTS` parts, so that all meshes share one table of triangles, `THING_FACES`.
 """
 
 from __future__ import annotations
@@ -34,8 +37,16 @@ PART_FACES = joined_faces([(_RINGS, _SEGMENTS)])
 
 
 def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
-    """Vertices (..., V, 3) mm of superellipsoids: power 2 is an ellipsoid, a large power a block;
-    turned by yaw rad.
+    """Vertices of superellipsoids, turned about the vertical.
+
+    Args:
+        centre: (..., 3) centres, mm.
+        radii: (..., 3) half axes, mm.
+        yaw: (...) turn about the z axis, rad.
+        power: (...) exponent; 2 is an ellipsoid, a large power a block.
+
+    Returns:
+        (..., V, 3) mm, with triangles as in `PART_FACES`.
     """
     p = np.asarray(power, float)[..., None, None]
     unit = SPHERE / (np.abs(SPHERE) ** p).sum(axis=-1, keepdims=True) ** (1.0 / p)
@@ -92,11 +103,19 @@ _IN_WATER = {"pellet": _pellet, "plant": _plant, "fish": _fish}
 
 
 def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
-    """Vertices (N_PARTS * V, 3) mm of one thing standing on the floor around the origin, faces as
-    in THING_FACES.
+    """Vertices of one random object that stands on the floor around the origin.
 
     Blocks and balls are from a third of to somewhat over the animal's size; pellets sink, plants
     stand and another fish swims in a tank. Unused parts shrink to nothing.
+
+    Args:
+        rng: source of randomness.
+        kind: 'block', 'ball', 'cable', 'pellet', 'plant' or 'fish'; anything else is a hand.
+        spine_mm: length of the animal, mm, which sets the size; cable and hand have one of their
+            own.
+
+    Returns:
+        (N_PARTS * V, 3) mm, arena frame, with triangles as in `THING_FACES`.
     """
     centre = np.zeros((N_PARTS, 3))
     radii = np.zeros((N_PARTS, 3))

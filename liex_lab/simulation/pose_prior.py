@@ -1,5 +1,9 @@
-"""The postures a mouse-like animal takes: a prior to draw from, every one of them standing on the
-floor.
+"""Pose prior of a mouse-like animal: a mixture of five kinds of posture that stand on the floor.
+
+A posture is drawn as bone elevations and turns, going about, curled up, reared up, hunched or
+reaching (`KINDS`, with the weights `SHARES`), and then put on the plane z = 0 by forward
+kinematics: the rear of the trunk touches the floor, and a front that would sink below it tips the
+animal up around its rump (`stand`). Stretch preserves volume: girth is size / sqrt(stretch).
 """
 
 from __future__ import annotations
@@ -30,8 +34,13 @@ _MAX_GAP_MM = 3.0  # between the floor and the lowest point of the body
 
 @dataclass(frozen=True)
 class Posture:
-    """Bone elevations (n, J - 1) rad above the floor, turns (n, J) rad to the left at each joint,
-    roll (n,) rad and stretch (n,): what a posture is before it stands anywhere.
+    """What a posture is before it stands anywhere, n of them.
+
+    Attributes:
+        elevation: (n, J - 1) of the bones above the floor, rad.
+        turn: (n, J) to the left at each joint, rad.
+        roll: (n,) rad.
+        stretch: (n,) of the spine over its rest length.
     """
 
     elevation: Array
@@ -48,11 +57,20 @@ def sample_postures(
     shape: BodyShape | None = None,
     kinds: NDArray[np.int64] | None = None,
 ) -> tuple[Pose, Array]:
-    """N poses in the arena frame, rump above the origin, heading uniform; and the girth (n,) of
-    their bodies.
+    """Poses in the arena frame, rump above the origin, headings uniform, and their girths.
 
-    size (n,) of the animals over home size, shape (n) their bodies, kinds (n,) indices into `KINDS`
-    (None draws them by `SHARES`). A stretched animal is thinner, a compressed one fatter.
+    A stretched animal is thinner, a compressed one fatter.
+
+    Args:
+        rng: source of randomness.
+        skeleton: of the animal.
+        n: how many.
+        size: (n,) of the animals over home size, or one for all.
+        shape: (n) their bodies; None the default one.
+        kinds: (n,) int64, indices into `KINDS`; None draws them by `SHARES`.
+
+    Returns:
+        Poses (n) and girths (n,).
     """
     bodies = (BodyShape.default(skeleton) if shape is None else shape).broadcast(n)
     size = np.broadcast_to(np.asarray(size, float), (n,))
@@ -66,13 +84,31 @@ def sample_postures(
 def draw_postures(
     rng: np.random.Generator, skeleton: Skeleton, kinds: NDArray[np.int64], shape: BodyShape
 ) -> Posture:
-    """Postures of the given kinds (n,), for bodies of the given shapes (n)."""
+    """Postures of given kinds, for bodies of given shapes.
+
+    Args:
+        rng: source of randomness.
+        skeleton: of the animal.
+        kinds: (n,) int64, indices into `KINDS`.
+        shape: (n) the bodies, whose thickness sets how high the mid-axis lies.
+
+    Returns:
+        n postures that do not stand anywhere yet; see `stand`.
+    """
     n = len(kinds)
     n_bones = skeleton.n_joints - 1
     bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
     rest = resting_heights(skeleton, shape)
 
     def is_kind(name: str) -> NDArray[np.bool_]:
+        """Which postures are of a kind.
+
+        Args:
+            name: a word of `KINDS`.
+
+        Returns:
+            (n, 1) bool.
+        """
         return (kinds == KINDS.index(name))[:, None]
 
     # going about: the mid-axis lies as high as the body is thick, a little more towards the front;
@@ -126,8 +162,14 @@ def _draw_turns(
 
 
 def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
-    """Heights (n, J) mm at scale 1 at which the joints lie when the trunk just touches the floor
-    under each.
+    """Heights at which the joints lie when the trunk just touches the floor under each.
+
+    Args:
+        skeleton: of the animal, with stations in its [surface] table.
+        shape: (n) the bodies.
+
+    Returns:
+        (n, J) mm at scale 1.
     """
     stations = np.asarray(skeleton.surface["stations"], float)
     reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
@@ -137,11 +179,21 @@ def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
 def stand(
     skeleton: Skeleton, posture: Posture, heading: Array, size: Array, shape: BodyShape, gap: Array
 ) -> tuple[Pose, Array]:
-    """Put postures (n) on the floor z = 0, rump above the origin: poses in the arena frame and
-    girths (n,).
+    """Put postures on the floor z = 0, rump above the origin.
 
-    The rear part of the trunk comes to lie `gap` (n,) mm above the floor; where the front would go
-    below it, the whole animal tips up around the rump.
+    The rear part of the trunk comes to lie `gap` above the floor; where the front would go below
+    it, the whole animal tips up around the rump, in at most six rounds.
+
+    Args:
+        skeleton: of the animal.
+        posture: n postures.
+        heading: (n,) rad.
+        size: (n,) of the animals over home size.
+        shape: (n) their bodies.
+        gap: (n,) between the floor and the lowest point of the rear, mm.
+
+    Returns:
+        Poses (n) in the arena frame, their angles clipped to the joints' limits, and girths (n,).
     """
     angles = np.zeros((len(size), skeleton.n_joints, 3))
     angles[:, 1:-1, 1] = -np.diff(posture.elevation, axis=1)
@@ -181,7 +233,16 @@ def stand(
 
 
 def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
-    """Rotations (n, 3, 3) of a base that heads, then rises, then rolls."""
+    """Rotations of a base that heads, then rises, then rolls: Rz(heading) Ry(-elevation) Rx(roll).
+
+    Args:
+        heading: (n,) about the vertical, rad.
+        elevation: (n,) above the horizontal, rad.
+        roll: (n,) about the long axis, rad.
+
+    Returns:
+        (n, 3, 3).
+    """
     zero = np.zeros_like(heading)
     turn = so3.exp(np.stack([zero, zero, heading], axis=-1))
     rise = so3.exp(np.stack([zero, -elevation, zero], axis=-1))
@@ -190,7 +251,17 @@ def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
 
 @njit(cache=True, parallel=True)
 def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out):
-    """Fill out (n, R) mm with the lowest point of the trunk's ellipse at every station."""
+    """Fill out (n, R) mm with the lowest point of the trunk's ellipse at every station.
+
+    Args:
+        joints: (n, J, 3) mm.
+        rotations: (n, J, 3, 3) of the joints.
+        girth: (n,) factor across the body.
+        stations: (R,) along the spine, over its length.
+        half_width: (n, R) mm.
+        half_height: (n, R) mm.
+        out: (n, R) filled, mm.
+    """
     for i in prange(len(joints)):
         arc = np.empty(joints.shape[1])
         frame = np.empty((4, 3))

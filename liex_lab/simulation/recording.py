@@ -1,8 +1,10 @@
-"""Synthetic recordings: a virtual animal in a virtual arena before an imitated sensor, with the
-exact truth.
+"""Synthetic depth recordings with exact truth: a posed mesh in an arena through a sensor model.
 
-Frames are made when asked for, from a seed, in any order. `test_split` holds the splits on which
-accuracy is told.
+A `SyntheticSession` ray-casts the floor and walls once, rasterises the animal's mesh over them
+frame by frame with a z-buffer, and passes each ideal picture through the sensor's noise model.
+Frames are made when asked for, from a seed, in any order. `test_split` holds the fixed splits on
+which accuracy is reported: 'clean', 'hard' (twice the noise, an eroded outline, other objects) and
+'other-body' (builds that no model is trained on).
 """
 
 from __future__ import annotations
@@ -24,13 +26,13 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.simulation import _render_kernels as _stage
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.objects import THING_FACES, draw_thing
-from liex_lab.simulation.scene import Stage, outline_of
+from liex_lab.simulation.scene import SimulatedScene, outline_of
 from liex_lab.simulation.sensors import Sensor
-from liex_lab.simulation.species import Habits, MouseHabits
+from liex_lab.simulation.species import MouseSpecies, Species
 
 Array = NDArray[np.float64]
 
-FRAME_NS = MouseHabits.frame_ns
+FRAME_NS = MouseSpecies.frame_ns
 N_SESSIONS = 40
 N_FRAMES = 50
 # name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
@@ -42,12 +44,21 @@ SPLITS = {
 
 
 @dataclass(frozen=True)
-class Cast:
-    """Everything in front of a virtual camera that moves, and the camera's own errors.
+class FrameContents:
+    """Everything that moves before a virtual camera, and the camera's own errors, in n frames.
 
-    pose (n), arena frame; girth (n,); shape: one animal; bends (n, TAIL_RINGS) rad: its tail.
-    things (n, V, 3) mm: other objects, shown where `shown` (n,). parameters (n, N_PARAMETERS) of
-    the sensor, seeds (n,) of its noise. thing_faces (F, 3): of the other objects' meshes.
+    Attributes:
+        skeleton: of the animal.
+        spine_mm: its length, mm.
+        pose: (n) arena frame.
+        girth: (n,) factor of all lengths across the body.
+        shape: body of the one animal.
+        bends: (n, TAIL_RINGS) rad, how its tail lies; None without a tail of its own.
+        things: (n, V, 3) meshes of the distractors, mm, arena frame.
+        shown: (n,) bool, in which frames the distractors are there.
+        parameters: (n, N_PARAMETERS) of the sensor.
+        seeds: (n,) uint64, of the sensor's noise.
+        thing_faces: (F, 3) int32, triangles of the distractors' meshes.
     """
 
     skeleton: Skeleton
@@ -66,9 +77,15 @@ class Cast:
 class TrueRecording(Recording):
     """A virtual recording and its truth.
 
-    spine_mm: the animal's size over the session; pose (n): root T_camera_root, angles, scale;
-    joints_camera (n, J, 3) and joints_arena (n, J, 3) mm; T_arena_camera: exact; floor: the exact
-    plane, or what stands for it.
+    Attributes:
+        skeleton: of the animal.
+        surface: its mesh model.
+        spine_mm: the animal's size over the session, mm.
+        pose: (n) root T_camera_root, angles and scale.
+        joints_camera: (n, J, 3) joints, mm, camera frame.
+        joints_arena: (n, J, 3) joints, mm, arena frame.
+        T_arena_camera: exact transform from the camera frame into the arena frame.
+        floor: the exact plane, or what stands for it.
     """
 
     skeleton: Skeleton
@@ -81,16 +98,42 @@ class TrueRecording(Recording):
     floor: Floor
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        """Depth pictures of a range of frames, made on all threads.
+
+        Args:
+            start: first frame.
+            stop: one past the last frame.
+
+        Returns:
+            (stop - start, H, W) float32 mm, 0 where unread.
+        """
         raise NotImplementedError
 
 
 class SyntheticSession(TrueRecording):
-    """A virtual animal in a virtual arena; shape: its body."""
+    """A virtual animal in a virtual arena, rendered on demand.
+
+    Attributes:
+        stage: the still scene and its camera.
+        cast: what moves in it, and the sensor's errors.
+        shape: the animal's body.
+    """
 
     def __init__(
-        self, name: str, stage: Stage, cast: Cast, times_ns: NDArray[np.int64] | None = None
+        self,
+        name: str,
+        stage: SimulatedScene,
+        cast: FrameContents,
+        times_ns: NDArray[np.int64] | None = None,
     ) -> None:
+        """Put moving contents into a still scene.
+
+        Args:
+            name: of the recording.
+            stage: the still scene and its camera.
+            cast: what moves in it, n frames.
+            times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
+        """
         n = len(cast.seeds)
         times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
         super().__init__(
@@ -115,7 +158,15 @@ class SyntheticSession(TrueRecording):
         return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        """Depth pictures of a range of frames, made on all threads.
+
+        Args:
+            start: first frame.
+            stop: one past the last frame.
+
+        Returns:
+            (stop - start, H, W) float32 mm, 0 where unread.
+        """
         cast = self.cast
         part = slice(start, stop)
         camera = self.stage.camera
@@ -147,7 +198,15 @@ class SyntheticSession(TrueRecording):
         return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        """The frames in lists, each list made on all threads.
+
+        Args:
+            n_frames: frames a list; the last may be shorter.
+            first: frame to begin with.
+
+        Yields:
+            Lists of depth frames in order of time.
+        """
         for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
@@ -166,25 +225,37 @@ class SyntheticSession(TrueRecording):
         erosion_px: int = 0,
         thing_share: float = 0.0,
         spine_mm: float | None = None,
-        habits: Habits | None = None,
+        habits: Species | None = None,
         name: str | None = None,
     ) -> SyntheticSession:
-        """A session of independent postures and places: one camera, arena and animal, all drawn
-        from the seed.
+        """A session of independent postures and positions before one camera, drawn from the seed.
 
-        habits: of the animal, None a mouse. spine_mm: the animal's size; None draws it.
-        thing_share: of frames with another object in view. See `Sensor.draw` for noise and
-        erosion_px, `draw_shapes` for family.
+        Camera, arena and animal are the same in all frames.
+
+        Args:
+            seed: or seeds, that everything is drawn from.
+            n_frames: length of the session.
+            sensor: the camera's make; None draws one of the animal's.
+            family: of body shapes, see `draw_shapes`.
+            noise: multiplies the sensor's random errors and its rate of holes, see `Sensor.draw`.
+            erosion_px: pixels stripped off the animal's outline, see `Sensor.draw`.
+            thing_share: of the frames with a distractor in view.
+            spine_mm: length of the animal, mm; None draws it.
+            habits: the species; None a mouse.
+            name: of the recording; None takes one after the sensor.
+
+        Returns:
+            The session with its truth.
         """
         rng = np.random.default_rng(seed)
-        habits = MouseHabits() if habits is None else habits
+        habits = MouseSpecies() if habits is None else habits
         home = habits.skeleton.length
         sensor = (
             habits.sensors[int(rng.integers(len(habits.sensors)))] if sensor is None else sensor
         )
         drawn = home * float(rng.uniform(*habits.sizes))
         spine = drawn if spine_mm is None else float(spine_mm)
-        stage = Stage.draw(rng, sensor.camera, spine, habits.setting)
+        stage = SimulatedScene.draw(rng, sensor.camera, spine, habits.setting)
         shape = habits.shapes(rng, family, 1)
         size = np.full(n_frames, spine / home)
         camera_mm = np.full(n_frames, stage.T_arena_camera.translation[2])
@@ -211,9 +282,9 @@ class SyntheticSession(TrueRecording):
 
 def assemble(
     rng: np.random.Generator,
-    stage: Stage,
+    stage: SimulatedScene,
     sensor: Sensor,
-    habits: Habits,
+    habits: Species,
     spine_mm: float,
     shape: Body,
     pose: Pose,
@@ -222,9 +293,25 @@ def assemble(
     erosion_px: int,
     thing_share: float,
     scatter: bool,
-) -> Cast:
-    """Put postures (n) of one animal on a stage (scatter: each at a place of its own) and things
-    beside it.
+) -> FrameContents:
+    """Put postures of one animal into a scene, with a distractor beside it and its sensor's errors.
+
+    Args:
+        rng: source of randomness.
+        stage: the still scene.
+        sensor: the camera's make, of which one unit is drawn.
+        habits: the species.
+        spine_mm: length of the animal, mm.
+        shape: its body, a batch of one.
+        pose: (n) arena frame; the root translations are changed in place where `scatter` is set.
+        girth: (n,) factor of all lengths across the body.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels stripped off the animal's outline.
+        thing_share: of the frames with a distractor in view.
+        scatter: move each posture to a free position of its own on the floor.
+
+    Returns:
+        What moves in front of the camera in n frames.
     """
     n = len(girth)
     surface = Surface.of(habits.skeleton)
@@ -239,22 +326,24 @@ def assemble(
     things, shown = _beside(rng, stage, trunk, spine_mm, thing_share, habits, sensor.stride)
     parameters = np.repeat(sensor.draw(rng, 1, shape.fur, noise, erosion_px), n, axis=0)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    return Cast(
+    return FrameContents(
         habits.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds
     )
 
 
 def _beside(
     rng: np.random.Generator,
-    stage: Stage,
+    stage: SimulatedScene,
     trunk: Array,
     spine_mm: float,
     share: float,
-    habits: Habits,
+    habits: Species,
     stride: int,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """One thing for a session, at a free place of its own in every frame: (n, V, 3) mm and where it
-    is shown (n,).
+    """One distractor for a session, at a free position of its own in every frame.
+
+    Returns:
+        Its meshes (n, V, 3) mm and where it is shown (n,).
     """
     mesh = draw_thing(rng, str(rng.choice(habits.things)), spine_mm)
     n = len(trunk)
@@ -278,8 +367,8 @@ def _beside(
     return things, shown
 
 
-def _covers(stage: Stage, thing: Array, trunk: Array, margin_px: float) -> bool:
-    """Whether the thing and the animal overlap in the picture or nearly so."""
+def _covers(stage: SimulatedScene, thing: Array, trunk: Array, margin_px: float) -> bool:
+    """Whether the distractor and the animal overlap in the picture or nearly so."""
     T_camera_arena = stage.T_arena_camera.inverse()
     a = stage.camera.project(T_camera_arena @ thing)
     b = stage.camera.project(T_camera_arena @ trunk)
@@ -293,20 +382,29 @@ def test_split(
     name: str,
     spine_mm: float | None = None,  # noqa: PT028
     n_sessions: int = N_SESSIONS,  # noqa: PT028
-    habits: Habits | None = None,  # noqa: PT028
+    habits: Species | None = None,  # noqa: PT028
     seed: int | None = None,  # noqa: PT028
 ) -> list[SyntheticSession]:
-    """The sessions of a fixed split: 'clean', 'hard' or 'other-body', 40 of 50 frames, as many from
-    each sensor.
+    """The sessions of a fixed split: 40 of 50 frames, as many from each sensor.
 
-    spine_mm sets the animals' size instead of drawing it; n_sessions takes only the first ones;
-    habits: of the animal, None a mouse; seed: another one makes recordings like those of the split,
-    to develop on.
+    Args:
+        name: 'clean', 'hard' or 'other-body', a key of `SPLITS`.
+        spine_mm: length of every animal, mm; None draws it.
+        n_sessions: takes only the first so many.
+        habits: the species; None a mouse.
+        seed: another one makes recordings like those of the split, to develop on; None is the
+            split's own.
+
+    Returns:
+        The sessions, session k named after the split and k.
+
+    Raises:
+        LiexError: there is no split of this name.
     """
     if name not in SPLITS:
         raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
     frozen, family, noise, erosion_px, thing_share = SPLITS[name]
-    habits = MouseHabits() if habits is None else habits
+    habits = MouseSpecies() if habits is None else habits
     return [
         SyntheticSession.draw(
             [frozen if seed is None else seed, k],

@@ -1,5 +1,12 @@
-"""A virtual arena in front of a virtual camera: floor, walls, clutter, and where in it an animal
-can be.
+"""Ray-cast model of an arena before a depth camera: floor, walls, clutter, free positions.
+
+Floor and walls are intersected analytically with the ray of every pixel: the plane z = 0 raised by
+a few long sine waves, a vertical cylinder or a turned box for the walls, and a rounding
+exp(-distance / spread) at their foot, as multi-path reflections leave it. Clutter is rasterised on
+top. Free positions for an animal are found by rejection sampling against the signed distance from
+the walls, the clutter and the border of the picture.
+
+Arena frame: z up from the floor, the origin at the foot of the camera's perpendicular.
 """
 
 from __future__ import annotations
@@ -25,12 +32,17 @@ _TRIES = 64
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What surrounds an animal, as a rule: lengths in mm.
+class SceneSpec:
+    """What surrounds an animal, as ranges to draw a scene from; lengths in mm.
 
-    camera_mm: heights of cameras above the floor, tilted by up to tilt_rad; walls_mm: heights of
-    walls, and a share `open_share` of the places has none; clutter: what stands around; scale: of
-    corners, unevenness, distances and estimation errors, over those of a mouse's arena.
+    Attributes:
+        camera_mm: lowest and highest camera above the floor.
+        tilt_rad: largest tilt of a camera, rad.
+        walls_mm: lowest and highest walls.
+        open_share: of the scenes that have no walls.
+        clutter: kinds of objects that stand around, see `objects.draw_thing`.
+        scale: of corners, unevenness, distances and estimation errors, over those of a mouse's
+            arena.
     """
 
     camera_mm: tuple[float, float] = (500.0, 1000.0)
@@ -41,17 +53,23 @@ class Setting:
     scale: float = 1.0
 
 
-ARENA = Setting()
+ARENA = SceneSpec()
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What a virtual camera looks at.
+class SimulatedScene:
+    """The still scene that a virtual camera looks at.
 
-    still (H, W) float32 mm: the ideal depth without the animal, 0 = nothing in range;
-    T_arena_camera: exact; kind: round or box; centre (2,) mm and half (2,) mm extents (or radii) of
-    the walls in the arena frame, turned by yaw rad; clutter (n, 2) mm: outline points of what
-    stands around.
+    Attributes:
+        camera: the camera.
+        T_arena_camera: its exact pose.
+        kind: 'round' or 'box', the outline of the walls.
+        centre: (2,) of the walls in the arena frame, mm.
+        half: (2,) half extents of the walls (or their radius, twice), mm.
+        yaw: turn of the walls, rad.
+        wall_mm: height of the walls, mm; 0 is an open table.
+        clutter: (n, 2) outline points of what stands around, mm, arena frame.
+        still: (H, W) float32 mm, the ideal depth without the animal, 0 = nothing in range.
     """
 
     camera: Camera
@@ -66,9 +84,22 @@ class Stage:
 
     @staticmethod
     def draw(
-        rng: np.random.Generator, camera: Camera, spine_mm: float, setting: Setting = ARENA
-    ) -> Stage:
-        """A random arena, large enough for the animal, its floor's centre in view."""
+        rng: np.random.Generator, camera: Camera, spine_mm: float, setting: SceneSpec = ARENA
+    ) -> SimulatedScene:
+        """A random arena, large enough for the animal, with the floor's centre in view.
+
+        Walls are at least 1.6 body lengths from the centre; about a third of the scenes have one or
+        two pieces of clutter near the wall.
+
+        Args:
+            rng: source of randomness.
+            camera: the camera that looks at it.
+            spine_mm: length of the animal, mm.
+            setting: ranges to draw from.
+
+        Returns:
+            The scene with its ideal depth picture.
+        """
         T = draw_views(rng, 1, setting)
         T_arena_camera = SE3(T.rotation[0], T.translation[0])
         height = float(T_arena_camera.translation[2])
@@ -87,7 +118,7 @@ class Stage:
         wall_mm = float(rng.uniform(low, min(high, 0.7 * height)))
         if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
-        stage = Stage(
+        stage = SimulatedScene(
             camera,
             T_arena_camera,
             kind,
@@ -100,8 +131,10 @@ class Stage:
         )
         return stage._furnished(rng, spine_mm, setting)
 
-    def _furnished(self, rng: np.random.Generator, spine_mm: float, setting: Setting) -> Stage:
-        """The same with its still picture, and in a third of them a thing or two near the wall."""
+    def _furnished(
+        self, rng: np.random.Generator, spine_mm: float, setting: SceneSpec
+    ) -> SimulatedScene:
+        """The same with its still picture, and in a third one or two objects near the wall."""
         still = self._ideal_depth(rng, setting.scale)
         T_camera_arena = self.T_arena_camera.inverse()
         outline = []
@@ -114,7 +147,7 @@ class Stage:
             still = np.where((thing > 0) & ((still == 0) | (thing < still)), thing, still)
             outline.append(mesh[:, :2])
         clutter = np.concatenate(outline) if outline else np.zeros((0, 2))
-        return Stage(
+        return SimulatedScene(
             self.camera,
             self.T_arena_camera,
             self.kind,
@@ -134,15 +167,28 @@ class Stage:
         return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
 
     def room(self, xy: Array) -> Array:
-        """How far (...) mm points (..., 2) of the floor are inside the walls; negative outside."""
+        """Signed distance of points of the floor from the walls, mm; negative outside.
+
+        Args:
+            xy: (..., 2) points, mm, arena frame.
+
+        Returns:
+            (...) mm.
+        """
         local = self._turned(xy - self.centre, -self.yaw)
         if self.kind == ROUND:
             return self.half[0] - np.hypot(local[..., 0], local[..., 1])
         return np.min(self.half - np.abs(local), axis=-1)
 
     def freedom(self, xy: Array, z: float = 0.0) -> float:
-        """How far (mm) a point of the floor, or z mm above it, is from walls, clutter and the
-        border of the picture.
+        """Distance of one point from walls, clutter and the border of the picture, mm.
+
+        Args:
+            xy: (2,) point, mm, arena frame.
+            z: its height above the floor, mm.
+
+        Returns:
+            The least of the three; the border's counts at the point's own depth. Negative outside.
         """
         c = self.camera
         p = self.T_arena_camera.inverse() @ np.array([xy[0], xy[1], z])
@@ -154,8 +200,10 @@ class Stage:
         return free
 
     def _ideal_depth(self, rng: np.random.Generator, scale: float) -> NDArray[np.float32]:
-        """Depth (H, W) mm along every ray: floor within the walls, walls up to their height, beyond
-        them little.
+        """Depth (H, W) mm along every ray: floor within the walls, walls up to their height.
+
+        Beyond an open table the floor goes on; beyond walls there is nothing, or in 40 % of the
+        scenes the untidy surroundings of the arena.
         """
         T = self.T_arena_camera
         camera = self.camera
@@ -209,11 +257,18 @@ class Stage:
     def places(
         self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None
     ) -> Array:
-        """Shifts (n, 2) mm that bring each of n bodies to a random free place on the floor, whole
-        and in the picture.
+        """Shifts that bring each of n bodies to a random free position, whole and in the picture.
 
-        outline (n, K, 2) mm: outermost points of the bodies on the floor; tops, bottoms (n,) mm:
-        how high they reach and begin, None on the floor.
+        Of 64 random positions the first free one is taken, else the one with the largest clearance.
+
+        Args:
+            rng: source of randomness.
+            outline: (n, K, 2) outermost points of the bodies seen from above, mm.
+            tops: (n,) how high the bodies reach, mm above the floor.
+            bottoms: (n,) how high they begin, mm; None on the floor.
+
+        Returns:
+            (n, 2) shifts, mm.
         """
         n = len(outline)
         middle = outline.mean(axis=1)
@@ -244,8 +299,20 @@ class Stage:
         return aim[np.arange(n), chosen] - middle
 
 
-def draw_views(rng: np.random.Generator, m: int, setting: Setting = ARENA) -> SE3:
-    """T_arena_camera (m) of cameras that look down on a setting, tilted in any direction."""
+def draw_views(rng: np.random.Generator, m: int, setting: SceneSpec = ARENA) -> SE3:
+    """Poses of cameras that look down on a scene, tilted in any direction.
+
+    The tilt's direction is uniform and its angle such that the tilts are uniform over a disc.
+
+    Args:
+        rng: source of randomness.
+        m: how many.
+        setting: its `camera_mm` and `tilt_rad` are drawn from.
+
+    Returns:
+        (m) T_arena_camera; the arena frame's origin lies at the camera's foot, its x along the
+        camera's.
+    """
     tilt = setting.tilt_rad * np.sqrt(rng.random(m))
     toward = rng.uniform(-np.pi, np.pi, m)
     up = -np.stack(
@@ -259,13 +326,30 @@ def draw_views(rng: np.random.Generator, m: int, setting: Setting = ARENA) -> SE
 
 
 def floor_point(camera: Camera, T_arena_camera: SE3, uv: Array) -> Array:
-    """Where (..., 2) mm on the floor pixels (..., 2) look."""
+    """Points of the floor z = 0 that pixels look at.
+
+    Args:
+        camera: the camera.
+        T_arena_camera: its pose, the arena frame's origin at its foot.
+        uv: (..., 2) pixels.
+
+    Returns:
+        (..., 2) mm, arena frame.
+    """
     ray = camera.unproject(uv, np.ones(np.shape(uv)[:-1])) @ T_arena_camera.rotation.T
     return T_arena_camera.translation[2] / -ray[..., 2:] * ray[..., :2]
 
 
 def outline_of(vertices: Array, n_directions: int = 24) -> Array:
-    """The outermost points (n, n_directions, 2) of bodies (n, V, 3) seen from above."""
+    """Outermost points of bodies seen from above, one in each of evenly spaced directions.
+
+    Args:
+        vertices: (n, V, 3) meshes, mm, arena frame.
+        n_directions: number of directions.
+
+    Returns:
+        (n, n_directions, 2) mm.
+    """
     angle = 2 * np.pi * np.arange(n_directions) / n_directions
     extent = vertices[..., :2] @ np.stack([np.cos(angle), np.sin(angle)])
     return np.take_along_axis(vertices[..., :2], extent.argmax(axis=1)[..., None], axis=1)

@@ -1,5 +1,8 @@
-"""The depth sensors we imitate: their cameras and the range of their habits, none of them fitted to
-a recording.
+"""Noise parameters of depth sensors: structured light, time of flight and light field.
+
+Each make (`Sensor`) has a camera and ranges from which the parameters of a unit are drawn; the
+models themselves are in `_sensor_kernels`: a PrimeSense (structured light), a Kinect v2 (time of
+flight) and a Raytrix R5 (plenoptic). None of the ranges is fitted to a recording.
 """
 
 from __future__ import annotations
@@ -17,10 +20,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensor:
-    """A kind of depth sensor: its camera and how it errs.
+    """A make of depth sensor: its camera and how it errs.
 
-    unit_mm: of its depth; stride: its pictures are so large that only every so many-th pixel is
-    looked at.
+    Attributes:
+        name: of the make.
+        camera: its camera.
+        kind: number of its noise model, `PRIMESENSE_KIND`, `KINECT_V2_KIND` or `LIGHT_FIELD_KIND`.
+        unit_mm: step of its depth, mm.
+        stride: its pictures are so large that only every so many-th pixel is read.
     """
 
     name: str
@@ -30,16 +37,29 @@ class Sensor:
     stride: int = 1
 
     def coarse(self, parameters: Array) -> Array:
-        """Parameters (n, N_PARAMETERS) of this sensor's units for pictures of every `stride`-th
-        pixel.
+        """Parameters of this sensor's units for pictures of every `stride`-th pixel.
+
+        Args:
+            parameters: (n, N_PARAMETERS) of whole pictures.
+
+        Returns:
+            (n, N_PARAMETERS), the lengths in pixels divided by the stride.
         """
         coarse = parameters.copy()
         coarse[:, [k.GRID, k.JITTER]] /= self.stride
         return coarse
 
     def spread_mm(self, parameters: Array, distance_mm: Array) -> Array | float:
-        """Standard deviation (n,) mm of what units of a light-field camera read of one surface; of
-        others 0, for it is small beside everything that they are used for.
+        """Standard deviation of what units of a light-field camera read of one surface.
+
+        Of other sensors it is 0, for it is small beside everything that they are used for.
+
+        Args:
+            parameters: (n, N_PARAMETERS) of the units.
+            distance_mm: (n,) of the surface, mm.
+
+        Returns:
+            (n,) mm, or 0.0.
         """
         if self.kind != k.LIGHT_FIELD_KIND:
             return 0.0
@@ -49,11 +69,17 @@ class Sensor:
     def draw(
         self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0
     ) -> Array:
-        """Parameters (n, N_PARAMETERS) of n units of this sensor looking at animals of the given
-        fur (n,).
+        """Parameters of n units of this sensor, each looking at one animal.
 
-        noise multiplies random errors and the rate of holes; erosion_px strips pixels off the
-        animal's outline.
+        Args:
+            rng: source of randomness.
+            n: how many units.
+            fur: (n,) of the animals, from 0 (sleek) to 1 (long and soft).
+            noise: multiplies random errors and the rate of holes.
+            erosion_px: pixels stripped off the animal's outline.
+
+        Returns:
+            (n, N_PARAMETERS), columns as in `_sensor_kernels`.
         """
         p = np.zeros((n, k.N_PARAMETERS))
         p[:, k.UNIT] = self.unit_mm
@@ -87,7 +113,7 @@ class Sensor:
 
 
 def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
-    """The habits of n plenoptic cameras into p (n, N_PARAMETERS)."""
+    """Draw the noise parameters of n plenoptic cameras into p (n, N_PARAMETERS)."""
     n = len(p)
     p[:, k.SMOOTH] = rng.uniform(0.4, 1.2, n)  # mm at 250 mm
     p[:, k.WHITE] = rng.uniform(0.1, 0.4, n)

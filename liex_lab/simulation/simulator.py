@@ -1,5 +1,10 @@
-"""The worlds that animals are rendered in: training images, test splits and continuous recordings
-of each of them.
+"""Synthetic data generators, one an animal: training patches, test splits, recordings with truth.
+
+Each simulator renders a posed body mesh through a depth camera with a sensor noise model and hands
+out the exact pose beside every picture. Mouse and fish have pose and locomotion models of their own
+(`MouseSimulator`, `FishSimulator`), the hand one of its own scene (`HandSimulator`); an animal
+known only by its skeleton and surface is drawn within its joint limits (`GenericSimulator`).
+Everything is drawn from seeds, so that any part of a set can be made again, in any order.
 """
 
 from __future__ import annotations
@@ -12,17 +17,18 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.simulation import generic, locomotion
 from liex_lab.simulation import recording as synthetic
 from liex_lab.simulation import training_patches as windows
-from liex_lab.simulation.fish import FishHabits
-from liex_lab.simulation.generic import GenericHabits
-from liex_lab.simulation.hand.simulator import HandWorld, find_reference
+from liex_lab.simulation.fish import FishSpecies
+from liex_lab.simulation.generic import GenericSpecies
+from liex_lab.simulation.hand.simulator import HandSimulator, find_reference
 from liex_lab.simulation.recording import SyntheticSession, TrueRecording
-from liex_lab.simulation.species import Habits, MouseHabits
-from liex_lab.simulation.training_patches import TrainingWindows
+from liex_lab.simulation.species import MouseSpecies, Species
+from liex_lab.simulation.training_patches import TrainingPatches
 
 
-class World(Protocol):
-    """Where an animal's training and test data come from. Everything is drawn from seeds, in any
-    order.
+class Simulator(Protocol):
+    """Interface of an animal's source of synthetic training and test data.
+
+    Everything is drawn from seeds, in any order. `world_of` chooses the implementation.
     """
 
     @property
@@ -35,11 +41,11 @@ class World(Protocol):
 
     @property
     def protocol(self) -> str:
-        """What to say of the test splits beside figures measured on them."""
+        """One sentence on the test splits, to stand beside figures measured on them."""
 
     @property
     def sources(self) -> str:
-        """What the training images were made from, for a model's card."""
+        """One phrase on what the training images were made from, for a model's card."""
 
     def training_blocks(
         self,
@@ -54,25 +60,62 @@ class World(Protocol):
         spine_mm: float | None = None,
         window_px: int = 144,
         parallel: bool = True,
-    ) -> Iterator[TrainingWindows]:
-        """Blocks of training images from block `first` on; see `windows.training_blocks`."""
+    ) -> Iterator[TrainingPatches]:
+        """Blocks of `BLOCK` training patches with truth; see `training_patches.training_blocks`.
+
+        Args:
+            seed: of the whole set; a block depends on it and on its own number alone.
+            n_blocks: how many blocks to make.
+            first: number of the first block.
+            family: of body shapes, one of `body.shape.FAMILIES`.
+            noise: multiplies the sensor's random errors and its rate of holes.
+            erosion_px: pixels stripped off the animal's outline.
+            degraded_share: of the mini-sessions that get more noise, and half of them more erosion.
+            spine_mm: mean length of the animals, mm; None takes the skeleton's own.
+            window_px: side of the patches, px.
+            parallel: render on all threads; the pictures are the same either way.
+
+        Returns:
+            An iterator of sets of patches, one a block.
+        """
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
     ) -> Sequence[TrueRecording]:
-        """The recordings of one of the `splits`; spine_mm sets the animals' size instead of drawing
-        it.
+        """The recordings of one of the `splits`.
+
+        Args:
+            name: of the split.
+            spine_mm: length of every animal, mm; None draws it.
+            n_sessions: how many recordings to make, from the first on.
+
+        Returns:
+            One recording with truth per session, each with its own camera, surroundings and animal.
         """
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
-        """A recording in which one animal moves; settings as in `locomotion.walking_session`."""
+        """A continuous recording in which one animal moves.
+
+        Args:
+            seed: or seeds, that everything is drawn from.
+            n_frames: length of the recording.
+            **settings: keyword arguments as in `locomotion.walking_session`.
+
+        Returns:
+            The recording with its truth.
+        """
 
 
 @dataclass(frozen=True)
-class RenderedWorld:
-    """The world of an animal with these habits."""
+class BodySimulator:
+    """Simulator of an animal that a `Species` describes: where it lives, its body, its postures.
 
-    habits: Habits
+    Attributes:
+        habits: the animal's species.
+        splits: names of the test splits.
+    """
+
+    habits: Species
     splits: tuple[str, ...] = tuple(synthetic.SPLITS)
 
     @property
@@ -82,7 +125,7 @@ class RenderedWorld:
 
     @property
     def protocol(self) -> str:
-        """What to say of the test splits beside figures measured on them."""
+        """One sentence on the test splits, to stand beside figures measured on them."""
         return (
             "each with its own camera, arena, animal; the background, the floor, the blob and the "
             "animal's size are found by the product, nothing is handed over. "
@@ -90,63 +133,126 @@ class RenderedWorld:
 
     @property
     def sources(self) -> str:
-        """What the training images were made from."""
+        """One phrase on what the training images were made from."""
         return "rendered from a seed; no recording of an animal was used"
 
     def training_blocks(
         self, seed: int, n_blocks: int, **settings: Any
-    ) -> Iterator[TrainingWindows]:
-        """Blocks of training images."""
+    ) -> Iterator[TrainingPatches]:
+        """Blocks of training patches with truth.
+
+        Args:
+            seed: of the whole set.
+            n_blocks: how many blocks to make.
+            **settings: keyword arguments as in `training_patches.training_blocks`.
+
+        Returns:
+            An iterator of sets of patches, one a block.
+        """
         return windows.training_blocks(seed, n_blocks, self.habits, **settings)
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
     ) -> list[SyntheticSession]:
-        """The recordings of a split."""
+        """The recordings of a split; see `recording.test_split`.
+
+        Args:
+            name: 'clean', 'hard' or 'other-body'.
+            spine_mm: length of every animal, mm; None draws it.
+            n_sessions: how many recordings to make, from the first on.
+
+        Returns:
+            One recording of independent postures per session.
+
+        Raises:
+            LiexError: there is no split of this name.
+        """
         return synthetic.test_split(name, spine_mm, n_sessions, self.habits)
 
 
 @dataclass(frozen=True)
-class MouseWorld(RenderedWorld):
-    """A mouse in an arena, seen from above."""
+class MouseSimulator(BodySimulator):
+    """Simulator of a mouse in an arena, seen from above."""
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A mouse that walks, turns, rears and curls up."""
-        assert isinstance(self.habits, MouseHabits)
+        """A recording of a mouse that walks, turns, rears and curls up; see `walking_session`.
+
+        Args:
+            seed: or seeds, that everything is drawn from.
+            n_frames: length of the recording, at 30 frames/s.
+            **settings: further keyword arguments of `locomotion.walking_session`.
+
+        Returns:
+            The recording with its truth.
+        """
+        assert isinstance(self.habits, MouseSpecies)
         return locomotion.walking_session(seed, n_frames, habits=self.habits, **settings)
 
 
 @dataclass(frozen=True)
-class FishWorld(RenderedWorld):
-    """A zebrafish in a tank, seen from above."""
+class FishSimulator(BodySimulator):
+    """Simulator of a zebrafish in a tank, seen from above."""
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A fish that swims."""
-        assert isinstance(self.habits, FishHabits)
+        """A recording of a fish that swims in bouts; see `swimming_session`.
+
+        Args:
+            seed: or seeds, that everything is drawn from.
+            n_frames: length of the recording, at 50 frames/s.
+            **settings: further keyword arguments of `locomotion.swimming_session`.
+
+        Returns:
+            The recording with its truth.
+        """
+        assert isinstance(self.habits, FishSpecies)
         return locomotion.swimming_session(seed, n_frames, habits=self.habits, **settings)
 
 
 @dataclass(frozen=True)
-class GenericWorld(RenderedWorld):
-    """Any animal on a floor, or above one."""
+class GenericSimulator(BodySimulator):
+    """Simulator of any animal on a floor, or above one."""
 
     def window_px(self, length_mm: float) -> int:
-        """Pixels a side that hold an animal of this mean length, wherever it is."""
-        assert isinstance(self.habits, GenericHabits)
+        """Side of a square patch, px, that holds an animal of this mean length wherever it is.
+
+        Args:
+            length_mm: mean length of the animals, mm.
+
+        Returns:
+            The side, a multiple of 8 px.
+        """
+        assert isinstance(self.habits, GenericSpecies)
         return self.habits.window_px(length_mm)
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """An animal that goes about and changes its posture."""
-        assert isinstance(self.habits, GenericHabits)
+        """A recording of an animal that goes about and changes its posture; see `moving_session`.
+
+        Args:
+            seed: or seeds, that everything is drawn from.
+            n_frames: length of the recording.
+            **settings: further keyword arguments of `generic.moving_session`.
+
+        Returns:
+            The recording with its truth.
+        """
+        assert isinstance(self.habits, GenericSpecies)
         return generic.moving_session(seed, n_frames, habits=self.habits, **settings)
 
 
-def world_of(skeleton: Skeleton) -> World:
-    """The world of an animal; of one that is not known here by its name, the generic one."""
+def world_of(skeleton: Skeleton) -> Simulator:
+    """The simulator of an animal; the generic one where its name is not known here.
+
+    Args:
+        skeleton: of the animal; the names 'mouse', 'fish' and 'hand' have simulators of their own.
+
+    Returns:
+        The simulator; that of the hand takes labelled test postures where `find_reference` finds
+        any.
+    """
     if skeleton.name == "mouse":
-        return MouseWorld(MouseHabits(skeleton))
+        return MouseSimulator(MouseSpecies(skeleton))
     if skeleton.name == "fish":
-        return FishWorld(FishHabits(skeleton))
+        return FishSimulator(FishSpecies(skeleton))
     if skeleton.name == "hand":
-        return HandWorld(skeleton, find_reference())
-    return GenericWorld(GenericHabits(skeleton))
+        return HandSimulator(skeleton, find_reference())
+    return GenericSimulator(GenericSpecies(skeleton))

@@ -1,5 +1,10 @@
-"""Sequences to measure tracking on: one animal that moves, as a sensor sees it or as on a bad day,
-with the truth.
+"""Benchmark sequences for tracking: one animal that moves, clean or corrupted, with exact truth.
+
+'easy' is what a sensor gives of an animal that moves; 'hard' has twice the noise, an eroded outline
+and the corruptions of `corruptions`. Their lengths, 511 and 300 frames, are those of the tracking
+sequences in the Lie-X paper. A script of events re-times one long recording (frames that are
+dropped or played faster), adds occluders and distractors to the scene and takes readings out of the
+pictures.
 """
 
 from __future__ import annotations
@@ -18,18 +23,24 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.simulation import corruptions as hazards
 from liex_lab.simulation.corruptions import Event, Loss
-from liex_lab.simulation.hand.simulator import FRAME_NS, NYU_SENSOR, HandSession, HandWorld
-from liex_lab.simulation.recording import Cast, SyntheticSession, TrueRecording
+from liex_lab.simulation.hand.simulator import FRAME_NS, NYU_SENSOR, HandSession, HandSimulator
+from liex_lab.simulation.recording import FrameContents, SyntheticSession, TrueRecording
 from liex_lab.simulation.sensors import Sensor
-from liex_lab.simulation.simulator import RenderedWorld, World
+from liex_lab.simulation.simulator import BodySimulator, Simulator
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """A fixed test sequence: frames, seed, and how bad the day is. The lengths are those of the
-    paper's.
+    """A fixed test sequence and its difficulty.
+
+    Attributes:
+        n_frames: its length, that of the paper's.
+        seed: that it is drawn from.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: stripped off the animal's outline, in px of the picture that is looked at.
+        hazards: whether corruptions happen.
     """
 
     n_frames: int
@@ -46,8 +57,11 @@ SEQUENCES = {
 
 
 class TestSequence(TrueRecording):
-    """A recording with its truth and what happens in it: events, in order of their start; scene:
-    without the losses.
+    """A recording with its truth and the events that happen in it.
+
+    Attributes:
+        scene: the recording without the losses.
+        events: in order of their start.
     """
 
     __test__ = False
@@ -55,6 +69,14 @@ class TestSequence(TrueRecording):
     def __init__(
         self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str
     ) -> None:
+        """Apply losses to a recording whose truth is kept.
+
+        Args:
+            scene: the recording without the losses.
+            events: what happens in it, in order of start.
+            loss: readings that are lost in its frames.
+            name: of the sequence.
+        """
         super().__init__(
             name=name,
             format="synthetic",
@@ -69,7 +91,15 @@ class TestSequence(TrueRecording):
         self._loss = loss
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth (n, H, W) mm of frames start to stop."""
+        """Depth pictures of a range of frames, with the losses.
+
+        Args:
+            start: first frame.
+            stop: one past the last frame.
+
+        Returns:
+            (stop - start, H, W) float32 mm, 0 where unread.
+        """
         depths = self.scene.depths(start, stop)
         camera = self.camera
         middle = self.joints_camera.mean(axis=1)
@@ -79,7 +109,15 @@ class TestSequence(TrueRecording):
         return depths
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        """The frames in lists, each list made on all threads.
+
+        Args:
+            n_frames: frames a list; the last may be shorter.
+            first: frame to begin with.
+
+        Yields:
+            Lists of depth frames in order of time.
+        """
         for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
@@ -101,7 +139,7 @@ _TRUTH = (
 
 
 def tracking_sequence(
-    world: World,
+    world: Simulator,
     name: str,
     *,
     seed: int | None = None,
@@ -109,11 +147,24 @@ def tracking_sequence(
     sensor: Sensor | None = None,
     spine_mm: float | None = None,
 ) -> TestSequence:
-    """The fixed sequence 'easy' or 'hard' of an animal's world; other seeds make sequences of its
-    kind, to develop on.
+    """The fixed sequence 'easy' or 'hard' of an animal; other seeds make others of its kind.
 
     hard: bursts of holes, frames dropped, a bar passing between camera and animal, a second object,
-    an animal that is lost in the floor or in glare, and stretches at several times the speed.
+    an animal that is lost in the floor or in glare, and stretches at two to three times the speed.
+
+    Args:
+        world: the animal's simulator.
+        name: 'easy' or 'hard', a key of `SEQUENCES`.
+        seed: another one makes a sequence to develop on; None is the fixed one.
+        n_frames: its length; None is the fixed one.
+        sensor: the camera's make; None is the animal's first.
+        spine_mm: length of the animal, mm; None draws it.
+
+    Returns:
+        The sequence with its truth and its events, 'hidden' spans among them.
+
+    Raises:
+        RecordingError: there is no such sequence, or none of this animal.
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
@@ -147,11 +198,11 @@ def tracking_sequence(
     )
 
 
-def _setting(world: World, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
+def _setting(world: Simulator, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
     """The camera, the nanoseconds between its frames, and whether the animal floats."""
-    if isinstance(world, HandWorld):
+    if isinstance(world, HandSimulator):
         return sensor or NYU_SENSOR, FRAME_NS, True
-    if isinstance(world, RenderedWorld):
+    if isinstance(world, BodySimulator):
         return sensor or world.habits.sensors[0], world.habits.frame_ns, world.habits.floats
     raise RecordingError(
         f"there are no test sequences of a {world.skeleton.name}; mouse, fish and hand have them"
@@ -160,7 +211,7 @@ def _setting(world: World, sensor: Sensor | None) -> tuple[Sensor, int, bool]:
 
 def _hands(
     rng: np.random.Generator,
-    world: World,
+    world: Simulator,
     base: TrueRecording,
     rows: NDArray[np.int64],
     times: NDArray[np.int64],
@@ -190,7 +241,7 @@ def _hands(
 
 def _animals(
     rng: np.random.Generator,
-    world: World,
+    world: Simulator,
     base: TrueRecording,
     rows: NDArray[np.int64],
     times: NDArray[np.int64],
@@ -199,7 +250,7 @@ def _animals(
 ) -> tuple[SyntheticSession, list[Event]]:
     """As `_hands` of an animal."""
     assert isinstance(base, SyntheticSession)
-    assert isinstance(world, RenderedWorld)
+    assert isinstance(world, BodySimulator)
     cast = _taken(base.cast, rows)
     stage = base.stage
     habits = world.habits
@@ -230,7 +281,7 @@ def _animals(
     return SyntheticSession(title, stage, cast, times), hidden
 
 
-def _taken(cast: Cast, rows: NDArray[np.int64]) -> Cast:
+def _taken(cast: FrameContents, rows: NDArray[np.int64]) -> FrameContents:
     """Some moments of what moves, in another order of time."""
     pose = Pose(
         SE3(cast.pose.root.rotation[rows], cast.pose.root.translation[rows]),

@@ -1,8 +1,13 @@
-"""Training images by the thousand: a window of depth around an animal, with the truth, from a seed.
+"""Synthetic training set for regression forests: rendered depth patches with exact poses.
 
-Images come in mini-sessions of `PER_SESSION` that share camera, floor, animal and sensor, as a
-recording's frames do. They are made in blocks; a block depends on the seed and its own number
-alone, so any part of a set can be made again.
+Domain randomisation: each image draws camera tilt and height, intrinsics, floor, walls,
+neighbouring objects, body shape, posture and sensor noise at random, and keeps the exact pose as
+its label. Images come in mini-sessions of `PER_SESSION` that share camera, floor, animal and
+sensor, as a recording's frames do. They are made in blocks; a block depends on the seed and its own
+number alone, so any part of a set can be made again, bit for bit.
+
+The floor is stored as inverse depth, 1 / z = a u + b v + c, which is linear in the pixel (u, v) for
+a plane in a pinhole picture.
 """
 
 from __future__ import annotations
@@ -21,8 +26,8 @@ from liex_lab.runtime.threads import threads
 from liex_lab.simulation import _render_kernels as _stage
 from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
 from liex_lab.simulation.objects import PART_FACES, rounded
-from liex_lab.simulation.scene import Setting, draw_views
-from liex_lab.simulation.species import Habits, MouseHabits
+from liex_lab.simulation.scene import SceneSpec, draw_views
+from liex_lab.simulation.species import MouseSpecies, Species
 
 Array = NDArray[np.float64]
 
@@ -33,19 +38,29 @@ _WALL_SHARE = 0.35
 
 
 @dataclass(frozen=True)
-class TrainingWindows:
-    """n windows of S x S pixels around an animal, and the truth behind each.
+class TrainingPatches:
+    """Depth patches of S x S pixels around an animal, n of them, and the truth behind each.
 
-    depth, background (n, S, S) uint16, steps of unit_mm, 0 = unread: the picture, and the still
-    scene as a recording would have taught it. origin (n, 2) int32: the full picture's pixel (u, v)
-    of window pixel (0, 0); intrinsics (n, 4): fx, fy, cx, cy of the full picture. floor, floor_true
-    (n, 3): 1 / z = a u + b v + c in its pixels, as estimated and exact. T_arena_camera (n), exact.
-    root (n): T_camera_root; angles (n, J, 3) rad; scale (n,) of this frame's bones; joints_mm (n,
-    J, 3) in the camera frame. spine_mm (n,): the animal's own size, constant over its mini-session,
-    whose number is `session` (n,); sensor (n,) indexes the animal's sensors, kind (n,) its kinds of
-    posture. spread_mm (n,): standard deviation of the floor's readings, where it matters.
-    own_bones: `joints_mm` are those of each body's own proportions, from which the skeleton's
-    differ.
+    Attributes:
+        depth: (n, S, S) uint16, steps of `unit_mm`, 0 = unread: the picture.
+        background: (n, S, S) uint16, likewise: the still scene as a recording would have taught it.
+        origin: (n, 2) int32, the full picture's pixel (u, v) of patch pixel (0, 0).
+        intrinsics: (n, 4) fx, fy, cx, cy of the full picture, px.
+        floor: (n, 3) plane 1 / z = a u + b v + c in pixels of the full picture, as estimated.
+        floor_true: (n, 3) the same plane, exact.
+        T_arena_camera: (n) exact transform from the camera frame into the arena frame.
+        root: (n) T_camera_root, the base joint in the camera frame.
+        angles: (n, J, 3) joint angles, rad.
+        scale: (n,) of this frame's bones over those of the skeleton.
+        joints_mm: (n, J, 3) joints in the camera frame, mm.
+        spine_mm: (n,) the animal's own size, mm, constant over its mini-session.
+        session: (n,) int64, number of the mini-session.
+        sensor: (n,) int64, index into the animal's sensors.
+        kind: (n,) int64, index into its kinds of posture.
+        unit_mm: step of the stored depths, mm.
+        spread_mm: (n,) standard deviation of the floor's readings, mm, where it matters; else 0.
+        own_bones: `joints_mm` are those of each body's own proportions, from which the skeleton's
+            differ.
     """
 
     depth: NDArray[np.uint16]
@@ -68,23 +83,38 @@ class TrainingWindows:
     own_bones: bool = False
 
     def __len__(self) -> int:
+        """Number of patches n."""
         return len(self.depth)
 
-    def __getitem__(self, index: slice | NDArray[np.int64]) -> TrainingWindows:
-        """Some of the images."""
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> TrainingPatches:
+        """Some of the patches.
+
+        Args:
+            index: slice, mask or row numbers over the patches.
+
+        Returns:
+            The chosen patches with their truth.
+        """
         picked: list[Any] = []
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, SE3):
                 value = SE3(value.rotation[index], value.translation[index])
             picked.append(value[index] if isinstance(value, np.ndarray) else value)
-        return TrainingWindows(*picked)
+        return TrainingPatches(*picked)
 
     @staticmethod
-    def joined(parts: list[TrainingWindows]) -> TrainingWindows:
-        """The images of several sets, one after the other."""
+    def joined(parts: list[TrainingPatches]) -> TrainingPatches:
+        """The patches of several sets, one after the other.
+
+        Args:
+            parts: at least one set; `unit_mm` and `own_bones` are taken from the first.
+
+        Returns:
+            One set with all of them.
+        """
         columns: list[Any] = []
-        for field in fields(TrainingWindows):
+        for field in fields(TrainingPatches):
             values: list[Any] = [getattr(part, field.name) for part in parts]
             if isinstance(values[0], SE3):
                 columns.append(
@@ -97,14 +127,12 @@ class TrainingWindows:
                 columns.append(values[0])
             else:
                 columns.append(np.concatenate(values))
-        return TrainingWindows(*columns)
+        return TrainingPatches(*columns)
 
 
 @dataclass(frozen=True)
-class _Looks:
-    """Who looks at whom, one row an image (n): camera, floor, sensor, animal; constant within a
-    mini-session.
-    """
+class _Views:
+    """Camera, floor, sensor and animal of n images, one row each, constant in a mini-session."""
 
     sensor: NDArray[np.int64]
     intrinsics: Array
@@ -120,7 +148,7 @@ class _Looks:
 def training_windows(
     seed: int,
     n: int,
-    habits: Habits | None = None,
+    habits: Species | None = None,
     *,
     family: str = "train",
     noise: float = 1.0,
@@ -129,8 +157,24 @@ def training_windows(
     spine_mm: float | None = None,
     window_px: int = 144,
     parallel: bool = True,
-) -> TrainingWindows:
-    """N training images; the first n of `training_blocks`, which explains the arguments."""
+) -> TrainingPatches:
+    """The first n training patches of a seed; those that `training_blocks` makes.
+
+    Args:
+        seed: of the whole set.
+        n: how many patches; whole blocks are rendered and the last one is cut.
+        habits: the species; None a mouse.
+        family: of body shapes, one of `body.shape.FAMILIES`.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels stripped off the animal's outline.
+        degraded_share: of the mini-sessions that get more noise, and half of them more erosion.
+        spine_mm: mean length of the animals, mm; None takes the skeleton's own.
+        window_px: side of the patches, px.
+        parallel: render on all threads.
+
+    Returns:
+        n patches with their truth.
+    """
     parts = []
     left = n
     for block in training_blocks(
@@ -147,13 +191,13 @@ def training_windows(
     ):
         parts.append(block if left >= BLOCK else block[:left])
         left -= BLOCK
-    return TrainingWindows.joined(parts)
+    return TrainingPatches.joined(parts)
 
 
 def training_blocks(
     seed: int,
     n_blocks: int,
-    habits: Habits | None = None,
+    habits: Species | None = None,
     *,
     first: int = 0,
     family: str = "train",
@@ -163,34 +207,48 @@ def training_blocks(
     spine_mm: float | None = None,
     window_px: int = 144,
     parallel: bool = True,
-) -> Iterator[TrainingWindows]:
-    """Blocks of `BLOCK` training images from block `first` on, bit for bit the same for a seed,
-    whatever the threads.
+) -> Iterator[TrainingPatches]:
+    """Blocks of `BLOCK` training patches from block `first` on.
 
-    habits: of the animal, None a mouse. family: of body shapes. noise, erosion_px: see
-    `Sensor.draw`; a share `degraded_share` of the mini-sessions has 1 to 2.5 times the noise and
-    half of those an outline eroded by a pixel. spine_mm: the animals' mean size, None the
-    skeleton's own; window_px must hold the animal with a margin: 144 does up to mice of 70 mm.
+    They are the same bit for bit for a seed, whatever the threads.
+
+    Args:
+        seed: of the whole set; a block depends on it and on its own number alone.
+        n_blocks: how many blocks to make.
+        habits: the species; None a mouse.
+        first: number of the first block.
+        family: of body shapes, one of `body.shape.FAMILIES`.
+        noise: multiplies the sensor's random errors and its rate of holes, see `Sensor.draw`.
+        erosion_px: pixels stripped off the animal's outline, see `Sensor.draw`.
+        degraded_share: of the mini-sessions that have 1 to 2.5 times the noise; half of those have
+            an outline eroded by one pixel more.
+        spine_mm: mean length of the animals, mm; None takes the skeleton's own.
+        window_px: side of the patches, px; it must hold the animal with a margin, and 144 does up
+            to mice of 70 mm.
+        parallel: render on all threads.
+
+    Yields:
+        One set of `BLOCK` patches a block.
     """
-    habits = MouseHabits() if habits is None else habits
+    habits = MouseSpecies() if habits is None else habits
     surface = Surface.of(habits.skeleton)
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
-        looks = _draw_looks(rng, habits, family, noise, erosion_px, degraded_share, spine_mm)
+        views = _draw_looks(rng, habits, family, noise, erosion_px, degraded_share, spine_mm)
         yield _draw_block(
-            rng, habits, surface, looks, window_px, number * (BLOCK // PER_SESSION), parallel
+            rng, habits, surface, views, window_px, number * (BLOCK // PER_SESSION), parallel
         )
 
 
 def _draw_looks(
     rng: np.random.Generator,
-    habits: Habits,
+    habits: Species,
     family: str,
     noise: float,
     erosion_px: int,
     degraded_share: float,
     spine_mm: float | None,
-) -> _Looks:
+) -> _Views:
     """Cameras, floors and animals of one block's mini-sessions, repeated for each of their
     images.
     """
@@ -217,7 +275,7 @@ def _draw_looks(
     each = np.repeat(np.arange(m), PER_SESSION)
     T_arena_camera = draw_views(rng, m, habits.setting)
     scale = habits.setting.scale
-    return _Looks(
+    return _Views(
         sensor[each],
         intrinsics[each],
         picture[each],
@@ -243,10 +301,19 @@ def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
 def inverse_depth_plane(
     T_arena_camera: SE3, intrinsics: Array, tilt_and_lift: Array | None = None
 ) -> Array:
-    """Coefficients (n, 3) of the floor: 1 / z = a u + b v + c. Optionally of one wrongly estimated.
+    """Inverse-depth coefficients of the floor, 1 / z = a u + b v + c, exact or wrongly estimated.
 
-    tilt_and_lift (n, 3): slopes of the wrong floor along the arena's x and y, rad, and its height
-    below the camera, mm.
+    With n the floor's unit normal in the camera frame and d its distance, a = n_x / (fx d), b = n_y
+    / (fy d) and c = n_z / d - a cx - b cy.
+
+    Args:
+        T_arena_camera: (n) exact poses of the cameras, the arena frame's origin at their feet.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        tilt_and_lift: (n, 3) errors of a wrongly estimated floor: slopes along the arena's x and y,
+            rad, and how many mm farther below the camera it lies; None is the exact floor.
+
+    Returns:
+        (n, 3) a, b, c in 1/mm per pixel and 1/mm.
     """
     wrong = np.zeros((len(intrinsics), 3)) if tilt_and_lift is None else tilt_and_lift
     slope = np.stack([wrong[:, 0], wrong[:, 1], -np.ones(len(wrong))], axis=-1)
@@ -263,27 +330,27 @@ def inverse_depth_plane(
 
 def _draw_block(
     rng: np.random.Generator,
-    habits: Habits,
+    habits: Species,
     surface: Surface,
-    looks: _Looks,
+    views: _Views,
     window_px: int,
     first_session: int,
     parallel: bool,
-) -> TrainingWindows:
+) -> TrainingPatches:
     """The images of one block."""
-    n = len(looks.size)
+    n = len(views.size)
     skeleton = habits.skeleton
     scale = habits.setting.scale
     pose, girth, kinds = habits.postures(
-        rng, looks.size, looks.shape, looks.T_arena_camera.translation[:, 2]
+        rng, views.size, views.shape, views.T_arena_camera.translation[:, 2]
     )
-    _place(rng, habits, pose, looks)
-    vertices = surface.vertices(pose, looks.shape, girth, habits.bends(rng, n), parallel)
+    _place(rng, habits, pose, views)
+    vertices = surface.vertices(pose, views.shape, girth, habits.bends(rng, n), parallel)
     trunk = vertices[:, : surface.n_trunk_vertices]
-    T_camera_arena = looks.T_arena_camera.inverse()
-    origin = window_origin(trunk, T_camera_arena, looks.intrinsics, window_px)
+    T_camera_arena = views.T_arena_camera.inverse()
+    origin = window_origin(trunk, T_camera_arena, views.intrinsics, window_px)
     thing, has_thing = _draw_neighbours(
-        rng, trunk, looks.size * skeleton.length, scale, habits.floats
+        rng, trunk, views.size * skeleton.length, scale, habits.floats
     )
     walls = _draw_walls(rng, trunk, habits.setting)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
@@ -296,54 +363,56 @@ def _draw_block(
             thing,
             PART_FACES,
             has_thing,
-            looks.T_arena_camera.rotation,
-            looks.T_arena_camera.translation[:, 2].copy(),
-            looks.intrinsics,
-            looks.picture,
+            views.T_arena_camera.rotation,
+            views.T_arena_camera.translation[:, 2].copy(),
+            views.intrinsics,
+            views.picture,
             origin,
             walls,
-            looks.rough,
-            looks.parameters,
+            views.rough,
+            views.parameters,
             seeds,
             NORMAL,
             depth,
             background,
         )
     seen = pose.moved(T_camera_arena)
-    return TrainingWindows(
+    return TrainingPatches(
         depth,
         background,
         origin.astype(np.int32),
-        looks.intrinsics,
-        inverse_depth_plane(looks.T_arena_camera, looks.intrinsics, looks.floor_error),
-        inverse_depth_plane(looks.T_arena_camera, looks.intrinsics),
-        looks.T_arena_camera,
+        views.intrinsics,
+        inverse_depth_plane(views.T_arena_camera, views.intrinsics, views.floor_error),
+        inverse_depth_plane(views.T_arena_camera, views.intrinsics),
+        views.T_arena_camera,
         seen.root,
         seen.angles,
         seen.scale,
         seen.joints(skeleton),
-        looks.size * skeleton.length,
+        views.size * skeleton.length,
         first_session + np.arange(n) // PER_SESSION,
-        looks.sensor,
+        views.sensor,
         kinds,
         habits.sensors[0].unit_mm,
-        habits.sensors[0].spread_mm(looks.parameters, looks.T_arena_camera.translation[:, 2]),
+        habits.sensors[0].spread_mm(views.parameters, views.T_arena_camera.translation[:, 2]),
     )
 
 
-def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) -> None:
+def _place(rng: np.random.Generator, habits: Species, pose: Pose, views: _Views) -> None:
     """Move the poses over the floor so that each animal is somewhere in its picture, whole."""
     n = len(pose.scale)
-    T = looks.T_arena_camera
+    T = views.T_arena_camera
     skeleton = habits.skeleton
     middle = pose.joints(skeleton).mean(axis=1)
     height = T.translation[:, 2] - (middle[:, 2] if habits.floats else 0.0)
-    margin = 0.85 * pose.scale * skeleton.length * looks.intrinsics[:, 0] / height + 6.0
+    margin = 0.85 * pose.scale * skeleton.length * views.intrinsics[:, 0] / height + 6.0
     uv = np.stack(
-        [margin + rng.random(n) * (looks.picture[:, k] - 2.0 * margin) for k in range(2)], axis=-1
+        [margin + rng.random(n) * (views.picture[:, k] - 2.0 * margin) for k in range(2)],
+        axis=-1,
     )
     ray = np.concatenate(
-        [(uv - looks.intrinsics[:, 2:]) / looks.intrinsics[:, :2], np.ones((n, 1))], axis=1
+        [(uv - views.intrinsics[:, 2:]) / views.intrinsics[:, :2], np.ones((n, 1))],
+        axis=1,
     )
     direction = np.einsum("nij,nj->ni", T.rotation, ray)
     spot = (height / -direction[:, 2])[:, None] * direction[:, :2]
@@ -353,7 +422,17 @@ def _place(rng: np.random.Generator, habits: Habits, pose: Pose, looks: _Looks) 
 def window_origin(
     trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int
 ) -> NDArray[np.int64]:
-    """Where (n, 2) a window must start for the trunk (n, V, 3) to lie in its middle."""
+    """First pixels of square patches that have the trunk's bounding box in their middle.
+
+    Args:
+        trunk: (n, V, 3) vertices of the trunks, mm, arena frame.
+        T_camera_arena: (n) from the arena frame into the camera frame.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        window_px: side of the patches, px.
+
+    Returns:
+        (n, 2) int64 pixel (u, v) of the full picture at patch pixel (0, 0); it may lie outside.
+    """
     p = (
         np.einsum("nij,nvj->nvi", T_camera_arena.rotation, trunk)
         + T_camera_arena.translation[:, None]
@@ -394,7 +473,7 @@ def _draw_neighbours(
     ) < _THING_SHARE
 
 
-def _draw_walls(rng: np.random.Generator, trunk: Array, setting: Setting) -> Array:
+def _draw_walls(rng: np.random.Generator, trunk: Array, setting: SceneSpec) -> Array:
     """A straight wall (n, WALL_COLUMNS) beyond some of the trunks, seen from the arena's inside."""
     n = len(trunk)
     scale = setting.scale

@@ -1,1 +1,1 @@
-"""The columns of every table of a session, and the rows that a track fills them with."""
+"""Tables of a session: the schema of every column, and the rows that a track fills them with."""

@@ -1,4 +1,10 @@
-"""From a track to the rows of the tables: times, gaps, and one block of columns per table."""
+"""Rows of a session's tables (frames, poses, rotations, gaps, flips, bouts) from a track.
+
+Intervals are half open: a frame is valid until the next, before a gap or the end one median step
+more. A joint's score is P(|e| < r) of an isotropic Gaussian in space, the chi distribution with 3
+degrees of freedom: erf(x / sqrt(2)) - sqrt(2 / π) x exp(-x^2 / 2), x = r / sd. The columns are
+described in `schema`.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +30,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-GAP_FACTOR = (
-    1.5  # median steps; a longer one means that frames are missing (as in recordings.timestamps)
-)
+# median steps; a longer one means that frames are missing (as in recordings.timestamps)
+GAP_FACTOR = 1.5
 _Found = tuple[
     float, float, int, int, int, str
 ]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
@@ -37,8 +42,16 @@ _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 @dataclass(frozen=True)
 class Rows:
-    """A track, the camera's frame count of its rows, the names that every row carries, and where
-    the animal can be.
+    """A track with what its rows also carry: the camera's frame count, names, and the arena.
+
+    Attributes:
+        track: one animal's track of n frames.
+        frame_index: (n,) the camera's own count of each frame.
+        session_id: name of the session.
+        individual: name of the animal within the session.
+        camera_gaps: where the recording's time is not a steady camera's.
+        arena: outline of the floor, where the animal can be.
+        zones: zones of the plan, arena frame.
     """
 
     track: Track
@@ -51,16 +64,23 @@ class Rows:
 
     @property
     def time_s(self) -> Array:
-        """(n,) seconds since the first frame."""
+        """(n,) s since the first frame."""
         return seconds(self.track.times_ns)
 
     def frames(self) -> Iterator[Block]:
-        """The table `frames`, some hundred thousand rows at a time."""
+        """The table `frames`, in blocks of 100 000 rows."""
         missing = self.missing_before()
         return (self._frame_rows(part, missing[part]) for part in self._parts(1))
 
     def frames_table(self, names: Container[str] = _ALL) -> pd.DataFrame:
-        """The table `frames`, or those columns of it."""
+        """The table `frames` in memory, or some of its columns.
+
+        Args:
+            names: the columns that are wanted.
+
+        Returns:
+            A data frame of n rows, columns in the schema's order.
+        """
         import pandas as pd
 
         schema = [column for column in FRAMES if column.name in names]
@@ -69,12 +89,13 @@ class Rows:
         return table
 
     def poses(self) -> Iterator[Block]:
-        """The table `poses`, some hundred thousand rows at a time."""
+        """The table `poses`, one row per frame and joint, in blocks of about 100 000 rows."""
         return (self._pose_rows(part) for part in self._parts(self.track.skeleton.n_joints))
 
     def rotations(self) -> Iterator[Block]:
-        """The table `rotations`: per frame the row of the root's rigid transform, then one row per
-        joint.
+        """The table `rotations`: per frame a row of the root, then one row per joint.
+
+        The root's row is its rigid transform T_arena_root. Blocks have about 100 000 rows.
         """
         return (self._rotation_rows(part) for part in self._parts(self.track.skeleton.n_joints + 1))
 
@@ -149,8 +170,8 @@ class Rows:
     def gaps(self) -> Block:
         """The table `gaps`, in order of time.
 
-        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames
-        without a pose.
+        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames in
+        which no pose was measured.
         """
         time = self.time_s
         count = frame_count(self.frame_index)
@@ -171,7 +192,14 @@ class Rows:
         }
 
     def flips(self, flips: Sequence[Flip]) -> Block:
-        """The table `flips`, in order of time."""
+        """The table `flips`.
+
+        Args:
+            flips: spans of exchanged or uncertain head and tail, in order of time.
+
+        Returns:
+            A block with one row for each.
+        """
         time = self.time_s
         count = frame_count(self.frame_index)
         stops = stop_times(time)
@@ -246,8 +274,16 @@ def _log(rotation: Array) -> Array:
 
 
 def nearness(sd: Array, radius: Array) -> Array:
-    """Probability that a Gaussian point in space with `sd` along each axis lies within `radius` of
-    its mean.
+    """Probability that a Gaussian point in space lies within a radius of its mean.
+
+    The chi distribution with 3 degrees of freedom, see the module.
+
+    Args:
+        sd: standard deviation along each axis, mm, any shape.
+        radius: mm, a shape that broadcasts with `sd`.
+
+    Returns:
+        Probabilities; NaN where `sd` or `radius` is.
     """
     from scipy.special import erf
 
@@ -256,24 +292,52 @@ def nearness(sd: Array, radius: Array) -> Array:
 
 
 def seconds(times_ns: NDArray[np.int64]) -> Array:
-    """(n,) seconds since the first of integer nanoseconds (n,)."""
+    """Seconds since the first of some time stamps.
+
+    Args:
+        times_ns: (n,) integer nanoseconds.
+
+    Returns:
+        (n,) s.
+    """
     return (times_ns - times_ns[:1]).astype(np.float64) * 1e-9
 
 
 def median_step(time_s: Array) -> float:
-    """The usual time from one frame to the next, s; 0 for a single frame."""
+    """The usual time from one frame to the next, s; 0 for a single frame.
+
+    Args:
+        time_s: (n,) s, increasing.
+
+    Returns:
+        Median of the steps, s.
+    """
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
 
 
 def gap_follows(time_s: Array) -> NDArray[np.bool_]:
-    """(n,) True where frames are missing after this one, and at the last frame."""
+    """After which frames others are missing: the step is longer than 1.5 median ones.
+
+    Args:
+        time_s: (n,) s, increasing.
+
+    Returns:
+        (n,) bool, True also at the last frame.
+    """
     step = np.diff(time_s)
     return np.append(step > GAP_FACTOR * median_step(time_s), True)[: len(time_s)]
 
 
 def stop_times(time_s: Array) -> Array:
-    """(n,) when each frame's validity ends: at the next frame; before a gap or the end, one median
-    step later.
+    """When each frame's validity ends: at the next frame, or one median step later.
+
+    The latter before a gap and at the end of the recording.
+
+    Args:
+        time_s: (n,) s, increasing.
+
+    Returns:
+        (n,) s.
     """
     stops: Array = np.append(time_s[1:], np.nan)[: len(time_s)]
     alone = gap_follows(time_s)
@@ -282,24 +346,54 @@ def stop_times(time_s: Array) -> Array:
 
 
 def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n + 1,) the camera's count of every row and of the row after the last."""
+    """The camera's count of every row and of the row after the last.
+
+    Args:
+        frame_index: (n,) the camera's own count.
+
+    Returns:
+        (n + 1,) int64.
+    """
     return np.append(frame_index, frame_index[-1:] + 1)
 
 
 def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
-    """Runs of equal labels (n,) as (start, stop, label), stop exclusive."""
+    """Runs of equal labels, see `runs_of`.
+
+    Args:
+        labels: (n,) of any kind.
+
+    Returns:
+        (start, stop, label) of each run, stop exclusive; none for no labels.
+    """
     if len(labels) == 0:
         return []
     return [(int(a), int(b), label) for a, b, label in zip(*runs_of(labels), strict=True)]
 
 
 def rows_only(rows: Rows) -> pd.DataFrame:
-    """A kinematics table without any measure."""
+    """A kinematics table without any measure: the names and times of every frame.
+
+    Args:
+        rows: a track's rows.
+
+    Returns:
+        The first five columns of the table `frames`.
+    """
     return rows.frames_table([column.name for column in FRAMES[:5]])
 
 
 def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.DataFrame:
-    """The columns that every table `bouts` has, from the table `frames` of the ethogram's times."""
+    """The columns that every table `bouts` has.
+
+    Args:
+        ethogram: one animal's bouts.
+        frames: the table `frames` of the ethogram's times, at least one row.
+        model_hash: hash of the model that named the bouts; '' for a rule.
+
+    Returns:
+        One row for each bout.
+    """
     import pandas as pd
 
     times_ns = frames["time_ns"].to_numpy(np.int64)

@@ -1,8 +1,9 @@
-"""The tables of a session: every column listed once, and the one way a table gets to disk and back.
+"""Schema of a session's tables (Apache Parquet): every column, its dtype, unit and meaning.
 
-The schema, the writer, the reader, columns.json and the report's glossary all read `TABLES`. Tables
-that other rooms make (behaviour) bring their own `Column` entries; a column without an entry is
-refused by `write_table`.
+Every column is listed once, and there is one way for a table to get to disk and back: the writer,
+the reader, columns.json and the report's glossary all read `TABLES`. Tables that other packages
+make (behaviour) bring their own `Column` entries; a column without an entry is refused by
+`write_table`.
 """
 
 from __future__ import annotations
@@ -30,8 +31,19 @@ Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table, and what a reader has to know about it. An empty unit means a number
-    without one.
+    """One column of a table, and what a reader has to know about it.
+
+    Attributes:
+        table: name of the table.
+        name: name of the column.
+        dtype: 'string', 'float64', 'int64' or 'bool'.
+        unit: its unit; empty for a number without one.
+        meaning: what it is, in words.
+        formula: how it is worked out, where that is not obvious.
+        source: what it comes from.
+        unreliable_below_fps: frame rate, 1/s, below which it should not be trusted; None without
+            one.
+        since: version of liex_lab that introduced it.
     """
 
     table: str
@@ -46,7 +58,15 @@ class Column:
 
 
 def columns(table: str, *rows: tuple[str, ...]) -> tuple[Column, ...]:
-    """The columns of one table from rows of (name, dtype, unit, meaning[, formula[, source]])."""
+    """The columns of one table, in order.
+
+    Args:
+        table: name of the table.
+        *rows: (name, dtype, unit, meaning[, formula[, source]]) of each column.
+
+    Returns:
+        One `Column` for each row.
+    """
     made = []
     for row in rows:
         name, dtype, unit, meaning, formula, source = (*row, "", "")[:6]
@@ -442,8 +462,16 @@ TABLES: dict[str, tuple[Column, ...]] = {
 
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
-    """The content of columns.json: every column of `TABLES`, then those of other rooms, each as a
-    plain dict.
+    """The content of columns.json: every column of `TABLES`, then those of other packages.
+
+    Args:
+        *extra: columns of further tables.
+
+    Returns:
+        Each column once, as a plain dict.
+
+    Raises:
+        SessionError: a column is described twice and differently.
     """
     entries = [column for rows in TABLES.values() for column in rows] + [
         column for rows in extra for column in rows
@@ -458,7 +486,15 @@ def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
 
 
 def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Schema:
-    """The Arrow schema of a table, with `metadata` as JSON under the key `liex_lab`."""
+    """The Arrow schema of a table, with its description as JSON under the metadata key `liex_lab`.
+
+    Args:
+        schema: the columns.
+        metadata: what else the table's metadata shall hold, JSON values.
+
+    Returns:
+        The schema, fields in the order of the columns.
+    """
     import pyarrow as pa
 
     kinds = {
@@ -475,10 +511,22 @@ def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Sc
 def write_table(
     path: Path, schema: Sequence[Column], blocks: Iterable[Block], metadata: Mapping[str, Any]
 ) -> int:
-    """Write a parquet table block by block (row groups of about `ROWS_PER_GROUP` rows) and return
-    its rows.
+    """Write a Parquet table block by block and return its number of rows.
 
-    Equal blocks give equal bytes: zstd, strings as dictionaries, no time stamps.
+    Row groups have at most `ROWS_PER_GROUP` rows. Equal blocks give equal bytes: zstd, strings as
+    dictionaries, no time stamps.
+
+    Args:
+        path: the file.
+        schema: the columns, in the order in which they are written.
+        blocks: consecutive rows, each block with every column.
+        metadata: goes into the file, see `arrow_schema`.
+
+    Returns:
+        How many rows were written.
+
+    Raises:
+        SessionError: a block's columns are not exactly those of the schema.
     """
     import pyarrow.parquet as pq
 
@@ -509,7 +557,16 @@ def _arrow_block(block: Block, schema: Sequence[Column], arrow: pa.Schema) -> pa
 
 
 def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:
-    """Refuse a table whose columns are not exactly those of its schema."""
+    """Refuse a table whose columns are not exactly those of its schema.
+
+    Args:
+        names: the table's columns.
+        schema: the described columns.
+        table: the table's name in the error; '' takes the schema's.
+
+    Raises:
+        SessionError: a column lacks a description, or a described column lacks.
+    """
     written = list(names)
     described = [column.name for column in schema]
     undescribed = [name for name in written if name not in described]
@@ -542,7 +599,14 @@ def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
 
 @dataclass(frozen=True)
 class Words:
-    """A column of few different names: `words[codes]`, without a Python string per row."""
+    """A column of few different names, as in a dictionary encoding: `words[codes]`.
+
+    There is no Python string per row.
+
+    Attributes:
+        codes: (n,) index of each row's word.
+        words: the different words.
+    """
 
     codes: NDArray[np.int64]
     words: tuple[str, ...]
@@ -552,14 +616,27 @@ class Words:
 
 
 def harmless(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula: text that begins like one gets an apostrophe
-    before it.
+    """A cell that no spreadsheet takes for a formula (CSV injection).
+
+    Args:
+        value: a cell of any kind; only text that begins with =, +, -, @, tab or line end is
+            changed.
+
+    Returns:
+        The cell; such text with an apostrophe before it.
     """
     return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
 
 
 def as_it_was(value: Any) -> Any:
-    """What `harmless` was given."""
+    """The inverse of `harmless`.
+
+    Args:
+        value: a cell of any kind.
+
+    Returns:
+        What `harmless` was given.
+    """
     return (
         value[1:]
         if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA
@@ -570,7 +647,13 @@ def as_it_was(value: Any) -> Any:
 def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:
     """A block as a data frame of the schema's dtypes, as reading the table back would give it.
 
-    copy: False where the block's arrays may go on as the table's columns, wherever they lie.
+    Args:
+        schema: the columns; those that the block lacks are left out.
+        block: column -> one value for all rows, an array, or `Words`.
+        copy: False where the block's arrays may go on as the table's columns, wherever they lie.
+
+    Returns:
+        The data frame.
     """
     import pandas as pd
 
@@ -589,20 +672,36 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
 
 
 def empty_table(schema: Sequence[Column]) -> pd.DataFrame:
-    """A data frame without rows, of the right dtypes."""
+    """A data frame without rows, of the right dtypes.
+
+    Args:
+        schema: the columns.
+
+    Returns:
+        A data frame of 0 rows.
+    """
     return to_pandas(schema, {column.name: [] for column in schema})
 
 
 def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
-    """A data frame's columns as blocks for `write_table`."""
+    """A data frame's columns as blocks for `write_table`; an empty one gives one empty block.
+
+    Args:
+        table: any data frame.
+
+    Yields:
+        Column -> values of at most `ROWS_PER_GROUP` rows.
+    """
     for part in blocks(max(len(table), 1), ROWS_PER_GROUP):
         yield {str(name): table[name].iloc[part].to_numpy() for name in table.columns}
         let_table_go(table)
 
 
 def let_table_go(table: pd.DataFrame) -> None:
-    """Let go of the memory of a table's columns that lie on disk, until they are looked at
-    again.
+    """Release the memory pages of a table's columns that lie on disk, until they are read again.
+
+    Args:
+        table: a data frame; columns of text are left alone.
     """
     let_go(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
 

@@ -1,6 +1,4 @@
-"""What can be read from a measured session: the face that `sessions.Session` shows to the rooms
-below it.
-"""
+"""Protocol of a measured session's tables: what lower layers may read of `sessions.Session`."""
 
 from __future__ import annotations
 
@@ -23,27 +21,35 @@ class SessionTables(Protocol):
 
     @property
     def arena(self) -> Arena:
-        """The outline of the floor."""
+        """The outline of the floor, arena frame, mm."""
 
     @property
     def zones(self) -> Sequence[Zone]:
-        """The zones that were drawn, in the arena's frame."""
+        """The zones that were drawn, arena frame, mm."""
 
     @property
     def frames(self) -> pd.DataFrame:
-        """One row per frame of the recording."""
+        """The table `frames`: one row per frame of the recording."""
 
     @property
     def gaps(self) -> pd.DataFrame:
-        """One row per stretch without frames or without a pose."""
+        """The table `gaps`: one row per stretch without frames or a measured pose."""
 
     @property
     def bouts(self) -> pd.DataFrame:
-        """The ethogram."""
+        """The table `bouts`: the ethogram, one row per bout."""
 
     @property
     def summary(self) -> pd.DataFrame:
         """One row per animal."""
 
     def table(self, name: str, columns: list[str] | None = None) -> pd.DataFrame:
-        """Any table by its name, or some of its columns."""
+        """Any table by its name, or some of its columns.
+
+        Args:
+            name: of the table, such as 'poses'.
+            columns: those that are wanted; None for all.
+
+        Returns:
+            The table in memory.
+        """

@@ -1,4 +1,15 @@
-"""Kernel of the association: which hypothesis of each frame lies on the animal's curve, if any."""
+"""Viterbi beam search over the pose hypotheses of frames, with missed detections (numba kernels).
+
+A chain visits at most one hypothesis of each frame and costs, in nats, sum of emission + transition
++ missed-detection costs; cost[t, h] = emission[t, h] + min over (a, g) of cost[a, g] +
+transition(a, g; t, h) + missed-detection cost of the frames between, where frames may be passed by
+and the beam holds the best last links (Viterbi 1967).
+Transition cost between joints: d^2 / 2 s_1^2 + b^2 / 2 s_2^2, with d the shift of the joints' mean,
+b the mean change of posture, s_k^2 = (levels[0])^2 (e_a^2 + e_b^2) + (levels[k] L dt)^2; robust by
+T log(1 + c / T), T = levels[3].
+`two_ways` is the forward-backward algorithm over two states, head and tail as on the path or
+exchanged, and gives the flip posterior.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +21,24 @@ NONE = -1
 
 @njit(cache=True)
 def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling):
-    """How unlikely it is, in nats, that an animal of this length mm gets from joints (J, 3) mm to
-    others in dt s.
+    """Transition cost, nats: how unlikely an animal gets from joints (J, 3) mm to others in dt s.
 
     The middle and the posture about it move by standard deviations of levels[1] and levels[2]
-    lengths a second, and are measured to levels[0] of the predicted errors mm. Animals seldom dart,
-    but they do: costs above levels[3] nats grow as logarithms; at most `ceiling`.
+    lengths a second, and are measured to levels[0] of the predicted errors. Animals seldom dart,
+    but they do: costs above levels[3] nats grow as logarithms.
+
+    Args:
+        joints_a: (J, 3) mm, before.
+        joints_b: (J, 3) mm, after.
+        error_a: predicted mean joint error before, mm.
+        error_b: the same after, mm.
+        dt: time between, s.
+        length: spine length of the animal, mm.
+        levels: (4,) error factor, shift and bend in lengths a second, tail in nats.
+        ceiling: the most that a transition costs, nats.
+
+    Returns:
+        Nats, from 0 to `ceiling`.
     """
     n = joints_a.shape[0]
     shift = 0.0
@@ -41,12 +64,29 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
 def extend(
     t, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent
 ):
-    """Add frame t to the chain: fill cost[t] (H,) and parent[t] (H, 2), and put its hypotheses
-    among the `live` ones.
+    """One Viterbi step: add frame t and its hypotheses to the beam; returns the beam's size.
 
-    live (B, 2): frame and hypothesis of the n_live best chains' last links; idle (n + 1,): what it
-    has cost up to each frame to pass by all hypotheses. A chain passes a frame by at that price.
-    Returns how many are live.
+    A chain may begin at any frame and passes a frame by at its missed-detection price.
+
+    Args:
+        t: index of the frame.
+        live: (B, 2) the beam, frame and hypothesis of the best chains' last links; updated in
+            place.
+        n_live: how many rows of it are in use.
+        times: (n,) s.
+        joints: (n, H, J, 3) mm.
+        error: (n, H) predicted mean joint error, mm.
+        emission: (n, H) cost of each hypothesis by itself, nats; not finite where there is none.
+        idle: (n + 1,) missed-detection cost of all frames before each, cumulative, nats.
+        levels: see `leap_cost`.
+        length: spine length of the animal, mm.
+        ceiling: see `leap_cost`.
+        cost: (n, H) output at t, cost of the best chain that ends there, nats; infinite without
+            one.
+        parent: (n, H, 2) output at t, frame and hypothesis before, `NONE` where the chain begins.
+
+    Returns:
+        How many rows of `live` are in use afterwards.
     """
     for h in range(joints.shape[1]):
         cost[t, h] = np.inf
@@ -81,7 +121,7 @@ def extend(
 
 @njit(cache=True)
 def _keep_best(t, live, n_live, idle, cost, n_hypotheses):
-    """The best chains after frame t into `live`, best first; returns how many."""
+    """Prune: the best chains after frame t into `live`, best first; returns how many."""
     size = live.shape[0]
     all_of = np.empty((n_live + n_hypotheses, 2), np.int64)
     costs = np.empty(n_live + n_hypotheses)
@@ -122,7 +162,27 @@ def extend_all(
     cost,
     parent,
 ):
-    """`extend` for frames start to stop."""
+    """Viterbi over frames start to stop: `extend` for each; returns the beam's size.
+
+    Args:
+        start: first frame.
+        stop: frame after the last.
+        live: (B, 2) the beam, updated in place.
+        n_live: how many rows of it are in use.
+        times: (n,) s.
+        joints: (n, H, J, 3) mm.
+        error: (n, H) predicted mean joint error, mm.
+        emission: (n, H) nats.
+        idle: (n + 1,) cumulative missed-detection cost, nats.
+        levels: see `leap_cost`.
+        length: spine length of the animal, mm.
+        ceiling: see `leap_cost`.
+        cost: (n, H) output.
+        parent: (n, H, 2) output.
+
+    Returns:
+        How many rows of `live` are in use afterwards.
+    """
     for t in range(start, stop):
         n_live = extend(
             t,
@@ -144,8 +204,14 @@ def extend_all(
 
 @njit(cache=True)
 def trace_back(frame, hypothesis, parent, first, path):
-    """Follow the links from a hypothesis back to frame `first`, into path (n,), NONE where a frame
-    was passed by.
+    """Viterbi backtracking: follow the links from a hypothesis back to frame `first`.
+
+    Args:
+        frame: where the chain ends.
+        hypothesis: which of that frame's.
+        parent: (n, H, 2) links, see `extend`.
+        first: the earliest frame that is written.
+        path: (n,) output from `first` on, `NONE` where a frame was passed by.
     """
     path[first:] = NONE
     while frame >= first:
@@ -155,10 +221,22 @@ def trace_back(frame, hypothesis, parent, first, path):
 
 @njit(cache=True)
 def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
-    """Probability (n,) of the second of two ways round of each frame: joints one and two (n, J, 3)
-    mm.
+    """Forward-backward over two states: fill the flip posterior of each frame.
 
-    evidence (n,): by how many nats a frame is for the first way.
+    Transitions within and between the two states cost what `leap_cost` says of their joints; all
+    sums are in logarithms.
+
+    Args:
+        times: (n,) s.
+        one: (n, J, 3) mm, joints as on the path.
+        two: (n, J, 3) mm, joints with head and tail exchanged.
+        error: (n,) predicted mean joint error, mm.
+        evidence: (n,) log likelihood ratio of the frame by itself, nats, positive for the first
+            way.
+        levels: see `leap_cost`.
+        length: spine length of the animal, mm.
+        ceiling: see `leap_cost`.
+        doubt: (n,) output, posterior probability of the second way.
     """
     n = times.size
     stay = np.empty((n, 2))

@@ -1,11 +1,17 @@
-"""Kernels of the smoother: a filter of value and velocity and its way back, for vectors and for
-rotations.
+"""Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process.
 
-All coordinates of a group share one covariance (2, 2) of value and velocity, so only gains are
-computed per frame, and every coordinate is moved by them. The velocity dies away within `fade`
-seconds and is driven by white noise of density q (an integrated Ornstein-Uhlenbeck process; Johnson
-et al. 2008); a frame's value is measured with variance r, infinite where nothing was measured.
-Within dt the value goes on by go[t] times the velocity, of which keep[t] is left.
+State (x, v): dx = v dt, dv = -v / τ dt + sqrt(q) dW (correlated random walk, Johnson et al. 2008).
+Over dt: F = [[1, g], [0, a]], a = exp(-dt / τ), g = τ (1 - a); process noise
+    Q11 = q τ^2 (dt - 2 τ (1 - a) + τ (1 - a^2) / 2), Q12 = q g^2 / 2, Q22 = q τ (1 - a^2) / 2.
+Filter (Kalman 1960): K = P- H^T / (P-_11 + r); r is infinite where nothing was measured.
+Smoother (Rauch, Tung and Striebel 1965), x' and P' one frame later, - for predicted, s for
+smoothed:
+    G = P F^T (P-')^-1, x_s = x + G (x_s' - F x), P_s = P + G (P_s' - P-') G^T.
+
+All scalar coordinates of a group share one covariance (2, 2) of value and velocity, so only gains
+are computed per frame, and every coordinate is moved by them. Positions (3) have one coupled state
+of six. Rotations use the left-invariant error log(R^T R') on SO(3), with the body's own angular
+velocity. In the code `fade` is τ, `drive` and `q` the process variance, `keep` is a, and `go` is g.
 """
 
 from __future__ import annotations
@@ -18,7 +24,14 @@ from liex_lab.body._kernels import exp_so3
 
 @njit(cache=True)
 def steps(times, fade, keep, go):
-    """Fill keep (n,) and go (n,) s of the steps that lead to each frame."""
+    """Fill the decay a and the velocity's gain times dt, g, of the step that leads to each frame.
+
+    Args:
+        times: (n,) s.
+        fade: decay time τ, s.
+        keep: (n,) output, a = exp(-dt / τ); 1 at the first frame.
+        go: (n,) output, g = τ (1 - a), s; 0 at the first frame.
+    """
     keep[0] = 1.0
     go[0] = 0.0
     for t in range(1, times.size):
@@ -28,11 +41,23 @@ def steps(times, fade, keep, go):
 
 @njit(cache=True)
 def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted, smoothed):
-    """Gains and variances of n frames: forward (n, 2) of value and velocity, back (n, 2, 2) of the
-    way back.
+    """Fill Kalman gains, RTS gains and covariances of one scalar coordinate over n frames.
 
-    filtered, predicted, smoothed (n, 2, 2) are covariances; start: the first frame that was
-    measured.
+    The prior at `start` is the measurement, with the velocity's stationary variance q τ / 2.
+
+    Args:
+        times: (n,) s.
+        r: (n,) measurement variance, infinite where nothing was measured.
+        q: process variance, the density of the noise on the velocity.
+        fade: decay time τ, s.
+        start: index of the first frame that was measured; frames before it are not filled.
+        keep: (n,) output, the decay a of each step.
+        go: (n,) output, g of each step, s.
+        forward: (n, 2) output, Kalman gain of value and velocity.
+        back: (n, 2, 2) output, RTS gain; not filled at the last frame.
+        filtered: (n, 2, 2) output, covariance after each measurement.
+        predicted: (n, 2, 2) output, covariance before it.
+        smoothed: (n, 2, 2) output, covariance given all measurements.
     """
     n = times.size
     p = np.empty((2, 2))
@@ -89,7 +114,7 @@ def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted
 
 @njit(cache=True)
 def _way(dt, fade):
-    """Variance of the value after dt s of unit noise on the velocity."""
+    """Q11 / q, s^3: process variance of the value after dt s; a series for small dt / τ."""
     x = dt / fade
     if x < 1e-2:  # the differences below lose their digits
         return dt**3 * (1.0 / 3.0 - x / 4.0 + 7.0 * x * x / 60.0)
@@ -99,8 +124,18 @@ def _way(dt, fade):
 
 @njit(cache=True)
 def run_vector(y, known, start, keep, go, forward, back, out, rate):
-    """Filter values y (n,), smooth them into out (n,) and their rates (n,) per second; known (n,):
-    measured.
+    """Filter and smooth one scalar coordinate with the gains of `gains`.
+
+    Args:
+        y: (n,) measured values; not read where `known` is False.
+        known: (n,) bool, measured.
+        start: index of the first measured frame; `out` is constant before it.
+        keep: (n,) decay of each step.
+        go: (n,) g of each step, s.
+        forward: (n, 2) Kalman gains.
+        back: (n, 2, 2) RTS gains.
+        out: (n,) output, smoothed values.
+        rate: (n,) output, smoothed velocities per second, from `start` on.
     """
     n = y.size
     out[start] = y[start]
@@ -123,9 +158,20 @@ def run_vector(y, known, start, keep, go, forward, back, out, rate):
 
 @njit(cache=True)
 def run_place(times, y, r, known, start, drive, fade, out, spread):
-    """Filter places y (n, 3) mm measured with covariances r (n, 3, 3) and smooth them into out (n,
-    3), with their covariances `spread` (n, 3, 3); drive (3,): along each axis. Products are loops:
-    matrices so small are not for BLAS.
+    """Filter and smooth positions with full measurement covariances; the state is (6,).
+
+    Products are loops: matrices so small are not for BLAS.
+
+    Args:
+        times: (n,) s.
+        y: (n, 3) measured positions, mm.
+        r: (n, 3, 3) their covariances, mm^2.
+        known: (n,) bool, measured.
+        start: index of the first measured frame; `out` and `spread` are constant before it.
+        drive: (3,) process variance along each axis, mm^2/s^3.
+        fade: decay time τ, s.
+        out: (n, 3) output, smoothed positions, mm.
+        spread: (n, 3, 3) output, their covariances, mm^2.
     """
     n = y.shape[0]
     state = np.zeros((n, 6))
@@ -176,7 +222,7 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
 
 @njit(cache=True)
 def _go_on(state, p, dt, drive, fade, ahead, m):
-    """Fill ahead (6,) and m (6, 6) with what becomes of a state and its covariance in dt s."""
+    """Kalman prediction: fill ahead (6,) and m (6, 6) from a state and its covariance."""
     keep = np.exp(-dt / fade)
     go = fade * (1.0 - keep)
     way = _way(dt, fade)
@@ -197,7 +243,7 @@ def _go_on(state, p, dt, drive, fade, ahead, m):
 
 @njit(cache=True)
 def _way_back(times, fade, start, state, p, ahead, m):
-    """Turn filtered states (n, 6) and covariances (n, 6, 6) into smoothed ones."""
+    """Rauch-Tung-Striebel pass, in place, over states (n, 6) and covariances (n, 6, 6)."""
     inverse = np.zeros((6, 6))
     work = np.zeros((6, 6))
     forth = np.zeros((6, 6))
@@ -263,8 +309,11 @@ def _invert(a, out, work):
 
 @njit(cache=True)
 def log_so3(r, out):
-    """Rotation vector (3,) rad of a rotation (3, 3), through the quaternion of the largest
-    component.
+    """Logarithm of SO(3), through the quaternion's largest component, so that it is exact up to π.
+
+    Args:
+        r: (3, 3) rotation.
+        out: (3,) output, rotation vector, rad.
     """
     q = np.empty(4)
     d0 = r[0, 0]
@@ -329,9 +378,21 @@ def _between(a, b, out):
 
 @njit(cache=True)
 def run_rotations(y, known, start, keep, go, forward, back, out, rate):
-    """As `run_vector` for rotations y (n, 3, 3): the velocity is the body's own angular velocity
-    (n, 3) rad/s, the error a rotation vector on the right (left-invariant). Each axis of the body
-    has its own gains: keep and go (3, n), forward (3, n, 2), back (3, n, 2, 2).
+    """Filter and smooth rotations by the left-invariant error: `run_vector` on SO(3).
+
+    The velocity is the body's own angular velocity, rad/s, and the error a rotation vector on the
+    right, R' = R exp(w). Each axis of the body has its own gains.
+
+    Args:
+        y: (n, 3, 3) measured rotations.
+        known: (n,) bool, measured.
+        start: index of the first measured frame; `out` is constant before it.
+        keep: (3, n) decay of each step.
+        go: (3, n) g of each step, s.
+        forward: (3, n, 2) Kalman gains.
+        back: (3, n, 2, 2) RTS gains.
+        out: (n, 3, 3) output, smoothed rotations.
+        rate: (n, 3) output, smoothed angular velocities, rad/s.
     """
     n = known.size
     w = np.empty(3)

@@ -1,5 +1,12 @@
-"""Kernel of the smoother: all coordinates of a pose at once, outliers weighed down in a few
-passes.
+"""Robust Kalman filter and RTS smoother of whole poses: Student-t errors by iterated reweighting.
+
+Four passes of the smoother of `_kalman_kernels` over all coordinates at once. After each, a frame t
+at the mean joint distance δ_t from the curve, in predicted errors, gets the weight w_t = (ν + 1) /
+(ν + δ_t^2), by which its measurement variance is divided (EM for the t distribution, Lange et al.
+1989), and is left out where δ_t is beyond the gate. Positions are those of the joints' middle, with
+an error ellipsoid aligned with the animal; the root is put where the middle requires it. In the
+code `freedom` is ν, `reject` the gate and `lasting` the correlated share, whose square is left out
+of the variance.
 """
 
 from __future__ import annotations
@@ -17,8 +24,16 @@ _PASSES = 4
 
 
 class Body(NamedTuple):
-    """A skeleton for the kernels, see `place_joints`; free (m, 2): joint and axis of each angle;
-    length_mm; tip.
+    """A skeleton for the kernels, see `place_joints`.
+
+    Attributes:
+        parents: (J,) parent of each joint.
+        offsets: (J, 3) mm, bones at home.
+        rest: (J, 3, 3) rest rotation of each joint relative to its parent.
+        moves: (J,) bool, joints that turn.
+        free: (m, 2) joint and axis of each free angle.
+        length_mm: spine length of the animal, mm.
+        tip: joint whose direction from the base says which way the animal lies.
     """
 
     parents: NDArray[np.int64]
@@ -31,8 +46,18 @@ class Body(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """A `Motion` for the kernels: rows of error, drive and fade; place_error (3,), place_drive (3,)
-    lengths^2/s^3.
+    """A `Motion` for the kernels; rows are (error, process variance, decay time).
+
+    Attributes:
+        place_error: (3,) along the animal, to its side, up; over the predicted mean joint error.
+        place_drive: (3,) process variance along the arena's axes, lengths^2/s^3.
+        place_fade: decay time of the middle's velocity, s.
+        turn: (3, 3) a row for each axis of the base's rotation.
+        bend: (3, 3) a row for each axis of the joint angles.
+        size: (3,) of the log scale.
+        freedom: degrees of freedom ν of the errors' t distribution.
+        reject: gate, predicted errors.
+        lasting: correlated share of an error.
     """
 
     place_error: NDArray[np.float64]
@@ -47,8 +72,14 @@ class Moves(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Of n frames: rotation (n, 3, 3), place (n, 3) mm, angles (n, J, 3), log_scale (n,), joints
-    (n, J, 3) mm.
+    """Poses of n frames as arrays.
+
+    Attributes:
+        rotation: (n, 3, 3) of the root.
+        place: (n, 3) position of the root, mm.
+        angles: (n, J, 3) rad.
+        log_scale: (n,) logarithm of the bones' scale.
+        joints: (n, J, 3) mm.
     """
 
     rotation: NDArray[np.float64]
@@ -59,8 +90,12 @@ class Poses(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Of n frames: covariance of the joints' middle (n, 3, 3) mm^2; variances of the base's
-    rotation about its own axes and of the other joints' angles (n, 3) rad^2.
+    """Posterior spread of n frames.
+
+    Attributes:
+        middle: (n, 3, 3) covariance of the joints' middle, mm^2.
+        turn: (n, 3) variance of the base's rotation about its own axes, rad^2.
+        bend: (n, 3) variance of the other joints' angles about theirs, rad^2.
     """
 
     middle: NDArray[np.float64]
@@ -70,8 +105,21 @@ class Spread(NamedTuple):
 
 @njit(cache=True)
 def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
-    """Fill `made` and `spread` with the curve through `seen`, and used (n,) with the frames that it
-    goes by.
+    """Fill `made` and `spread` with the smoothed curve, and `used` with the frames that it goes by.
+
+    Where the gate leaves no frame at all, every measured one is used again. At least one frame must
+    be measured.
+
+    Args:
+        times: (n,) s.
+        seen: measured poses of n frames, arena frame.
+        error: (n,) predicted mean joint error, mm.
+        known: (n,) bool, measured.
+        body: the skeleton.
+        moves: motion and error parameters.
+        made: output, smoothed poses.
+        spread: output, their posterior spread; without the correlated share.
+        used: (n,) bool output, frames within the gate.
     """
     n = error.size
     n_joints = body.parents.size
@@ -109,7 +157,7 @@ def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
 
 @njit(cache=True)
 def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, used):
-    """One way forward and back, with each measurement's variance divided by its weight."""
+    """One filter and smoother pass, each measurement's variance divided by its weight."""
     n = error.size
     m = body.free.shape[0]
     start = 0
@@ -227,7 +275,7 @@ def _gains_of(
     smoothed,
     left,
 ):
-    """The gains of a group with this error, drive and fade, and the variance (n,) that is left."""
+    """The gains of a group with these `moves`, and its posterior variance (n,)."""
     gains(
         times,
         (moves[0] / length) ** 2 * variance,

@@ -1,5 +1,11 @@
-"""The animal's curve through the hypotheses of single frames: which of them it is, or none, over a
-whole recording.
+"""Data association by Viterbi: which hypothesis of each frame of a recording is the animal.
+
+The most probable path of a hidden Markov model whose states are the hypotheses of each frame and
+"missed": minimise sum_t score_t / score_mm (capped) + transition costs + missed-detection costs, by
+dynamic programming with a beam of 24 (Viterbi 1967; kernels in `_association_kernels`). Head and
+tail are told apart on that path by the forward-backward algorithm over two states (Rabiner 1989),
+which gives the flip posterior. Lie-X has no such step: its tracker is a particle filter (section
+4.2).
 """
 
 from __future__ import annotations
@@ -24,13 +30,17 @@ NONE = kernels.NONE
 
 @dataclass(frozen=True)
 class ChainTuning:
-    """What makes a chain likely; costs are nats, lengths those of an animal of the reference
-    length.
+    """Costs of a chain of hypotheses, nats; lengths are those of an animal of the reference length.
 
-    score_mm: this much of the metric's score weighs one nat, up to score_most of them; none:
-    passing all hypotheses of a frame by; ceiling: the most a leap costs; error_factor: of the
-    predicted errors, as standard deviations; shift and bend: how fast, in lengths a second, middle
-    and posture move by themselves; tail: from so many nats on, a leap's price grows as a logarithm.
+    Attributes:
+        score_mm: so much of the learned metric's score, mm, weighs one nat.
+        score_most: the most nats that a score costs.
+        none: missed-detection cost, of passing all hypotheses of a frame by.
+        ceiling: the most that a transition costs.
+        error_factor: standard deviation of a measurement over its predicted error.
+        shift: how fast the middle moves by itself, lengths a second (standard deviation).
+        bend: how fast the posture about the middle changes by itself, lengths a second.
+        tail: from so many nats on, a transition cost grows as a logarithm.
     """
 
     score_mm: float
@@ -44,10 +54,16 @@ class ChainTuning:
 
 
 class Chain:
-    """Follows the hypotheses of frames; grows while frames come.
+    """Associates the hypotheses of frames with one animal; frames may be added.
 
-    length_mm: of the animal. `path` explains all frames seen so far at once (Viterbi), so a stretch
-    that looked like one thing is another as soon as what follows says so.
+    `path` explains all frames seen so far at once (Viterbi), so a stretch that looked like one
+    component is another as soon as what follows says so.
+
+    Args:
+        skeleton: kinematic tree of the animal; up to eight of its joints measure how far it has
+            moved.
+        length_mm: spine length of the animal, mm.
+        tuning: costs.
     """
 
     def __init__(self, skeleton: Skeleton, length_mm: float, tuning: ChainTuning) -> None:
@@ -59,8 +75,14 @@ class Chain:
         self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend, tuning.tail])
 
     def joints(self, seen: Observations, room: Room = np.empty) -> NDArray[np.float32]:
-        """Positions (n, H, some, 3) mm of the joints that chains are told by; room: where they are
-        to lie.
+        """Positions of the k joints that transition costs are measured by.
+
+        Args:
+            seen: hypotheses (n, H).
+            room: allocator of the result.
+
+        Returns:
+            (n, H, k, 3) mm, float32, arena frame, NaN where there is no hypothesis; k is at most 8.
         """
         return seen.joints(self._joints, room)
 
@@ -71,10 +93,16 @@ class Chain:
         joints: NDArray[np.float32] | None = None,
         room: Room = np.empty,
     ) -> NDArray[np.int64]:
-        """(n,) the hypothesis of each frame that lies on the curve, or NONE.
+        """The most probable path: which hypothesis of each frame is the animal, or `NONE`.
 
-        told (m,): of the first m frames it is known already; joints: those of `joints`, where they
-        are at hand; room: for what takes much of it on the way.
+        Args:
+            seen: hypotheses (n, H).
+            told: (m,) decisions of the first m frames that stand, None where all are open.
+            joints: what `joints` gave, where it is at hand.
+            room: allocator of intermediate arrays.
+
+        Returns:
+            (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
         """
         n, h = seen.score.shape
         emission = self._emission(seen, room)
@@ -113,7 +141,7 @@ class Chain:
         return path
 
     def _emission(self, seen: Observations, room: Room) -> Array:
-        """What each hypothesis (n, H) costs by itself."""
+        """Emission cost (n, H) of each hypothesis, nats: its capped score; NaN without."""
         cost = room(seen.score.shape, float)
         for rows in blocks(len(cost), _BLOCK):
             cost[rows] = np.minimum(
@@ -129,12 +157,21 @@ class Chain:
         joints: NDArray[np.float32] | None = None,
         room: Room = np.empty,
     ) -> Array:
-        """(n,) probability that head and tail are exchanged on this path: forward and backward
-        through two states.
+        """Flip posterior (n,): probability that head and tail are exchanged on this path.
 
-        What a frame says is the difference between its hypothesis and the same thing turned round;
-        between frames, how likely it is that an animal turns round, or does not, in the time
-        between them.
+        Forward-backward over two states. What a frame says is the difference between its hypothesis
+        and the same component turned round (h ^ 1), or score_most where it has no such; between
+        frames, how likely it is that an animal turns round, or does not, in the time between them.
+        Frames that were passed by get values interpolated between their neighbours'.
+
+        Args:
+            seen: hypotheses (n, H).
+            path: (n,) from `path`.
+            joints: what `joints` gave, where it is at hand.
+            room: allocator of intermediate arrays.
+
+        Returns:
+            (n,) probabilities; 0 throughout where the path is empty.
         """
         rows = np.arange(len(path))
         other = np.where(path >= 0, path ^ 1, NONE)

@@ -1,8 +1,9 @@
-"""What the tracker believes of an animal: how it moves, how frames err, and what makes a chain of
-hypotheses likely.
+"""Motion and association parameters of each animal, read from and written to `tunings.toml` (TOML).
 
-`tunings.toml` beside this module holds it for the bundled animals; `liex train tracking` finds it
-again, on rendered sequences whose seeds are not those of any test.
+They hold what the tracker believes of an animal: how it moves (integrated Ornstein-Uhlenbeck
+processes), how single frames err, and the costs of a chain of hypotheses. The file beside this
+module holds them for the bundled animals; `liex train tracking` finds them again, on rendered
+sequences whose seeds are not those of any test.
 """
 
 from __future__ import annotations
@@ -22,7 +23,12 @@ _USUAL = "mouse"  # what an animal is taken for that has none of its own
 
 @dataclass(frozen=True)
 class Tuning:
-    """Of one animal."""
+    """The parameters of one animal.
+
+    Attributes:
+        chain: costs of the association by Viterbi.
+        motion: motion and error parameters of the smoother.
+    """
 
     chain: ChainTuning
     motion: Motion
@@ -30,13 +36,28 @@ class Tuning:
     @staticmethod
     @cache
     def of(name: str) -> Tuning:
-        """That of an animal by its skeleton's name."""
+        """The parameters of an animal, the mouse's where it has none of its own.
+
+        Args:
+            name: name of the skeleton, such as 'fish'.
+
+        Returns:
+            The parameters, read once per name.
+        """
         known = tomllib.loads(TUNINGS.read_text(encoding="utf-8"))
         return Tuning.from_table(known.get(name, known[_USUAL]))
 
     @staticmethod
     def from_table(table: dict[str, Any]) -> Tuning:
-        """From its table in TOML; three numbers of a coordinate are error, drive and fade."""
+        """The parameters from their TOML table.
+
+        Args:
+            table: the tables `chain` and `motion` as `tomllib` reads them; the three numbers of a
+                coordinate are error, drive (process variance) and fade (decay time).
+
+        Returns:
+            The parameters.
+        """
         motion = dict(table["motion"])
         for group in ("turn", "bend"):
             motion[group] = tuple(Wandering(*row) for row in motion[group])
@@ -47,7 +68,14 @@ class Tuning:
         return Tuning(ChainTuning(**table["chain"]), Motion(**motion))
 
     def to_toml(self, name: str) -> str:
-        """Its table in TOML."""
+        """The parameters as TOML tables, numbers to four significant digits.
+
+        Args:
+            name: the animal, as the tables' prefix.
+
+        Returns:
+            The text of `[name.chain]` and `[name.motion]`.
+        """
         lines = [
             f"[{name}.chain]",
             *(f"{key} = {_text(value)}" for key, value in asdict(self.chain).items()),
@@ -61,7 +89,15 @@ class Tuning:
 
 
 def tunings_with(name: str, tuning: Tuning) -> str:
-    """The file `tunings.toml` with an animal's table replaced, or added to it."""
+    """The text of `tunings.toml` with an animal's tables replaced, or added to it.
+
+    Args:
+        name: name of the animal's skeleton.
+        tuning: its parameters.
+
+    Returns:
+        The whole file, with the comment at its head.
+    """
     text = TUNINGS.read_text(encoding="utf-8")
     head = text[: text.index("\n[")]
     known = {animal: Tuning.from_table(table) for animal, table in tomllib.loads(text).items()} | {

@@ -1,4 +1,9 @@
-"""What the single frames say: for each of them a few hypotheses of the pose, in the arena frame."""
+"""Pose hypotheses of single frames as columns: the measurements that the tracker works on.
+
+Each frame has four hypotheses in the arena frame: of the best and of the second component of about
+the animal's size, the best pose and the best pose that points the other way. Hypothesis h ^ 1 is
+hypothesis h with head and tail exchanged. The fields are the columns of `observations.npz`.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +22,30 @@ from liex_lab.runtime.memory import Room, let_go
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
 
-N_HYPOTHESES = (
-    4  # of two things in the frame one way round and the other: hypothesis h ^ 1 is h turned round
-)
+# of two things in the frame one way round and the other: hypothesis h ^ 1 is h turned round
+N_HYPOTHESES = 4
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Hypotheses (n, H) of n frames, NaN where there is none; the first is the single frame's own
-    answer.
+    """Hypotheses (n, H) of n frames, NaN where there is none.
 
-    times_ns (n,); turn (n, H, 3) rad and place (n, H, 3) mm: T_arena_root, the rotation as its
-    vector; angles (n, H, D) rad about the skeleton's free axes, joint by joint; scale (n, H) of the
-    bones; error_mm (n, H): expected mean joint error; score (n, H): what the metric says of the
-    candidates behind it, mm at home size; residual_mm (n, H): between body and depth. Of the thing
-    that it is a pose of: n_px, centroid_mm (n, H, 3) arena frame and centroid_px (n, H, 2).
-    has_depth (n,): anything was read. Single precision, for a recording may last hours.
+    The first is the single frame's own answer. Single precision, for a recording may last hours.
+
+    Attributes:
+        skeleton: kinematic tree of the animal.
+        times_ns: (n,) int64.
+        turn: (n, H, 3) rotation of T_arena_root as its rotation vector, rad.
+        place: (n, H, 3) position of the root, mm, arena frame.
+        angles: (n, H, D) rad about the skeleton's D free axes, joint by joint, without the base.
+        scale: (n, H) of the bones.
+        error_mm: (n, H) expected mean joint error, mm.
+        score: (n, H) what the learned metric says of the candidates behind it, mm at home size.
+        residual_mm: (n, H) distance between rendered body and depth, mm.
+        n_px: (n, H) int32 pixels of the component that it is a pose of, 0 where there is none.
+        centroid_mm: (n, H, 3) centre of that component, arena frame, mm.
+        centroid_px: (n, H, 2) its projection, px of the depth image.
+        has_depth: (n,) True where anything was read.
     """
 
     skeleton: Skeleton
@@ -51,12 +64,21 @@ class Observations:
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
-        """Frames in which nothing was found."""
+        """Observations of frames in which nothing was found; `has_depth` is True throughout.
+
+        Args:
+            skeleton: kinematic tree of the animal.
+            times_ns: (n,) time stamps.
+
+        Returns:
+            n frames of four hypotheses, all NaN.
+        """
         n = len(times_ns)
         h = N_HYPOTHESES
         d = int(skeleton.axes[1:].sum())
 
         def nothing(*shape: int) -> Small:
+            """NaN (n, H, *shape), float32."""
             return np.full((n, h, *shape), np.nan, np.float32)
 
         return Observations(
@@ -76,7 +98,12 @@ class Observations:
         )
 
     def put_pose(self, h: int, pose: Pose) -> None:
-        """Poses (n) in the arena frame as hypothesis h, NaN where there is none."""
+        """Set poses as hypothesis h of all frames, in place.
+
+        Args:
+            h: index of the hypothesis.
+            pose: (n) poses in the arena frame, NaN where there is none.
+        """
         known = np.isfinite(pose.scale)
         self.turn[known, h] = so3.log(pose.root.rotation[known])
         self.place[:, h] = pose.root.translation
@@ -85,35 +112,49 @@ class Observations:
 
     @staticmethod
     def join(parts: Sequence[Observations]) -> Observations:
-        """Those of consecutive frames."""
+        """The observations of consecutive frames as one.
+
+        Args:
+            parts: observations of one animal in order of time, at least one.
+
+        Returns:
+            All their frames.
+        """
         return Observations(
             parts[0].skeleton,
             *(np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS),
         )
 
     def __getitem__(self, frames: slice) -> Observations:
+        """Some consecutive frames; what is written into them is written into the whole."""
         return Observations(self.skeleton, *(getattr(self, name)[frames] for name in COLUMNS))
 
     def __len__(self) -> int:
+        """The number of frames n."""
         return len(self.times_ns)
 
     def rest(self) -> None:
-        """Let go of the memory of columns that lie on disk, until they are looked at again."""
+        """Release the memory pages of columns that lie on disk, until they are read again."""
         let_go(*(getattr(self, name) for name in COLUMNS))
 
     @property
     def seconds(self) -> Array:
-        """(n,) since the first frame."""
+        """(n,) s since the first frame."""
         return np.asarray((self.times_ns - self.times_ns[:1]) * 1e-9)
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(n, H) where there is a hypothesis."""
+        """(n, H) True where there is a hypothesis."""
         return np.isfinite(self.score)
 
     def pose(self, path: NDArray[np.int64]) -> Pose:
-        """The poses (n) of the hypotheses `path` (n,); NaN where it is negative or there is
-        none.
+        """The poses (n) that a path takes, arena frame.
+
+        Args:
+            path: (n,) index of a hypothesis for each frame, negative for none.
+
+        Returns:
+            (n) poses; NaN where the path is negative or there is no such hypothesis.
         """
         turn, place, free, scale = (
             self.along(v, path) for v in (self.turn, self.place, self.angles, self.scale)
@@ -123,16 +164,28 @@ class Observations:
         return Pose(SE3(so3.exp(turn), place), angles, scale)
 
     def along(self, values: NDArray[np.generic], path: NDArray[np.int64]) -> Array:
-        """Some of the hypotheses' values (n, H, ...) along a path (n,), NaN where it is
-        negative.
+        """Values along a path of hypotheses, in double precision.
+
+        Args:
+            values: (n, H, ...) one of the columns.
+            path: (n,) index of a hypothesis for each frame, negative for none.
+
+        Returns:
+            (n, ...) float64, NaN where the path is negative.
         """
         taken = values[np.arange(len(path)), np.maximum(path, 0)].astype(np.float64)
         taken[path < 0] = np.nan
         return taken
 
     def joints(self, joints: Sequence[int], room: Room = np.empty) -> Small:
-        """Positions (n, H, len(joints), 3) mm of some joints in all hypotheses; room: where they
-        are to lie.
+        """Positions of some joints in all hypotheses, by forward kinematics.
+
+        Args:
+            joints: indices of k joints.
+            room: allocator of the result.
+
+        Returns:
+            (n, H, k, 3) mm, float32, arena frame; NaN where there is no hypothesis.
         """
         out = room((*self.score.shape, len(joints), 3), np.float32)
         for start in range(0, len(self), _BLOCK):
@@ -149,7 +202,15 @@ class Observations:
 
 
 def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
-    """Joint positions (n, J, 3) mm of poses (n); as `Pose.joints`, quicker."""
+    """Joint positions of poses by forward kinematics; as `Pose.joints`, but quicker.
+
+    Args:
+        skeleton: kinematic tree of the animal.
+        pose: (n) poses.
+
+    Returns:
+        (n, J, 3) mm in the poses' frame.
+    """
     out = np.empty((len(pose.scale), skeleton.n_joints, 3))
     place_joints(
         skeleton.parents,
@@ -170,9 +231,16 @@ COLUMNS = tuple(field.name for field in fields(Observations) if field.name != "s
 
 
 def reversed_pose(skeleton: Skeleton, pose: Pose) -> Pose:
-    """Poses (n) that lie where others do, with head and tail exchanged; of one chain of joints.
+    """Poses that lie where others do, with head and tail exchanged.
 
     The joints are moved along the body's line until it is measured from its other end.
+
+    Args:
+        skeleton: a kinematic tree that is one chain.
+        pose: (n) poses.
+
+    Returns:
+        (n) poses in the same frame.
     """
     joints = pose.joints(skeleton)
     up = pose.root.rotation[:, :, 2]

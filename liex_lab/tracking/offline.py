@@ -1,5 +1,18 @@
-"""From what single frames say to the track: the whole recording at once, head and tail told apart
-over all of it.
+"""Fixed-interval smoothing of a whole recording: association, flip posterior, then RTS smoothing.
+
+1. Viterbi over the hypotheses of single frames (`association`) says which of them the animal is, or
+   none.
+2. A forward-backward pass over two states, head and tail as they are or exchanged, gives the flip
+   posterior; spans that a person corrected are exchanged with certainty.
+3. A Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process
+   (`smoother`) runs over blocks of 4096 frames with a margin of 160 frames on either side.
+4. Validation gate: a hypothesis that was passed by, but lies within one predicted error of the
+   curve, its own and the curve's together, is a measurement after all; twice over, for each time
+   the curve comes nearer to others.
+5. Gaps up to `bridge_s` are bridged by the curve, longer ones are NaN.
+
+The default tracker of the package; it replaces the particle filter of Lie-X section 4.2
+(`particles`).
 """
 
 from __future__ import annotations
@@ -27,12 +40,10 @@ Array = NDArray[np.float64]
 _BLOCK = 4096
 MARGIN = 160
 # nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was
-# passed by is a
-# measurement after all, unless it shows less than this share of what the animal usually shows, or
-# more than that many
-# times as much; of half an animal beside a bar the pose errs by this share of the length that is
-# not seen. Each time
-# that some are taken, the curve comes nearer to others.
+# passed by is a measurement after all, unless it shows less than this share of what the animal
+# usually shows, or more than that many times as much; of half an animal beside a bar the pose errs
+# by this share of the length that is not seen. Each time that some are taken, the curve comes
+# nearer to others.
 _ADMIT = 1.0
 _LEAST = 0.5
 _MOST = 1.5
@@ -43,13 +54,20 @@ _TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
 
 @dataclass(frozen=True)
 class Subject:
-    """Whom a track is of, and before which camera.
+    """Whom a track is of, before which camera, and by which limits its rows are kept or flagged.
 
-    length_mm: of this animal; doubtful_mm: frames with a larger predicted error are flagged;
-    bridge_s: so long a stretch without a measurement is bridged, and half as far into a longer one
-    from both its ends; joint_share (J,): each joint's error over the mean. stretch_sd: by which
-    share all distances from the base may be off throughout, for an animal whose ends a sensor eats
-    is taken for a smaller one; None where nothing is known of it.
+    Attributes:
+        skeleton: kinematic tree of the animal.
+        camera: the depth camera that took the recording.
+        T_arena_camera: pose of the camera in the arena frame, mm.
+        length_mm: spine length of this animal, mm.
+        doubtful_mm: frames with a larger predicted mean joint error, mm, are flagged.
+        bridge_s: so long a gap without a measurement is bridged, s, and half as far into a longer
+            one from both its ends.
+        joint_share: (J,) error of each joint over the mean of all joints.
+        stretch_sd: standard deviation of the share by which all distances from the base may be off
+            throughout, for an animal whose ends a sensor eats is taken for a smaller one; None
+            where nothing is known of it, which takes the usual share of `Motion`.
     """
 
     skeleton: Skeleton
@@ -69,11 +87,21 @@ def track_whole(
     tuning: Tuning | None = None,
     room: Room = np.empty,
 ) -> Tracked:
-    """The track of a recording from what was seen in all of its frames; corrections: what a human
-    says of flips.
+    """The track of a recording, smoothed over all of its frames at once, and its head-tail flips.
 
-    tuning: None takes the animal's own. room: where the track is to lie; of everything else no more
-    than a block of frames is in memory.
+    See the module for the steps. Besides the columns of the track, no more than a block of frames
+    is in memory.
+
+    Args:
+        subject: whom the track is of.
+        seen: hypotheses (n, H) of all frames, arena frame.
+        corrections: spans in which a person says that head and tail are exchanged; those with
+            `undone_at` are not applied.
+        tuning: motion and association parameters; None takes the animal's own.
+        room: allocator of the track's columns, `np.empty` or one on disk.
+
+    Returns:
+        The track (n rows) and the flips, those found and those of `corrections`, in order of time.
     """
     tuning = tuning or Tuning.of(subject.skeleton.name)
     chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
@@ -88,6 +116,11 @@ def track_whole(
     seconds = seen.seconds
 
     def draw(rows: slice) -> None:
+        """Smooth the frames `rows` with a margin on either side, and write them into the track.
+
+        Args:
+            rows: consecutive frames, one block.
+        """
         first = max(0, rows.start - MARGIN)
         last = min(len(seen), rows.stop + MARGIN)
         around = slice(first, last)
@@ -135,9 +168,10 @@ def _rest(track: Track, seen: Observations) -> None:
 def _turn_round(
     seen: Observations, path: NDArray[np.int64], doubt: Array, corrections: Sequence[Flip]
 ) -> NDArray[np.int64]:
-    """Exchange head and tail in the spans that a human says, of which there is no doubt then: in
-    the path where a frame has that hypothesis. Returns how often (n,) the pose itself is to be
-    turned round elsewhere.
+    """Exchange head and tail in the spans that a person corrected; their flip posterior is 0.
+
+    The path takes the reversed hypothesis where a frame has it. Returns how often (n,) the pose
+    itself is to be turned round elsewhere.
     """
     turned = np.zeros(len(seen), np.int64)
     for span in corrections:
@@ -172,11 +206,11 @@ def _admit(
     track: Track,
     usual_px: float,
 ) -> None:
-    """Put the hypothesis that lies on the curve after all into path (n,) and error (n,) of frames
-    that were passed by.
+    """Gate: put hypotheses that lie on the curve after all into the path of frames passed by.
 
-    It shows about as many pixels as usual; in a gap no one knows where the curve is, nor of half an
-    animal how it lies.
+    Fills path (n,) and error (n,). Such a hypothesis lies within one predicted error, its own and
+    the curve's together, and shows between half and 1.5 times as many pixels as usual: of half an
+    animal nobody knows how it lies, and in a gap nobody knows where the curve is.
     """
     best = np.full(len(seen), _ADMIT)
     passed = (path == NONE) & np.isfinite(track.predicted_error_mm)
@@ -206,10 +240,20 @@ def to_track(
     told: slice = slice(None),
     tuning: Tuning | None = None,
 ) -> Track:
-    """A curve as rows of a track: measured, bridged over a short time, or missing.
+    """The rows of a track that a smoothed curve gives: measured, bridged over a gap, or missing.
 
-    ahead: the curve also goes on for a short time after the last measurement; told: only these
-    rows.
+    Args:
+        subject: whom the track is of.
+        seen: hypotheses (n, H) of the frames that the curve covers.
+        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
+        curve: smoothed poses of the n frames, arena frame.
+        doubt: (n,) probability that head and tail are exchanged.
+        ahead: the curve also goes on for up to `bridge_s` after the last measurement (prediction).
+        told: only these rows are returned; gaps are judged by all n.
+        tuning: motion parameters with the calibration factors; None takes the animal's own.
+
+    Returns:
+        A track of the rows `told`; NaN where nothing was measured or bridged.
     """
     tuning = tuning or Tuning.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
@@ -250,9 +294,7 @@ def _settle(
     measured: NDArray[np.bool_],
     bridged: NDArray[np.bool_],
 ) -> None:
-    """Keep of the curve in the rows (n) of a track what was measured or is bridged, and add what
-    was seen.
-    """
+    """Mask rows (n) of a track to those measured or bridged; add projections, flags and sight."""
     there = measured | bridged
     for column in (
         track.joints_mm,
@@ -279,8 +321,17 @@ def _settle(
 
 
 def covariance_of_root(curve: Curve) -> Array:
-    """Covariance (n, 6, 6) of the root's turn, rad, and shift, mm, about and along its own axes:
-    what the joints' middle may be off, and what a turn about the middle moves the root.
+    """Covariance (n, 6, 6) of the root: rotation, rad, then translation, mm, in its own frame.
+
+    First-order propagation: the joints' middle is off by `cov_middle_mm2`, and a small turn φ about
+    that middle moves the root by φ x l, with l the lever from the middle to the root; hence the
+    blocks Σ_φ, -[l] Σ_φ and R^T Σ_m R + [l] Σ_φ [l]^T, with [l] the skew matrix.
+
+    Args:
+        curve: smoothed poses of n frames with the spread of the middle and of the turn.
+
+    Returns:
+        (n, 6, 6) symmetric, rad^2, rad mm and mm^2.
     """
     root = curve.pose.root
     out = np.zeros((len(curve.joints), 6, 6))
@@ -296,8 +347,14 @@ def covariance_of_root(curve: Curve) -> Array:
 
 
 def stretch_of(stretch_sd: float, joints: Array) -> Array:
-    """Standard deviations (n, J) mm along one axis of joints (n, J, 3) mm whose distances from the
-    base are all off by about this share.
+    """Standard deviations (n, J) mm of joints whose distances from the base are all off.
+
+    Args:
+        stretch_sd: share by which the distances are off, as a standard deviation.
+        joints: (n, J, 3) mm, the base first.
+
+    Returns:
+        (n, J) mm along one axis: stretch_sd times the distance from the base over sqrt(3).
     """
     return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
 
@@ -320,7 +377,18 @@ def _add_sight(
 
 
 def single_frames(subject: Subject, seen: Observations) -> Track:
-    """What each frame says by itself, without its neighbours."""
+    """The track of each frame by itself, without its neighbours: its first hypothesis.
+
+    No association, no smoothing and no bridging; p_flip is 0 throughout. The spread is that of one
+    measurement.
+
+    Args:
+        subject: whom the track is of; its `bridge_s` is not used.
+        seen: hypotheses (n, H), arena frame.
+
+    Returns:
+        A track of n rows, NaN where a frame has no first hypothesis.
+    """
     path = np.where(seen.known[:, 0], 0, NONE)
     pose = seen.pose(path)
     error = seen.along(seen.error_mm, path)
@@ -336,9 +404,19 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
 def short_gaps(
     seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
 ) -> NDArray[np.bool_]:
-    """(n,) True in frames between two measured ones of which the nearer is no farther than half of
-    bridge_s, so that a gap no longer than bridge_s is bridged whole; ahead: and so long after the
-    last one.
+    """Mask (n,) of the unmeasured frames that are bridged.
+
+    A frame between two measured ones is bridged where the nearer of them is no farther than half of
+    bridge_s, so a gap no longer than bridge_s is bridged whole.
+
+    Args:
+        seconds: (n,) s, increasing.
+        measured: (n,) True where the pose was measured.
+        bridge_s: the longest gap that is bridged whole, s.
+        ahead: also bridge the frames within bridge_s after the last measured one.
+
+    Returns:
+        (n,) bool, False at measured frames.
     """
     rows = np.flatnonzero(measured)
     if not len(rows):
@@ -372,6 +450,13 @@ def _flips(seen: Observations, track: Track) -> list[Flip]:
 
 
 def spans(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The stretches of True in (n,), as (start, stop), stop exclusive."""
+    """The runs of True in a mask, as (start, stop) with stop exclusive.
+
+    Args:
+        where: (n,) bool.
+
+    Returns:
+        One pair of indices for each run, in order.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

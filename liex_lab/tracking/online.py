@@ -1,5 +1,9 @@
-"""Tracking while the recording goes on: the same chain and the same smoother over the last seconds,
-at a fixed lag.
+"""Fixed-lag smoothing while the recording goes on: the methods of `offline` over a sliding window.
+
+A window of 48 frames is associated by Viterbi, with decisions already given out kept, and smoothed
+by the Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process
+from 20 frames before the first row due. Each frame's row is given `lag` frames later; lag 0 is
+filtering.
 """
 
 from __future__ import annotations
@@ -21,10 +25,15 @@ _BEFORE = 20
 
 
 class OnlineTracker:
-    """Takes what frames say as they come; gives a row for every one, `lag` frames later.
+    """Takes the observations of frames as they come; gives a row for every one, `lag` frames later.
 
-    Which hypothesis a frame of the past was stays as it was told; what is told can only get better
-    with a longer lag. With lag 0 a row is told at once, from the past alone.
+    Which hypothesis a frame of the past was stays as it was given out; estimates can only get
+    better with a longer lag. With lag 0 a row is given at once, from the past alone.
+
+    Args:
+        subject: whom the track is of.
+        lag: frames by which a row is held back.
+        tuning: motion and association parameters; None takes the animal's own.
     """
 
     def __init__(self, subject: Subject, lag: int = 0, tuning: Tuning | None = None) -> None:
@@ -36,13 +45,17 @@ class OnlineTracker:
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)
-        self._joints: NDArray[np.float32] | None = (
-            None  # of the window's hypotheses, those that the chain goes by
-        )
+        # of the window's hypotheses, those that the chain goes by
+        self._joints: NDArray[np.float32] | None = None
 
     def add(self, seen: Observations) -> Track | None:
-        """The rows that can be told once the next frames are known, None where there are
-        none yet.
+        """The rows that have become due with these frames.
+
+        Args:
+            seen: hypotheses (n, H) of the next n frames, arena frame.
+
+        Returns:
+            As many rows as are due, in order; None where there are none yet.
         """
         rows = []
         for k in range(len(seen)):
@@ -52,7 +65,7 @@ class OnlineTracker:
         return Track.join(rows) if rows else None
 
     def close(self) -> Track | None:
-        """The rows that were held back."""
+        """The rows that were held back, at the end of the recording; None where there are none."""
         left = len(self._path) - self._told
         return self._tell(left) if left else None
 
@@ -68,7 +81,7 @@ class OnlineTracker:
         self._path = np.append(self._path[gone:], NONE)
 
     def _tell(self, n: int) -> Track:
-        """The rows of the n frames after those that were told."""
+        """The rows of the n frames after those that were given out."""
         assert self._seen is not None
         seen = self._seen
         told = self._told

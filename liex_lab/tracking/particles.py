@@ -1,8 +1,15 @@
-"""Algorithm 3 of Lie-X to the letter: a particle filter whose base joints wander and whose other
-joints are regressed.
+"""Particle filter with Brownian motion on SE(3): Algorithm 3 of Lie-X (section 4.2) to the letter.
 
-What the paper leaves open is stated in `Wander` and in `ParticleFilter`. It keeps its row in the
-tables; the default tracker is `curve`.
+1. Select: draw K particles from the cumulative weights.
+2. Propagate: the base joint by a left-invariant Brownian step, g exp(sqrt(δ) ξ) with ξ ~ N(0, C)
+   (Eq. 6 and 7); every other joint by the cascade's regressors from its parent (Eq. 10).
+3. Measure: m is the learned metric's score; w = exp(-m^2 / 2 σ^2) (Eq. 12), normalised to sum 1
+   (Eq. 13).
+4. Estimate: the weighted average of tangent vectors (Eq. 14), taken about itself: the intrinsic
+   mean on the group.
+
+What the paper leaves open is stated in `Wander` and in `ParticleFilter`. The filter keeps its row
+in the tables of the evaluation; the default tracker is `curve` (`offline`).
 """
 
 from __future__ import annotations
@@ -15,7 +22,8 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.foreground.height_maps import Foreground, view_of
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.foreground.height_maps import Foreground
 from liex_lab.forests.forest import predict
 from liex_lab.geometry import SE3, brownian_path, brownian_steps, so3
 from liex_lab.recordings.frame import DepthFrame
@@ -27,11 +35,16 @@ _AVERAGING_PASSES = 10
 
 @dataclass(frozen=True)
 class Wander:
-    """What the paper leaves open: how far base joints wander, and how the metric weighs; lengths of
-    an animal of the reference length.
+    """What the paper leaves open: how far base joints wander, and how the metric's scores weigh.
 
-    turn_rad and shift_mm: standard deviations of a Brownian step of delta_s, Eq. 6; sigma_mm of Eq.
-    12.
+    Lengths are those of an animal of the reference length.
+
+    Attributes:
+        n_particles: number of particles K.
+        turn_rad: standard deviation of the rotation of a Brownian step about each axis, rad, Eq. 6.
+        shift_mm: standard deviation of its translation along each axis, mm.
+        delta_s: time δ of a Brownian step, s.
+        sigma_mm: σ of Eq. 12, mm.
     """
 
     n_particles: int = 200
@@ -42,8 +55,15 @@ class Wander:
 
     @staticmethod
     def of(name: str) -> Wander:
-        """That of an animal: a fish goes and turns three times as far, by its length, between two
-        frames of a mouse.
+        """The parameters of an animal.
+
+        A fish goes and turns three times as far, by its length, between two frames as a mouse.
+
+        Args:
+            name: name of the skeleton; 'fish' has its own, all others the default.
+
+        Returns:
+            The parameters.
         """
         return Wander(turn_rad=0.45, shift_mm=12.0) if name == "fish" else Wander()
 
@@ -58,12 +78,19 @@ class _Particles:
 
 
 class ParticleFilter:
-    """One animal, frame by frame. The first frame in which it is found gives all particles their
-    place.
+    """Tracks one animal frame by frame; the first frame in which it is found places all particles.
 
     Selection, propagation of the base by Eq. 7 and of the other joints by Eq. 10, measurement by
     the learned metric with Eq. 12 and 13, and Eq. 14, where the average of tangent vectors is taken
-    about itself, that is on the group. In a frame without a foreground particles wander on.
+    about itself, that is on the group. Each particle keeps the bones' scale of the first frame. In
+    a frame without a foreground particles wander on.
+
+    Args:
+        estimator: the pose estimator whose regressors and metric are used.
+        scene: the segmenter of the recording's camera.
+        size: the animal's spine over the skeleton's home length.
+        rng: source of the Brownian steps and of the selection.
+        how: parameters; None takes the animal's own.
     """
 
     def __init__(
@@ -83,8 +110,14 @@ class ParticleFilter:
         self._last_ns = 0
 
     def step(self, frame: DepthFrame) -> tuple[Pose, float] | None:
-        """The pose () of the next frame in the camera frame and its expected error, mm; None before
-        the animal is found, and where no particle can be measured.
+        """One time step of Algorithm 3; the first frame with an animal initialises the particles.
+
+        Args:
+            frame: the next frame of the recording.
+
+        Returns:
+            The pose () in the camera frame and its expected mean joint error, mm; None before the
+            animal is found, and where no particle can be measured.
         """
         method = self._estimator.model.method
         depths = frame.depth[None]
@@ -98,10 +131,10 @@ class ParticleFilter:
         crops = self._scene.extract(depths, self._size, camera_view=method.camera_view)
         if not crops.found[0]:
             return None
-        looks = self._scene.looks(crops, method.camera_view)
-        view = view_of(looks)
+        crop_cameras = self._scene.crop_cameras(crops, method.camera_view)
+        view = view_of(crop_cameras)
         T_view_camera = SE3(view.rotation[0], view.translation[0])
-        images = ImageSet(crops.heights, looks, crops.moments)
+        images = ImageSet(crops.heights, crop_cameras, crops.moments)
         rotations, positions, score = self._measure(images, T_view_camera @ self._particles.base)
         w = np.exp(-(score**2 - (score**2).min()) / (2.0 * (self._how.sigma_mm * self._unit) ** 2))
         self._particles.weight = w / w.sum()
@@ -127,7 +160,7 @@ class ParticleFilter:
         ), float(found.chosen.error_mm[0])
 
     def _select(self) -> None:
-        """Draw particles from the cumulative weights; all weigh the same afterwards."""
+        """Selection: draw particles from the cumulative weights; all weigh the same afterwards."""
         assert self._particles is not None
         p = self._particles
         k = self._how.n_particles
@@ -140,7 +173,7 @@ class ParticleFilter:
         )
 
     def _propagate(self, dt: float) -> None:
-        """Move every base joint along a Brownian path of dt seconds."""
+        """Propagation: move every base joint along a Brownian path of dt seconds (Eq. 7)."""
         assert self._particles is not None
         how = self._how
         p = self._particles
@@ -155,8 +188,9 @@ class ParticleFilter:
             p.base.translation[i] = end.translation[0]
 
     def _measure(self, images: ImageSet, base: SE3) -> tuple[Array, Array, Array]:
-        """All joints of the particles, regressed from their bases, in the view frame, and the
-        metric's scores (K,).
+        """All joints of the particles, regressed from their bases, and the metric's scores (K,).
+
+        Rotations (K, J, 3, 3) and positions (K, J, 3) mm are in the view frame.
         """
         assert self._particles is not None
         cascade = self._estimator.model.cascade
@@ -185,9 +219,7 @@ class ParticleFilter:
         )
 
     def _average(self, rotations: Array, positions: Array) -> Pose:
-        """Eq. 14 about the average itself, for the base on SE(3) and for each other joint on its
-        axes.
-        """
+        """Eq. 14 about the average itself: the base on SE(3), other joints on their axes."""
         assert self._particles is not None
         weight = self._particles.weight
         skeleton = self._estimator.skeleton

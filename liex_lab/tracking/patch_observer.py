@@ -1,4 +1,8 @@
-"""What windows of depth around an animal say, as whole pictures do: for rendered motion in bulk."""
+"""Pose hypotheses of patches of depth around animals, like `FrameTracker.observe` of frames.
+
+For rendered motion in bulk: training of the tracker and its development sequences. Only one
+component, hence two hypotheses of each frame, head and tail either way round.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.height_maps import Crops, Windows
+from liex_lab.foreground.height_maps import HeightMaps, Patches
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.tracking.observations import Observations
@@ -23,14 +27,27 @@ _SURE = 0.5  # of the frames measure the size: those of which the model is sures
 
 
 @dataclass(frozen=True)
-class WindowTracker:
-    """Measures windows one by one."""
+class PatchObserver:
+    """Measures patches of depth one by one.
+
+    Attributes:
+        estimator: the pose estimator.
+    """
 
     estimator: PoseEstimator
 
-    def find_size(self, windows: Windows) -> float:
-        """The animal's length over the home length, measured in some windows as over a recording's
-        sample.
+    def find_size(self, windows: Patches) -> float:
+        """The animal's spine over the home length, measured in some patches.
+
+        As over a recording's sample, a fixed-point iteration: the median of the sizes that the
+        surest half of the frames estimate becomes the size of the next of four passes. The
+        estimator's final correction is left out, as it pulls sizes to the usual.
+
+        Args:
+            windows: patches of one animal.
+
+        Returns:
+            The size; 1 where the model knows no session size or no patch shows an animal.
         """
         model = self.estimator.model
         size = 1.0
@@ -47,9 +64,18 @@ class WindowTracker:
         return size
 
     def observe(
-        self, parts: Iterable[Windows], times_ns: NDArray[np.int64], size: float
+        self, parts: Iterable[Patches], times_ns: NDArray[np.int64], size: float
     ) -> Observations:
-        """What the frames at these times (n,) say, each by itself, in the arena frame."""
+        """The pose hypotheses of frames, each by itself, in the arena frame.
+
+        Args:
+            parts: patches of consecutive frames, batch by batch; each batch on one floor.
+            times_ns: (n,) time stamps of all of them.
+            size: the animal's spine over the home length.
+
+        Returns:
+            Observations of n frames, with hypotheses 0 and 1; centroids and residuals are NaN.
+        """
         seen = Observations.empty(self.estimator.skeleton, times_ns)
         start = 0
         for windows in parts:
@@ -68,7 +94,16 @@ class WindowTracker:
         return seen
 
     def subject(self, camera: Camera, T_arena_camera: SE3, size: float) -> Subject:
-        """Whom a track out of such windows is of, before which camera."""
+        """Whom a track from such patches is of.
+
+        Args:
+            camera: the camera that the track is projected into.
+            T_arena_camera: its pose in the arena frame, mm.
+            size: the animal's spine over the home length.
+
+        Returns:
+            The subject, with the model's flagging limit at that size and the default `BRIDGE_S`.
+        """
         skeleton = self.estimator.skeleton
         calibration = self.estimator.model.calibration
         share = calibration.joint_share or (1.0,) * skeleton.n_joints
@@ -77,8 +112,8 @@ class WindowTracker:
             skeleton, camera, T_arena_camera, size * skeleton.length, doubtful_mm, BRIDGE_S, share
         )
 
-    def _cut(self, windows: Windows, size: float) -> tuple[Crops, Array]:
-        """The height map of every window and how it was cut."""
+    def _cut(self, windows: Patches, size: float) -> tuple[HeightMaps, Array]:
+        """The height map of every patch and its crop camera."""
         model = self.estimator.model
         n = len(windows.depth)
         used = size if model.method.session_size else 1.0

@@ -1,5 +1,13 @@
-"""The curve itself: poses between and beside the measured ones, by a smoother on the manifold, with
-their spread.
+"""Robust smoothing of poses on SE(3) x R^d: Kalman filter and RTS smoother with Student-t weights.
+
+Every coordinate (the joints' middle, mm; the base's rotation on SO(3); joint angles; log scale) is
+an integrated Ornstein-Uhlenbeck process: dx = v dt, dv = -v / τ dt + sqrt(q) dW (Johnson et al.
+2008). Measurement errors follow a t distribution of ν degrees of freedom, fitted by iteratively
+reweighted smoothing: w = (ν + 1) / (ν + δ^2) with δ the distance from the curve over the predicted
+error, and a gate beyond which a measurement does not count. Of the error's variance the share c^2
+is correlated over neighbouring frames: no smoother takes it away, so it is left out of the filter
+and added to the posterior. Calibration factors then scale the posterior spread to the errors
+observed on rendered sequences. The kernels are in `_smoother_kernels` and `_kalman_kernels`.
 """
 
 from __future__ import annotations
@@ -20,11 +28,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Wandering:
-    """How one coordinate moves and how frames err in it.
+    """Integrated Ornstein-Uhlenbeck parameters of one coordinate, and how single frames err in it.
 
-    error: standard deviation times the animal's length over the predicted mean joint error; drive:
-    density of the noise that drives the velocity, rad^2/s^3; fade: seconds within which a velocity
-    dies away by itself.
+    Attributes:
+        error: standard deviation of a measurement (rad, or of the log scale) times the animal's
+            length over the predicted mean joint error.
+        drive: process variance q, the density of the white noise that drives the velocity,
+            rad^2/s^3 (1/s^3 of the log scale).
+        fade: decay time τ, s, within which a velocity dies away by itself.
     """
 
     error: float
@@ -34,22 +45,31 @@ class Wandering:
 
 @dataclass(frozen=True)
 class Motion:
-    """How an animal moves and how single frames err; errors are over the predicted mean joint
-    error.
+    """How an animal moves and how frames err; errors are over the predicted mean joint error.
 
-    place_error: of the joints' middle, along the animal, to its side, and up; place_drive
-    (lengths^2/s^3): in the level and up; place_fade s. turn: of the base's rotation, about its own
-    x, y and z axis; bend: of the other joints' angles about theirs; size: of the logarithm of the
-    bones' scale. freedom of the t distribution of errors; reject: off by more than this many
-    predicted errors is not measured at all; lasting: the share of an error that neighbouring frames
-    have in common and no smoother takes away; honest: what is left of an error over what the filter
-    says is left, at some of the latter over the animal's length (pairs, in rising order; between
-    them by the logarithm), beside what a wrong size does: stretch is what the share by which
-    distances from the base may be off (see `Subject`) grows with, how far the body lies from the
-    depth seen, over its length, and the standard deviation of the logarithm of the size that frames
-    tell; usual_stretch: that share of a session of which neither is known. honest_root,
-    honest_bend: the same of the base's rotation and place about and along its own axes, and of the
-    other joints' angles about theirs, over what that leaves.
+    Attributes:
+        place_error: standard deviation of the joints' middle along the animal, to its side, and up.
+        place_drive: process variance of the middle in the level and up, lengths^2/s^3.
+        place_fade: decay time of the middle's velocity, s.
+        turn: the base's rotation about its own x, y and z axis.
+        bend: the other joints' angles about their own x, y and z axis.
+        size: the logarithm of the bones' scale.
+        freedom: degrees of freedom of the t distribution of errors.
+        reject: gate, in predicted errors: a measurement farther off the curve is no measurement at
+            all.
+        lasting: correlated share, the share of an error that neighbouring frames have in common and
+            no smoother takes away.
+        honest: calibration factors of the error, pairs (error over length, factor) in rising order,
+            interpolated in the logarithm of the former: the error that is observed over the
+            posterior's, beside what a wrong size does.
+        stretch: what the share by which distances from the base may be off (see `Subject`) grows
+            with: how far the body lies from the depth seen, over its length, and the standard
+            deviation of the logarithm of the size that single frames estimate.
+        usual_stretch: that share in a session of which neither is known.
+        honest_root: calibration factors of the root's rotation about (3) and position along (3) its
+            own axes, over what that leaves.
+        honest_bend: calibration factors of the other joints' angles about their x, y and z axis,
+            likewise.
     """
 
     place_error: tuple[float, float, float]
@@ -69,9 +89,10 @@ class Motion:
 
     @property
     def packed(self) -> kernels.Moves:
-        """For the kernels."""
+        """The parameters as arrays for the numba kernels, level process variance twice, then up."""
 
         def rows(*moves: Wandering) -> Array:
+            """One row (error, drive, fade) for each of the moves given, (k, 3)."""
             return np.array([[m.error, m.drive, m.fade] for m in moves])
 
         level, up = self.place_drive
@@ -90,12 +111,16 @@ class Motion:
 
 @dataclass(frozen=True)
 class Curve:
-    """A smoothed curve of n frames.
+    """A smoothed curve of n frames, arena frame, with its posterior spread.
 
-    pose (n), arena frame; joints (n, J, 3) mm; error_mm (n,): expected mean joint error;
-    cov_middle_mm2 (n, 3, 3): of the joints' middle along the arena's axes; sd_turn (n, 3) of the
-    base's rotation about its own axes and sd_bend (n, 3) of the other joints' about theirs, rad;
-    used (n,): frames whose measurement it goes by.
+    Attributes:
+        pose: (n) smoothed poses.
+        joints: (n, J, 3) mm.
+        error_mm: (n,) expected mean joint error, mm.
+        cov_middle_mm2: (n, 3, 3) covariance of the joints' middle along the arena's axes, mm^2.
+        sd_turn: (n, 3) standard deviation of the base's rotation about its own axes, rad.
+        sd_bend: (n, 3) standard deviation of the other joints' angles about theirs, rad.
+        used: (n,) frames whose measurement the curve goes by.
     """
 
     pose: Pose
@@ -112,7 +137,15 @@ class Curve:
 
     @staticmethod
     def unknown(n: int, n_joints: int) -> Curve:
-        """A curve of frames in which nothing was measured."""
+        """A curve of frames in which nothing was measured: all NaN, none used.
+
+        Args:
+            n: number of frames.
+            n_joints: number of joints J.
+
+        Returns:
+            A curve of n rows.
+        """
         nan = np.full((n, n_joints, 3, 3), np.nan)
         axes = nan[:, 0, 0]
         none = nan[:, 0, 0, 0]
@@ -131,12 +164,22 @@ def smooth(
     length_mm: float,
     motion: Motion,
 ) -> Curve:
-    """The curve through measured poses (n), NaN where none is, with predicted errors error_mm (n,)
-    at times (n,) s.
+    """The smoothed curve through measured poses, with its spread.
 
     Errors have heavy tails: measurements far off the curve weigh less (iterated weights of a t
     distribution) and those very far off nothing. Before the first measurement the curve stands
     still.
+
+    Args:
+        skeleton: kinematic tree of the animal.
+        seconds: (n,) s, increasing.
+        pose: (n) measured poses, arena frame, NaN where none is.
+        error_mm: (n,) predicted mean joint error of each, mm; NaN also counts as not measured.
+        length_mm: spine length of the animal, mm.
+        motion: motion and error parameters of the animal.
+
+    Returns:
+        A curve of n frames; all NaN where nothing was measured.
     """
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     n = len(seconds)
@@ -158,7 +201,15 @@ def smooth(
 
 
 def body_of(skeleton: Skeleton, length_mm: float) -> kernels.Body:
-    """A skeleton for the kernels."""
+    """A skeleton as arrays for the numba kernels.
+
+    Args:
+        skeleton: kinematic tree of the animal.
+        length_mm: spine length of the animal, mm.
+
+    Returns:
+        The arrays, with the (m, 2) joint and axis of each free angle beyond the base.
+    """
     free = np.argwhere(skeleton.axes)
     return kernels.Body(
         skeleton.parents,
@@ -180,9 +231,7 @@ def _curve(
     spread: kernels.Spread,
     used: NDArray[np.bool_],
 ) -> Curve:
-    """What the kernels made, and how far off it may be: what the filter leaves, and what lasts over
-    many frames.
-    """
+    """The kernels' output as a `Curve`: posterior and correlated share, calibrated."""
     lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
     middle = np.trace(spread.middle, axis1=1, axis2=2)
     place = np.array(motion.place_error)

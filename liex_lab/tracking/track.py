@@ -1,4 +1,9 @@
-"""A track: the curve of one animal's poses over a recording, one row for every frame."""
+"""The track of one animal: poses over a recording with their uncertainty, one row for every frame.
+
+Columns as arrays (n, ...): T_arena_root in SE(3) with its covariance (6, 6), joint angles, joint
+positions, bone scale, predicted error, flip posterior and flags. The tables `frames`, `poses` and
+`rotations` are written from it (`liex_lab.tables.rows`).
+"""
 
 from __future__ import annotations
 
@@ -31,16 +36,29 @@ FLAGS = {
 class Track:
     """Poses over time: one row for EVERY frame of the recording, NaN where there is none.
 
-    times_ns (n,) int64; joints_mm (n, J, 3) arena frame; uv_px (n, J, 2) pixels of the depth image;
-    sd_mm (n, J); root_rotation (n, 3, 3) and root_mm (n, 3): T_arena_root; cov_root (n, 6, 6):
-    covariance of the root's turn, rad, and shift, mm, about and along its own axes; angles_rad (n,
-    J, 3) rotation vectors relative to the parent joint; sd_angles_rad (n, J, 3); scale (n,) of the
-    skeleton's bones; predicted_error_mm (n,) mean joint error expected by the learned metric;
-    residual_mm (n,) median distance between the rendered body and the observed depth;
-    n_foreground_px (n,); centroid_mm (n, 3) centre of the animal as seen from above and its mean
-    height, arena frame; centroid_px (n, 2); p_flip (n,): probability that head and tail are
-    exchanged; bridged (n,): nothing was measured, but shortly before and after, and the pose is
-    what lies between; flag (n,) a word of `FLAGS`.
+    Attributes:
+        skeleton: kinematic tree of the animal.
+        times_ns: (n,) int64.
+        joints_mm: (n, J, 3) arena frame.
+        uv_px: (n, J, 2) pixels of the depth image.
+        sd_mm: (n, J) standard deviation of each joint along one axis, mm.
+        root_rotation: (n, 3, 3) rotation of T_arena_root.
+        root_mm: (n, 3) translation of T_arena_root.
+        cov_root: (n, 6, 6) covariance of the root's turn, rad, and shift, mm, about and along its
+            own axes.
+        angles_rad: (n, J, 3) rotation vectors relative to the parent joint.
+        sd_angles_rad: (n, J, 3) their standard deviations.
+        scale: (n,) of the skeleton's bones.
+        predicted_error_mm: (n,) mean joint error expected by the learned metric and the smoother.
+        residual_mm: (n,) median distance between the rendered body and the observed depth.
+        n_foreground_px: (n,) int64, 0 where nothing was measured.
+        centroid_mm: (n, 3) centre of the animal as seen from above and its mean height, arena
+            frame.
+        centroid_px: (n, 2) the same in the depth image.
+        p_flip: (n,) probability that head and tail are exchanged.
+        bridged: (n,) nothing was measured, but shortly before and after, and the pose is what lies
+            between.
+        flag: (n,) a word of `FLAGS`.
     """
 
     skeleton: Skeleton
@@ -70,19 +88,35 @@ class Track:
         flag: str = "not_found",
         room: Room = np.empty,
     ) -> Track:
-        """A track of these times in which nothing has been measured yet; room: where its columns
-        are to lie.
+        """A track of these times in which nothing has been measured yet.
+
+        Args:
+            skeleton: kinematic tree of the animal.
+            times_ns: (n,) time stamps.
+            flag: word of `FLAGS` for all rows.
+            room: allocator of the columns.
+
+        Returns:
+            n rows, NaN, 0 or False.
         """
         n = len(times_ns)
         j = skeleton.n_joints
 
         def column(value: object, dtype: object, *shape: int) -> NDArray[Any]:
+            """A column (n, *shape) filled with a value.
+
+            Args:
+                value: what fills it.
+                dtype: of the column.
+                *shape: of one row.
+            """
             made = room((n, *shape), dtype)
             made[...] = value
             let_go(made)
             return made
 
         def unknown(*shape: int) -> Array:
+            """A column (n, *shape) of NaN, float64."""
             return column(np.nan, np.float64, *shape)
 
         return Track(
@@ -109,7 +143,14 @@ class Track:
 
     @staticmethod
     def join(parts: list[Track]) -> Track:
-        """One track from consecutive parts of the same recording."""
+        """One track from consecutive parts of the same recording.
+
+        Args:
+            parts: tracks of one skeleton in order of time, at least one.
+
+        Returns:
+            All their rows.
+        """
         columns = (np.concatenate([getattr(part, name) for part in parts]) for name in _columns())
         return Track(parts[0].skeleton, *columns)
 
@@ -118,12 +159,12 @@ class Track:
         return Track(self.skeleton, *(getattr(self, name)[rows] for name in _columns()))
 
     def rest(self) -> None:
-        """Let go of the memory of columns that lie on disk, until they are looked at again."""
+        """Release the memory pages of columns that lie on disk, until they are read again."""
         let_go(*(getattr(self, name) for name in _columns()))
 
     @property
     def n_frames(self) -> int:
-        """Frames of the recording, measured or not."""
+        """Number of frames n of the recording, measured or not."""
         return len(self.times_ns)
 
     @property
@@ -142,17 +183,17 @@ class Track:
 
     @property
     def root(self) -> SE3:
-        """T_arena_root, a batch (n,)."""
+        """T_arena_root, a batch (n), mm."""
         return SE3(self.root_rotation, self.root_mm)
 
     @property
     def sd_root(self) -> Array:
-        """(n, 6) standard deviations of the root's turn, rad, and shift, mm."""
+        """(n, 6) standard deviations of the root's turn, rad, and shift, mm, on its own axes."""
         return np.asarray(np.sqrt(np.diagonal(self.cov_root, axis1=1, axis2=2)))
 
     @property
     def spine_mm(self) -> Array:
-        """(n,) length of the fitted chain, all bones added up, mm."""
+        """(n,) length of the fitted (longest) chain, all its bones added up, mm."""
         return self.scale * self.skeleton.length
 
 
@@ -164,9 +205,14 @@ def _columns() -> list[str]:
 class Flip:
     """Frames start to stop (exclusive) in which head and tail may have been exchanged.
 
-    p_flip: probability that they were, in the single frames' answers where `applied` says that this
-    was undone, else in the track; source: model or human; undone_at: when a human took the
-    correction back, ISO 8601.
+    Attributes:
+        start: first frame.
+        stop: frame after the last.
+        p_flip: probability that they were, in the single frames' answers where `applied` says that
+            this was undone, else in the track.
+        applied: whether the exchange was undone in the track.
+        source: model or human.
+        undone_at: when a person took the correction back, ISO 8601; empty otherwise.
     """
 
     start: int
@@ -179,7 +225,12 @@ class Flip:
 
 @dataclass(frozen=True)
 class Tracked:
-    """A track and what was found out about head and tail on the way."""
+    """A track and what was found out about head and tail on the way.
+
+    Attributes:
+        track: one row for every frame.
+        flips: spans of exchanged or uncertain head and tail, in order of time.
+    """
 
     track: Track
     flips: tuple[Flip, ...]

@@ -1,5 +1,8 @@
-"""Before the curve: the animal's size and girth, and what every frame of a recording says of the
-pose by itself.
+"""Single-frame measurement before smoothing: the animal's size and girth, and hypotheses per frame.
+
+`FrameTracker.prepare` estimates the session's constants from a sample of frames (spine length over
+the home length, girth of the body, usual error of depth); `observe` then gives the pose hypotheses
+of every frame by the estimator of Lie-X Algorithm 1, and `track` smooths them all (`offline`).
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from liex_lab.runtime.memory import Room
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import Tuning
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.occlusion import FreeEnds
+from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import Subject, single_frames, track_whole
 from liex_lab.tracking.residual import BodyResidual
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -30,14 +33,21 @@ BRIDGE_S = 0.5
 
 @dataclass(frozen=True)
 class FrameTracker:
-    """Measures each frame on its own; `track` then makes the curve of them all.
+    """Measures each frame on its own; `track` then makes the smoothed curve of them all.
 
-    size: the animal's spine over the skeleton's home length, a fact of the session. size_origin
-    says where the size comes from: 'plan' or 'recording'. doubtful_mm: frames with a larger
-    predicted error are flagged; bridge_s: so long a stretch without a measurement is bridged. blur:
-    how far the body lies from the depth seen, over its length, and size_spread: standard deviation
-    of the logarithm of the size that frames tell; both of the sampled frames. free_ends: puts an
-    animal that swims where the end of it that is seen says.
+    Attributes:
+        estimator: the pose estimator.
+        scene: the segmenter of the recording's camera.
+        size: the animal's spine over the skeleton's home length, a fact of the session.
+        size_origin: where the size comes from, 'plan' or 'recording'.
+        body: the default body at the recording's girth.
+        doubtful_mm: frames with a larger predicted mean joint error, mm, are flagged.
+        bridge_s: so long a gap without a measurement is bridged, s.
+        blur: how far the body lies from the depth seen, over its length, in the sampled frames.
+        size_spread: standard deviation of the logarithm of the size that the sampled frames
+            estimate.
+        free_ends: occlusion correction, which puts an animal that swims where the end of it that is
+            seen says; None without.
     """
 
     estimator: PoseEstimator
@@ -49,7 +59,7 @@ class FrameTracker:
     bridge_s: float = BRIDGE_S
     blur: float = 0.0
     size_spread: float = 0.0
-    free_ends: FreeEnds | None = None
+    free_ends: OcclusionCorrection | None = None
 
     @staticmethod
     def prepare(
@@ -60,11 +70,22 @@ class FrameTracker:
         doubtful_mm: float | None = None,
         bridge_s: float = BRIDGE_S,
     ) -> FrameTracker:
-        """A tracker for a recording, from a sample (n, H, W) mm of its frames: the animal's size
-        and girth are found.
+        """A tracker for a recording: a sample of its frames gives the animal's size and girth.
 
-        spine_mm: the size where the user knows it. Raises EstimationError where no sampled frame
-        shows an animal.
+        Args:
+            estimator: the pose estimator.
+            scene: the segmenter of the recording's camera.
+            sample: (n, H, W) float32 mm, frames spread over the recording.
+            spine_mm: spine length, mm, where the user knows it; None measures it.
+            doubtful_mm: flagging limit, mm; None takes the model's calibration at the animal's
+                size.
+            bridge_s: the longest gap that is bridged whole, s.
+
+        Returns:
+            The tracker.
+
+        Raises:
+            EstimationError: no sampled frame shows an animal.
         """
         home = estimator.skeleton.length
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
@@ -89,7 +110,7 @@ class FrameTracker:
         if (
             camera_view and estimator.skeleton.is_chain
         ):  # one that stands on the floor is seen from above: it may rear
-            ends = FreeEnds.fit(
+            ends = OcclusionCorrection.fit(
                 estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], sample[used]
             )
         origin = "plan" if spine_mm else "recording"
@@ -99,12 +120,12 @@ class FrameTracker:
 
     @property
     def spine_mm(self) -> float:
-        """The animal's spine, mm."""
+        """The animal's spine length, mm."""
         return self.size * self.estimator.skeleton.length
 
     @cached_property
     def subject(self) -> Subject:
-        """Whom the track is of."""
+        """Whom the track is of, with the limits and shares of this recording."""
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
         return Subject(
@@ -120,12 +141,19 @@ class FrameTracker:
 
     @property
     def stretch_sd(self) -> float:
-        """See `Subject`."""
+        """Standard deviation of the share by which lengths may be off, see `Subject`."""
         per_blur, per_spread = Tuning.of(self.estimator.skeleton.name).motion.stretch
         return float(np.hypot(per_blur * self.blur, per_spread * self.size_spread))
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
-        """What consecutive frames say, each by itself."""
+        """The pose hypotheses of consecutive frames, each by itself.
+
+        Args:
+            frames: at least one.
+
+        Returns:
+            Observations of n frames, arena frame.
+        """
         depths = np.stack([frame.depth for frame in frames])
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
@@ -138,23 +166,46 @@ class FrameTracker:
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:
-        """The track of consecutive frames, each by itself."""
+        """The track of consecutive frames, each by itself, without smoothing.
+
+        Args:
+            frames: at least one.
+
+        Returns:
+            A track of n rows.
+        """
         return self.follow_again(self.observe(frames))
 
     def follow_again(self, seen: Observations) -> Track:
-        """The same from what was seen of them."""
+        """The same as `follow`, from the frames' observations.
+
+        Args:
+            seen: what `observe` gave.
+
+        Returns:
+            A track of n rows.
+        """
         return single_frames(self.subject, seen)
 
     def track(
         self, seen: Observations, corrections: Sequence[Flip] = (), room: Room = np.empty
     ) -> Tracked:
-        """The track of a whole recording; room: where it is to lie."""
+        """The smoothed track of a whole recording, see `offline.track_whole`.
+
+        Args:
+            seen: what `observe` gave of all frames.
+            corrections: spans in which a person says that head and tail are exchanged.
+            room: allocator of the track's columns.
+
+        Returns:
+            The track and its head-tail flips.
+        """
         return track_whole(self.subject, seen, corrections, room=room)
 
     def _put(
         self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
     ) -> None:
-        """What the estimator says as hypothesis h, and what is seen of the thing that it is of."""
+        """Put estimates in as hypothesis h, with their component's pixels and centroid."""
         found = np.flatnonzero(estimates.found)
         chosen = estimates.chosen
         crops = estimates.crops

@@ -1,1 +1,1 @@
-"""The jobs of `liex evaluate`: one benchmark a module."""
+"""Jobs of `liex evaluate`: one benchmark a module, each with its protocol and numbers."""

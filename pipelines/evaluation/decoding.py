@@ -1,5 +1,10 @@
-"""The job behind `liex evaluate speed --recordings`: how fast each format decodes, and in how much
-memory.
+"""Benchmark of recording formats: decoding speed, opening time, peak memory.
+
+`liex evaluate speed --recordings` writes a rendered mouse (640 x 480, PrimeSense noise) as MCAP
+with zstd, MCAP with PNG, a folder of PNG pictures, MoSeq's .dat and 16-bit .oni, and reads each in
+a process of its own on one thread. Numbers: frames/s (every frame to float32 mm in order, best of
+`n_repeats`), ms a frame to open, peak memory of the process, MB, and the peak extrapolated to an
+hour from 64 x 48 pictures, since what grows with length does not depend on their size.
 """
 
 from __future__ import annotations
@@ -36,7 +41,7 @@ _ONE_CORE = (
     "OPENBLAS_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
-_READ = "from liex_lab.pipelines.evaluate_recordings import read_aloud; read_aloud()"
+_READ = "from liex_lab.pipelines.evaluation.decoding import read_aloud; read_aloud()"
 _PROTOCOL = (
     "rendered pictures of a mouse with a PrimeSense camera's noise ({width} x {height}, {n} "
     "frames), written by liex_lab and read in a process of its own on one thread; frames a "
@@ -61,6 +66,7 @@ class _MoseqWriter(RecordingWriter):
         self._stamps = (path / "depth_ts.txt").open("w", encoding="utf-8")
 
     def add(self, frame: DepthFrame) -> None:
+        """Append a frame: depth as little-endian uint16 mm, its time in ms."""
         self._depth.write(frame.depth.astype("<u2").tobytes())
         self._stamps.write(f"{frame.time_ns / 1e6:.6f} 0\n")
 
@@ -68,13 +74,13 @@ class _MoseqWriter(RecordingWriter):
         """Nothing belongs at the end."""
 
     def release(self) -> None:
+        """Close both files."""
         self._depth.close()
         self._stamps.close()
 
 
 # what is measured: the name of a format, what writes it, and how many frames of it may be an hour.
-# Ten minutes of
-# pictures in a folder are 18,000 files, and the other fifty would be like them.
+# Ten minutes of pictures in a folder are 18,000 files, and the other fifty would be like them.
 _FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] = {
     "mcap_zstd_raw": ("r.mcap", McapDepthWriter, 1),
     "mcap_zstd_png": (
@@ -95,8 +101,21 @@ def evaluate_recordings(
     n_repeats: int = _N_REPEATS,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Frames per second on one core and peak memory of every format that is written; see the
-    protocol in it.
+    """Decoding speed and peak memory of every format that is written; see the protocol in it.
+
+    Args:
+        n_frames: frames of each full-sized recording.
+        n_hour: frames of an hour's recording, 30 frames/s; of a folder of pictures a sixth is
+            written.
+        n_repeats: how often each recording is read, the best counts.
+        progress: told format by format.
+
+    Returns:
+        By format: `frames_per_s_1core`, `open_ms_per_frame`, `peak_mb`, `peak_mb_of_an_hour`;
+        machine and protocol.
+
+    Raises:
+        LiexError: the process that reads a recording failed.
     """
     camera, pictures = _rendered(progress)
     small = (
@@ -174,9 +193,7 @@ def _repeated(pictures: NDArray[np.float32], n_frames: int) -> Iterator[DepthFra
 
 
 def read_aloud() -> None:
-    """What the process of its own does: read the recording named on its command line, and print the
-    numbers.
-    """
+    """Read the recording named on the command line, and print the numbers as JSON."""
     from liex_lab.recordings import open_recording
     from liex_lab.runtime.memory import peak_memory_mb
 

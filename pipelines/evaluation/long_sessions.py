@@ -1,4 +1,9 @@
-"""Recordings of any length made of a short one, to find out what grows with length."""
+"""Sessions of any length made of a short rendered recording, to measure what grows with length.
+
+Frames go to and fro at times that run on. What is seen in a frame is what was seen in the short
+recording's frame, so hours are written, tracked and measured as in `liex run` without rendering and
+segmenting them. Numbers: peak memory, MB, and seconds.
+"""
 
 from __future__ import annotations
 
@@ -19,24 +24,26 @@ from ..session import conclude
 if TYPE_CHECKING:
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Provenance, SessionWriter
+    from liex_lab.sessions import Provenance
     from liex_lab.sessions.writer import ReportMaker
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.offline import Subject
 
 FPS = 30
 _SHORT = "synthetic:walk?seed=5&frames=300&sensor=primesense-qvga"
-_COARSER = (
-    8  # the pictures that are written: they go straight to disk, so their size does not matter here
-)
+# the pictures that are written: they go straight to disk, so their size does not matter here
+_COARSER = 8
 _CHUNK = 256  # frames
 
-Stage = Callable[[str], None]
+ReportStage = Callable[[str], None]
 
 
 def looped(short: Recording, n_frames: int) -> Recording:
-    """A recording of any length: the frames of a short one, held in memory, to and fro, at times
-    that run on.
+    """A recording of any length: a short one's frames, held in memory, to and fro at 30 frames/s.
+
+    Args:
+        short: the short recording.
+        n_frames: length of the long one.
     """
     from liex_lab.recordings.recording import Recording
 
@@ -57,15 +64,24 @@ def write_long(
     minutes: float,
     out: str | Path,
     report: ReportMaker | None = None,
-    told: Stage = lambda what: None,
+    told: ReportStage = lambda what: None,
 ) -> dict[str, Any]:
-    """A session of so many minutes from the frames of a short recording, over and over; returns its
-    cost.
+    """Write a session of so many minutes and return its cost.
 
-    Every frame is written, tracked and measured as in `liex run`; what is seen in it is what was
-    seen in the short recording's frame, for looking at it again would say the same. report: see
-    `SessionWriter`; told: where the job is.
+    Every frame is written, tracked and measured as in `liex run`; only its observations are those
+    of the short recording's frame, as measuring it again would say the same. Pictures are every 8th
+    pixel.
+
+    Args:
+        minutes: length of the session.
+        out: folder in which `long.liex` is written.
+        report: makes the report, see `SessionWriter`.
+        told: is told where the job is: `began`, `written`, `tracked`, `closed`.
+
+    Returns:
+        `peak_memory_mb` of the process and `seconds`.
     """
+    from liex_lab.sessions import SessionWriter
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.offline import track_whole
 
@@ -92,7 +108,7 @@ def write_long(
 
 @dataclass(frozen=True)
 class _Short:
-    """A short recording: coarser pictures of its frames, what was seen in them, and whom."""
+    """A short recording: coarser pictures of its frames, what was seen in them, and of whom."""
 
     depth: list[np.ndarray[Any, Any]]
     seen: Observations
@@ -101,7 +117,7 @@ class _Short:
 
 
 def _look_at_short(plan: Plan) -> _Short:
-    """Render and look at the short recording; its full pictures are let go of."""
+    """Render and measure the short recording; its full pictures are not kept."""
     from liex_lab.recordings import open_recording
     from liex_lab.tracking.observations import Observations
 

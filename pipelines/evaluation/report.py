@@ -1,5 +1,8 @@
-"""The job `liex evaluate report`: how long the report of a long session takes, and how much
-memory.
+"""Benchmark of the report of a long session: time and peak memory of `liex report`.
+
+`liex evaluate report` repeats a measured session end to end until it is an hour long, makes every
+table from the repeated track as a run of that length would, and writes the report in a process of
+its own. Numbers: seconds by the clock with the start of Python, peak memory and size, MB.
 """
 
 from __future__ import annotations
@@ -41,12 +44,18 @@ print(json.dumps({"code": code, "seconds": time.perf_counter() - began, "peak_me
 def evaluate_report(
     session: str | Path, minutes: float = 60.0, *, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Time and peak memory of `liex report` on a session that repeats this one until it is
-    `minutes` long.
+    """Time and peak memory of `liex report` on a session repeated to a given length.
 
-    Every table is made from the repeated track, as a run of that length would; the report is
-    written by a process of its own, so that its start counts, too. Returns frames, minutes,
-    seconds, peak_memory_mb and the report's size.
+    Args:
+        session: the session folder that is repeated.
+        minutes: least length of the long session.
+        progress: told the stage.
+
+    Returns:
+        `frames`, `minutes`, `seconds`, `peak_memory_mb` and `report_mb`.
+
+    Raises:
+        SessionError: the report could not be written.
     """
     from liex_lab.sessions import Session
 
@@ -77,8 +86,15 @@ def evaluate_report(
 
 
 def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int, float]:
-    """Write a session that repeats another one, end to end, to at least so many seconds; its depth
-    is that of one round only. Returns its frames and seconds.
+    """Write a session that repeats another one end to end; its depth is that of one round only.
+
+    Args:
+        session: the session as it was measured, without corrections.
+        folder: the new session's folder, which must not exist.
+        seconds: least length of the new session, s.
+
+    Returns:
+        Its number of frames, and its length in s.
     """
     from liex_lab.behaviour.summary import measure_rows, stated_by
     from liex_lab.sessions.evidence import provenance_of

@@ -1,5 +1,11 @@
-"""The job `liex evaluate scale`: sessions per hour by workers, memory by length, where the time
-goes.
+"""Benchmark of throughput and scaling: sessions per hour, memory by length, time by stage.
+
+`liex evaluate scale` writes virtual mice as 640 x 480 MCAP files and measures `liex run` on them:
+frames/s and ms a frame by stage, held against the bound of opening, decoding and writing alone; one
+recording's shards by one process and by two; a study by one Dask worker and by two (processes held
+on as many cores); and peak memory, MB, by length. Sessions per hour with up to 1,000 workers are
+simulated: measured times are drawn with replacement (a bootstrap), and sessions handed out one by
+one by a scheduler that spends its measured time on each (`ASSUMPTIONS`, `DEFINITIONS`).
 """
 
 from __future__ import annotations
@@ -24,8 +30,8 @@ from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Progress, silent
 
 from ..build import build_provenance, build_recording, build_tracker, kept_estimator
-from ..shards import CHUNK, Stretch, look_side_by_side
-from ..workers import Crew, Done, Processes, Work
+from ..shards import CHUNK, Shard, look_side_by_side
+from ..workers import Done, Processes, Work, WorkerPool
 from .long_sessions import looped
 
 RunSession = Callable[..., Path]
@@ -74,13 +80,19 @@ def evaluate_scale(
     minutes: tuple[float, ...] = (1.0, 10.0),
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure one session's stages, two workers against one, memory by length, and simulate many
-    workers.
+    """Stages of a session, two workers against one, memory by length, and simulated many workers.
 
-    Workers of one recording share its stretches, those of a study its sessions.
+    Workers of one recording share its shards, those of a study its sessions.
 
-    n_frames: of each virtual recording, 640 x 480, some stretches long; minutes: lengths of
-    recording whose memory is measured.
+    Args:
+        run: measures a recording, `liex_lab.api.run_session`.
+        n_frames: frames of each virtual recording, 640 x 480; some shards long.
+        minutes: lengths of recording whose memory is measured, minutes.
+        progress: told the stage, of five.
+
+    Returns:
+        The measured numbers, `memory_mb_by_length`, `simulated_sessions_per_hour` by workers,
+        `assumptions`, `definitions` and `n_frames`.
     """
     with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
         folder = Path(scratch)
@@ -152,30 +164,36 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
 
 
 class _Timed:
-    """A crew that takes down when each stretch came, and how many frames it has."""
+    """A worker pool that takes down when each shard came, and how many frames it has."""
 
-    def __init__(self, crew: Crew) -> None:
+    def __init__(self, crew: WorkerPool) -> None:
         self._crew = crew
         self.came: list[tuple[float, int]] = []
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """See `Crew`."""
+        """Results of the pool, the time of each taken down; see `WorkerPool`.
+
+        Args:
+            do: the task.
+            works: its arguments, one a task.
+        """
         for done in self._crew.each(do, works):
             self.came.append(
-                (time.perf_counter(), done.stop - done.start if isinstance(done, Stretch) else 0)
+                (time.perf_counter(), done.stop - done.start if isinstance(done, Shard) else 0)
             )
             yield done
 
 
 def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
-    """Frames a second that are read, looked at and written by one process and by two, once each
-    process has done its first stretch: they take some seconds to begin.
+    """Frames per second read, measured and written by one process and by two.
+
+    Each process has done its first shard before the clock runs, as it takes some seconds to begin.
     """
     plan = Plan.load("mouse")
     found = {}
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
-        whole = Stretch(
+        whole = Shard(
             str(recording),
             plan,
             tracker,
@@ -293,11 +311,18 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
 def simulate(
     session_s: list[float], scheduler_s: float, workers: tuple[int, ...] = _WORKERS, seed: int = 0
 ) -> dict[str, float]:
-    """Sessions per hour for each number of workers, by going through the handing out of
-    `_N_SIMULATED` sessions.
+    """Sessions per hour by number of workers, a discrete-event simulation of 2,000 sessions.
 
-    session_s: measured times of sessions; scheduler_s: what handing out one of them costs, one
-    after the other.
+    A session begins when a worker is free and the scheduler has handed out all before it.
+
+    Args:
+        session_s: measured times of sessions, s, drawn with replacement.
+        scheduler_s: what handing out one session costs, s, one after the other.
+        workers: numbers of workers.
+        seed: of the draw.
+
+    Returns:
+        Sessions per hour by number of workers, as text.
     """
     lengths = np.random.default_rng(seed).choice(session_s, _N_SIMULATED)
     found = {}

@@ -1,5 +1,11 @@
-"""The job `liex evaluate speed`: frames per second, where the time goes, and what makes a frame
-dearer.
+"""Benchmark of pose estimation: frames per second, time by stage, and what makes a frame dearer.
+
+`liex evaluate speed` times rendered frames of the split `clean`, in memory, from foreground to
+final pose (Lie-X Table 3), the best of 5 repeats after one that compiles. Numbers: frames/s of the
+default on one and on two cores; the ratio to the paper's variant on our engine, to Algorithm 1 as
+it is written (every candidate walks down every tree by itself), and to baselines trained on this
+machine; ms a frame on one core of foreground, candidates and choice, and against the number of
+joints, of candidates and of pixels.
 """
 
 from __future__ import annotations
@@ -30,8 +36,13 @@ _SHRINK = (2, 1)  # every second pixel, every pixel
 
 @dataclass(frozen=True)
 class _Footage:
-    """Frames (n, H, W) mm in memory, of a recording of that name, its scene and the
-    animal's size.
+    """Frames in memory of a rendered recording, its segmentation and the animal's size.
+
+    Attributes:
+        name: of the recording.
+        frames: (n, H, W) float32 depth, mm.
+        scene: the learned segmentation.
+        size: the animal's size over home size.
     """
 
     name: str
@@ -41,12 +52,19 @@ class _Footage:
 
     @property
     def pixels(self) -> str:
+        """Size of the pictures in words, such as `640 x 480`."""
         return f"{self.scene.camera.width} x {self.scene.camera.height}"
 
 
 def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
-    """Shortest of several runs after one that compiles: the least disturbed by what else the
-    machine does.
+    """Shortest time of several runs after one that compiles: the least disturbed by other programs.
+
+    Args:
+        job: what is timed.
+        n_repeats: number of runs; None takes `N_REPEATS`.
+
+    Returns:
+        Seconds.
     """
     job()
     times = []
@@ -58,10 +76,17 @@ def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
 
 
 def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
-    """Frames per second from depth frames in memory to poses, foreground included; `liex evaluate
-    speed`.
+    """Frames per second from frames in memory to poses, foreground included; `liex evaluate speed`.
 
     The paper's variant is trained where it has not been; baselines are timed where they have been.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        progress: told the stage, of five.
+
+    Returns:
+        `frames_per_s_1core`, `frames_per_s_2cores`, `ratio_to_paper`, `ratio_to` by rival,
+        `stages_ms` and `cost_ms` a frame, machine and protocol.
     """
     import numba
 
@@ -148,14 +173,13 @@ def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseli
 
 
 def _frames_per_s(subject: PoseEstimator | Baseline, footage: _Footage, parallel: bool) -> float:
+    """Frames per second of a subject on the frames, on one core or on those that numba may use."""
     job = partial(subject.estimate, footage.frames, footage.scene, footage.size, parallel)
     return len(footage.frames) / best_seconds(job)
 
 
 def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
-    """Algorithm 1 as it is written, from frames to the scores of all candidates: no two of them
-    share a step.
-    """
+    """Algorithm 1 as it is written, from frames to candidate scores; none share a step."""
     from liex_lab.estimation.cascade import Candidates, ImageSet
     from liex_lab.estimation.initial import draw_starts, start_poses
     from liex_lab.estimation.training import base_at_front
@@ -165,7 +189,9 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
     skeleton = paper.skeleton
     cascade = paper.model.cascade
     crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
-    images = ImageSet(crops.heights, footage.scene.looks(crops, method.camera_view), crops.moments)
+    images = ImageSet(
+        crops.heights, footage.scene.crop_cameras(crops, method.camera_view), crops.moments
+    )
     n = len(crops.heights)
     k = method.n_candidates
     rotation, position, scale = start_poses(
@@ -205,14 +231,14 @@ def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
     scene = footage.scene
     size = footage.size
     crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
-    looks = scene.looks(crops, default.model.method.camera_view)
-    rotations, positions, _, scores = default.candidates(crops, looks, size)
-    images = ImageSet(crops.heights, looks, crops.moments)
+    crop_cameras = scene.crop_cameras(crops, default.model.method.camera_view)
+    rotations, positions, _, scores = default.candidates(crops, crop_cameras, size)
+    images = ImageSet(crops.heights, crop_cameras, crops.moments)
     return {
         "foreground": _ms(
             lambda: scene.extract(frames, size, False, default.model.method.camera_view)
         ),
-        "candidates": _ms(lambda: default.candidates(crops, looks, size, False)),
+        "candidates": _ms(lambda: default.candidates(crops, crop_cameras, size, False)),
         "choice": _ms(lambda: default.pick(images, size, rotations, positions, scores, False)),
     }
 
@@ -226,10 +252,11 @@ def _costs(default: PoseEstimator, footage: _Footage) -> dict[str, dict[str, flo
     size = footage.size
     n_joints = len(default.skeleton.solved)
     crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
-    looks = scene.looks(crops, default.model.method.camera_view)
+    crop_cameras = scene.crop_cameras(crops, default.model.method.camera_view)
 
     def candidates(estimator: PoseEstimator) -> float:
-        return _ms(lambda: estimator.candidates(crops, looks, size, False))
+        """Milliseconds a frame that an `estimator` takes for its candidates on one core."""
+        return _ms(lambda: estimator.candidates(crops, crop_cameras, size, False))
 
     joints = sorted({1, (n_joints + 1) // 2, n_joints})
     return {

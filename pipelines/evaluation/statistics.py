@@ -1,5 +1,10 @@
-"""The job `liex evaluate statistics`: how often the group test is wrong where there is no effect,
-and its power.
+"""Monte Carlo evaluation of the group test: type I error, coverage and power on simulated studies.
+
+`liex evaluate statistics` draws studies from a nested normal model (cage, animal in its cage,
+session of its animal) in six designs, `PLANS`, and compares their groups as `liex compare` does.
+Numbers, each a share of studies: p <= 5 % without an effect (the type I error); the same of a t
+test that takes sessions for units; 95 % intervals that hold the true difference; studies in which
+the mixed model was used; and the power at an effect stated in standard deviations between animals.
 """
 
 from __future__ import annotations
@@ -18,12 +23,19 @@ _AT_ONCE = 50  # studies that are compared in one go, as measures of the same an
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A simulated study: so many cages per group, animals per cage and sessions per animal, and how
-    much each varies.
+    """A simulated study: its design, and how much each level varies.
 
-    Standard deviations are of a cage's mean, of an animal in its cage and of a session of its
-    animal. within: every cage holds both groups. effect: what the second group has more, in
-    standard deviations between animals.
+    Attributes:
+        name: of the design.
+        n_cages: cages per group, or in all where `within`.
+        n_animals: animals per cage.
+        n_sessions: sessions per animal.
+        sd_cage: standard deviation of a cage's mean.
+        sd_animal: of an animal in its cage.
+        sd_session: of a session of its animal.
+        within: every cage holds both groups.
+        caged: whether the cages are stated in the table.
+        effect: what the second group has more, in standard deviations between animals.
     """
 
     name: str
@@ -38,8 +50,11 @@ class StudyPlan:
     effect: float = 0.0
 
     def draw(self, rng: np.random.Generator, n_studies: int) -> pd.DataFrame:
-        """As many independent studies of the same design: a row per session, and the columns
-        study_0, study_1, ...
+        """Independent studies of the design: a row per session, a column study_k per study.
+
+        Args:
+            rng: draws all three levels.
+            n_studies: number of columns.
         """
         n_cages = self.n_cages if self.within else 2 * self.n_cages
         n_animals = n_cages * self.n_animals
@@ -76,12 +91,19 @@ PLANS = (
 def evaluate_statistics(
     n_studies: int = 2000, effect: float = 1.0, seed: int = 0, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Share of p <= 5 % in `n_studies` simulated studies of each kind: without an effect, and with
-    one.
+    """Error rates and power of the group test in every design; `liex evaluate statistics`.
 
-    effect: in standard deviations between animals. Beside it what a t test would do that takes
-    every session for a unit; the interval's coverage of the true difference; and how often the
-    mixed model was used.
+    Args:
+        n_studies: simulated studies of each design without an effect; about a quarter of them with
+            one.
+        effect: in standard deviations between animals.
+        seed: of the draws.
+        progress: told design by design.
+
+    Returns:
+        By the designs' names `type_1`, `type_1_sessions_as_units` (a t test that takes every
+        session for a unit), `coverage` of the true difference, `mixed_model` (how often it was
+        used) and `power`; and alpha, n_studies, effect_size and seed.
     """
     found: dict[str, Any] = {
         "alpha": ALPHA,
@@ -100,8 +122,12 @@ def evaluate_statistics(
 
 
 def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> dict[str, float]:
-    """Of studies without an effect: shares with p <= 5 %, with an interval around 0, tested by the
-    model.
+    """Shares of studies without an effect: p <= 5 %, interval around 0, tested by the model.
+
+    Args:
+        plan: the design.
+        n_studies: number of studies.
+        rng: draws the studies and the permutations' seeds.
     """
     from scipy.stats import ttest_ind
 
@@ -123,7 +149,14 @@ def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> di
 
 
 def power(plan: StudyPlan, effect: float, n_studies: int, rng: np.random.Generator) -> float:
-    """Share of studies with this effect in which it is found."""
+    """Share of studies with an effect in which the test finds it, p <= 5 %.
+
+    Args:
+        plan: the design.
+        effect: in standard deviations between animals.
+        n_studies: number of studies.
+        rng: draws the studies and the permutations' seeds.
+    """
     real = replace(plan, effect=effect)
     return _share(
         pd.concat([_compared(real.draw(rng, n), rng) for n in _portions(n_studies)])["p"] <= ALPHA

@@ -1,1 +1,1 @@
-"""The jobs of `liex cohort`: a study's sessions, on this machine, on Dask or on Slurm."""
+"""Jobs of `liex cohort`: a study's sessions, on this machine, on Dask or on Slurm."""

@@ -1,10 +1,9 @@
-"""The job `liex cohort`: every session of a study on the workers of a Dask cluster. Dask is
-imported here alone.
+"""Measurement of a study on a Dask cluster: local processes, a running scheduler, or Slurm jobs.
 
 A session is one task. It may run twice (a worker dies, and another takes over): it leaves its
-results on disk, goes on where it was, and done twice it does the same. Sessions are done side by
-side, each by one worker; where fewer are left than there are workers, these share the stretches of
-each.
+results on disk, goes on where it was, and done twice it does the same. Sessions are measured side
+by side, each by one worker; where fewer are left than there are workers, these share the shards of
+each. A session that more than three workers died of is quarantined. Dask is imported here alone.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from liex_lab.sessions.failure import describe_failure
 from ..workers import Done, Work, n_cores, worker_environment
 from .one_session import RunSession, measure_one, quarantine
 from .slurm import SlurmTable
-from .status import Standing
+from .status import SessionStatus
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -41,7 +40,7 @@ Finished = Callable[[dict[str, Any]], None]  # what `measure_one` returns
 
 
 def measure_cohort(
-    todo: Sequence[Standing],
+    todo: Sequence[SessionStatus],
     run: RunSession,
     *,
     workers: int = 0,
@@ -51,11 +50,21 @@ def measure_cohort(
     told: Told = lambda *_: None,
     finished: Finished = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Measure the sessions; returns how each went. workers: processes on this machine, 0 one for
-    every two cores.
+    """Measure the sessions of a study; returns how each went, as `measure_one` does.
 
-    threads: cores for each, 0 an equal share; scheduler: the address of a running Dask scheduler;
-    slurm: how to ask a Slurm cluster for workers.
+    Args:
+        todo: the sessions that are to be measured.
+        run: measures a recording, `liex_lab.api.run_session`.
+        workers: processes on this machine; 0 takes one for every two cores.
+        threads: cores of each; 0 takes an equal share.
+        scheduler: address of a running Dask scheduler.
+        slurm: how to ask a Slurm cluster for workers.
+        told: is told id, pieces done, pieces in all, and what is being done.
+        finished: is given each result as soon as it is there.
+
+    Raises:
+        StudyError: no scheduler answers.
+        MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
     """
     planned = {one.session.id: one.session for one in todo}
     if not planned:
@@ -67,9 +76,14 @@ def measure_cohort(
 
 
 def n_shared(n: int, n_workers: int) -> int:
-    """How many of n sessions, the last ones, are cut into stretches for all workers to look at: as
-    many as would leave workers idle if each were measured by one. Cutting costs: what each worker
-    wrote is copied into one.
+    """How many of n sessions, the last ones, are cut into shards for all workers to measure.
+
+    As many as would leave workers idle if each were measured by one. Cutting costs: what each
+    worker wrote is copied into one.
+
+    Args:
+        n: number of sessions.
+        n_workers: number of workers.
     """
     return n % max(n_workers, 1)
 
@@ -138,6 +152,7 @@ def _on_worker(
     last = 0.0
 
     def tell(done: int, total: int | None, what: str) -> None:
+        """Send `done`, `total` and `what` to whoever started the study, at most twice a second."""
         nonlocal last
         now = time.monotonic()
         if now - last > _TOLD_EVERY_S:
@@ -148,13 +163,16 @@ def _on_worker(
 
 
 class Workers:
-    """All workers of the cluster that this task runs on, as a crew for the stretches of its
-    session.
-    """
+    """All workers of the cluster that a task runs on, as a pool for the shards of its session."""
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """See `crew.Crew`. The task steps aside meanwhile, and its worker looks at stretches like
-        the others.
+        """Results of a task per shard as they come; see `workers.WorkerPool`.
+
+        The calling task steps aside meanwhile, and its worker measures shards like the others.
+
+        Args:
+            do: the task.
+            works: its arguments, one a task.
         """
         from distributed import as_completed, worker_client
 
@@ -207,8 +225,13 @@ def _client(
 
 
 def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
-    """Worker processes on this machine, reached through this machine alone and with keys made for
-    this run.
+    """Worker processes on this machine, reached through this machine alone, with keys for this run.
+
+    Args:
+        n_tasks: sessions to measure; there are no more workers than that.
+        workers: processes; 0 takes one for every two cores.
+        threads: cores of each; 0 takes an equal share.
+        scratch: folder for temporary files.
     """
     from distributed import LocalCluster, Security
 
@@ -232,7 +255,15 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
 
 
 def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
-    """A cluster whose workers are jobs of Slurm; the scheduler is this process."""
+    """A cluster whose workers are jobs of Slurm; the scheduler is this process.
+
+    Args:
+        table: how to ask for jobs.
+        scratch: folder for temporary files where the table names none.
+
+    Raises:
+        MissingPackageError: dask-jobqueue is not installed.
+    """
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError:
@@ -254,8 +285,11 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
 
 
 def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
-    """The options of one job: one worker that measures one session at a time on all of the job's
-    cores.
+    """The options of one job: a worker that measures a session at a time on all its cores.
+
+    Args:
+        table: how to ask for jobs.
+        scratch: folder for temporary files where the table names none.
     """
     exports = [
         f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()

@@ -1,5 +1,7 @@
-"""`liex cohort init`: a study file to begin from, made of the recordings that are found in a
-folder.
+"""A study file to begin from, made of the recordings found in a folder: `liex cohort init`.
+
+Animals and sessions are named after BIDS-like folders (`sub-m01`, `ses-01_date-20260821`) where
+there are such, else after folders and files.
 """
 
 from __future__ import annotations
@@ -32,11 +34,20 @@ _HEADER = """\
 
 
 def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
-    """Write FOLDER/study.toml with every recording below FOLDER/rawdata, or below FOLDER where
-    there is no rawdata.
+    """Write FOLDER/study.toml with every recording below FOLDER/rawdata, or else below FOLDER.
 
-    The animal and the session are taken from folder names such as sub-m01 and ses-01_date-20260821
-    where there are such, otherwise from the recording's own name. Returns the file.
+    Animal and session are taken from folder names such as sub-m01 and ses-01_date-20260821 where
+    there are such, otherwise from the recording's own name.
+
+    Args:
+        folder: the study's folder.
+        overwrite: replace a study file that is there already.
+
+    Returns:
+        The path of the study file.
+
+    Raises:
+        StudyError: there is no such folder, no recording in it, or a study file already.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -60,7 +71,11 @@ def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
 
 
 def find_recordings(folder: Path) -> list[Path]:
-    """Every recording below a folder, in order of name; results and what is hidden are left out."""
+    """Every recording below a folder, in order of name; results and hidden files are left out.
+
+    Args:
+        folder: searched with all folders in it; one that is a recording itself is not looked into.
+    """
     found = []
     for inside, folders, names in os.walk(folder):
         here = Path(inside)
@@ -85,7 +100,14 @@ def find_recordings(folder: Path) -> list[Path]:
 
 
 def name_sessions(recordings: list[Path], raw: Path) -> list[tuple[str, str, Path]]:
-    """(animal, session, recording) for each, no pair of names twice."""
+    """(animal, session, recording) for each recording, no pair of names twice.
+
+    Names that differ by capitals alone are one, as they are to some file systems.
+
+    Args:
+        recordings: paths below `raw`.
+        raw: the folder that the names count from.
+    """
     named = []
     taken = set()
     spelled: dict[str, str] = {}  # some file systems take M1 and m1 for one, so here they are one

@@ -12,12 +12,18 @@ from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.listed import WHO, Entry
 
 from ..compare import find_sessions
-from .status import Standing, standings
+from .status import SessionStatus, standings
 
 
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]]:
-    """The name of a study, and what lists its sessions: of a study file, or of a folder with
-    sessions in it.
+    """The name of a study, and a function that lists its sessions anew each time.
+
+    Args:
+        place: a study's .toml file, a folder with a study.toml, or a folder with sessions in it.
+
+    Raises:
+        StudyError: there is no such place.
+        SessionError: the folder has no session in it.
     """
     path = Path(place)
     if path.is_file() or (path / STUDY_FILE).is_file():
@@ -31,7 +37,7 @@ def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]
     return path.resolve().name, lambda: _of_folder(path)
 
 
-def _of_study(one: Standing) -> Entry:
+def _of_study(one: SessionStatus) -> Entry:
     animal = one.session.animal
     failure = one.failure or {}
     who = {"subject_id": animal.id, **{name: getattr(animal, name) for name in WHO[1:]}}

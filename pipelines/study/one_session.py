@@ -1,6 +1,4 @@
-"""One session of a study: measured, or quarantined with a failed.json; whatever happens, the others
-go on.
-"""
+"""One session of a study: measured, or quarantined with a failed.json while the others go on."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
 
 from ..shards import MEASURING
-from ..workers import Crew
+from ..workers import WorkerPool
 from .status import input_stamp, set_aside
 
 
@@ -31,10 +29,21 @@ class RunSession(Protocol):
         folder: Path,
         overwrite: bool,
         notes: dict[str, Any],
-        crew: Crew | None,
+        crew: WorkerPool | None,
         progress: Progress,
     ) -> Path:
-        """Write the session folder `folder`."""
+        """Measure a recording, write the session folder `folder`, and return it.
+
+        Args:
+            recording: a path or address.
+            plan: everything that the run depends on.
+            folder: the session folder.
+            overwrite: replace a session that is there already.
+            notes: what session.json is to hold besides.
+            crew: pool of workers for the shards of a long recording; None measures it in this
+                process.
+            progress: told frame by frame.
+        """
 
 
 def measure_one(
@@ -42,14 +51,22 @@ def measure_one(
     run: RunSession,
     progress: Progress = silent,
     run_id: str = "",
-    crew: Crew | None = None,
+    crew: WorkerPool | None = None,
 ) -> dict[str, Any]:
-    """Measure a session; returns how it went: id, state 'done' or 'failed', seconds, and the
-    failure.
+    """Measure a session, or quarantine it, and tell how it went.
 
-    Done twice it does the same: what was interrupted goes on, what is there is replaced when the
-    new one is whole. run_id: of the study's run; what that has ended already is not done again.
-    crew: looks at stretches of it.
+    Done twice it does the same: what was interrupted goes on, and what is there is replaced when
+    the new one is whole.
+
+    Args:
+        session: what is measured, how and where to.
+        run: measures the recording.
+        progress: told frame by frame.
+        run_id: of the study's run; a session that it has ended already is not measured again.
+        crew: pool of workers for the session's shards.
+
+    Returns:
+        `id`, `state` (`done` or `failed`), `seconds`, and `failure` (None where it is done).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
@@ -58,6 +75,7 @@ def measure_one(
     frame = None
 
     def watch(done: int, total: int | None, what: str) -> None:
+        """Note stage and frame for a failure's report, and pass `done`, `total` and `what` on."""
         nonlocal stage, frame
         stage = what
         frame = done if what == MEASURING else frame
@@ -105,8 +123,11 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
 
 
 def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
-    """Leave failed.json in the session's place, with what was to be done, so that a change of it is
-    noticed.
+    """Leave failed.json in the session's place, with plan and input so that changes show.
+
+    Args:
+        session: the session that failed; its older results are set aside.
+        failure: what `describe_failure` tells of the error.
     """
     known = {
         "session_id": session.id,

@@ -1,5 +1,6 @@
-"""The job `liex cohort`: look where every session stands, measure what is to be done, write the
-study's table.
+"""Run of a study, `liex cohort`: measure the sessions that are to be done, write its table.
+
+A lock in the study's cohort folder keeps a second run out.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from liex_lab.sessions.lock import locked
 
 from .one_session import RunSession
 from .slurm import SlurmTable
-from .status import Standing, standings
+from .status import SessionStatus, standings
 from .table import write_study_table
 
 
@@ -32,9 +33,25 @@ def run_study(
     only: Sequence[str],
     dry_run: bool,
     board: Callable[[int], AbstractContextManager[Board]],
-) -> list[Standing]:
-    """Measure what is to be done; returns where every session stands then. See
-    `liex_lab.api.run_study`.
+) -> list[SessionStatus]:
+    """Measure the sessions of a study that are to be done; returns every session's status.
+
+    Args:
+        study: the study.
+        run: measures a recording, `liex_lab.api.run_session`.
+        workers: processes on this machine; 0 takes one for every two cores.
+        scheduler: address of a running Dask scheduler; None starts workers.
+        slurm: TOML file that says how to ask Slurm for workers; None does not.
+        retry: measure failed sessions again.
+        again: measure all sessions again.
+        only: ids of sessions, the others are left out; () takes all.
+        dry_run: only look.
+        board: opens the display of so many sessions' progress.
+
+    Raises:
+        StudyError: both scheduler and slurm are given, or no scheduler answers.
+        SessionError: another process measures the study.
+        LiexError: an id in `only` is none of the study's.
     """
     if scheduler and slurm:
         raise StudyError(
@@ -58,7 +75,7 @@ def run_study(
 
 
 def _measure(
-    todo: list[Standing],
+    todo: list[SessionStatus],
     run: RunSession,
     board: Callable[[int], AbstractContextManager[Board]],
     **where: Any,
@@ -68,6 +85,7 @@ def _measure(
     with board(len(todo)) as shown:
 
         def finished(result: dict[str, Any]) -> None:
+            """Tell the board how a session went: its `result`."""
             failure = result["failure"]
             sentence = (
                 f"failed: {failure['reason']}"

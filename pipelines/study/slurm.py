@@ -1,4 +1,7 @@
-"""How to ask Slurm for workers: a small TOML file, `pipelines/plans/slurm.toml` to begin from."""
+"""Settings for workers on Slurm: a small TOML file, `pipelines/plans/slurm.toml` to begin from.
+
+Each text becomes one line of a job script, so line breaks are refused.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,22 @@ Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:/@+-]+$", max_length=200)]
 
 
 class SlurmTable(BaseModel):
-    """Every setting of the file; the comments in slurm.toml say what each is for."""
+    """Every setting of the file; the comments in slurm.toml say what each is for.
+
+    Attributes:
+        jobs: jobs at most; each measures one session after the other.
+        cores_per_job: cores of a job.
+        memory: memory of a job, as Slurm writes it.
+        walltime: time after which Slurm ends a job, HH:MM:SS.
+        partition: the partition, if one is to be named.
+        account: the account, if one is to be named.
+        interface: network interface on which jobs and the command see each other.
+        shared_folder: folder that all nodes see; keys made for this run go there.
+        local_folder: folder on the nodes for temporary files.
+        log_folder: folder for the jobs' own logs.
+        prologue: lines of the job script before the worker starts.
+        directives: further #SBATCH lines.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -36,7 +54,14 @@ class SlurmTable(BaseModel):
 
     @staticmethod
     def load(path: str | Path) -> SlurmTable:
-        """The table in a TOML file; 'slurm' is the bundled one."""
+        """The settings in a TOML file.
+
+        Args:
+            path: the file; `slurm` is the bundled one.
+
+        Raises:
+            StudyError: there is no such file, or something in it cannot be used.
+        """
         file = plans_folder() / "slurm.toml" if str(path) == "slurm" else Path(path)
         if not file.is_file():
             raise StudyError(

@@ -1,5 +1,7 @@
-"""Which sessions of a study are done, which are to be done (again), and why: looked up on disk,
-never remembered.
+"""Status of a study's sessions: done, failed, or to be done (again) and why; looked up on disk.
+
+Nothing is remembered: a session is done while versions, plan, model and input in its session.json
+are those of today. Inputs are compared by names, sizes and times, and where these differ by hash.
 """
 
 from __future__ import annotations
@@ -30,9 +32,14 @@ State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Where a session stands. reason: why it is to be done, or was not; failure: of the last
-    attempt, if it failed.
+class SessionStatus:
+    """The status of a session.
+
+    Attributes:
+        session: the planned session.
+        state: done, failed, new, begun, changed or excluded.
+        reason: why it is to be done, or was not.
+        failure: of the last attempt, if it failed.
     """
 
     session: PlannedSession
@@ -42,15 +49,23 @@ class Standing:
 
     @property
     def to_do(self) -> bool:
-        """Whether a run of the study measures it."""
+        """Whether a run of the study measures it: it is new, begun or changed."""
         return self.state in ("new", "begun", "changed")
 
 
 def standings(
     study: Study, *, retry: bool = False, only: Sequence[str] = (), again: bool = False
-) -> list[Standing]:
-    """Where every session stands. retry: failed ones are to be done; only: ids, the others are left
-    out; again: all.
+) -> list[SessionStatus]:
+    """The status of every session of a study.
+
+    Args:
+        study: the study.
+        retry: failed sessions are to be done.
+        only: ids of sessions, the others are left out; () takes all.
+        again: done and failed sessions are to be done.
+
+    Raises:
+        LiexError: an id in `only` is none of the study's.
     """
     known = [session.id for session in study.sessions]
     for id in only:
@@ -63,25 +78,29 @@ def standings(
     return [_asked_again(one, retry, again) for one in found]
 
 
-def _asked_again(one: Standing, retry: bool, again: bool) -> Standing:
+def _asked_again(one: SessionStatus, retry: bool, again: bool) -> SessionStatus:
     if again and one.state == "done":
-        return Standing(one.session, "changed", "asked for with --again")
+        return SessionStatus(one.session, "changed", "asked for with --again")
     if (retry or again) and one.state == "failed":
-        return Standing(one.session, "changed", "it failed, and is tried again", one.failure)
+        return SessionStatus(one.session, "changed", "it failed, and is tried again", one.failure)
     return one
 
 
-def standing(session: PlannedSession) -> Standing:
-    """Where one session stands, by what lies in its folder."""
+def standing(session: PlannedSession) -> SessionStatus:
+    """The status of one session, by what lies in its folder.
+
+    Args:
+        session: the planned session.
+    """
     if session.exclude:
-        return Standing(session, "excluded", session.exclude)
+        return SessionStatus(session, "excluded", session.exclude)
     if (session.folder / "session.json").is_file():
         try:
             document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
             why = next(filter(None, (check() for check in _checks(session, document))), "")
         except (OSError, ValueError, LiexError, AttributeError, TypeError):
             why = "its session.json cannot be read"
-        return Standing(session, "changed" if why else "done", why)
+        return SessionStatus(session, "changed" if why else "done", why)
     failure = read_failure(session.folder)
     if failure is not None:
         why = (
@@ -89,21 +108,19 @@ def standing(session: PlannedSession) -> Standing:
             if "input" not in failure
             else next(filter(None, (check() for check in _checks(session, failure))), "")
         )
-        return Standing(
+        return SessionStatus(
             session, "changed" if why else "failed", why or str(failure["reason"]), failure
         )
     begun = session.folder.with_name(f"{session.folder.name}.part").is_dir()
     return (
-        Standing(session, "begun", "it was interrupted and goes on")
+        SessionStatus(session, "begun", "it was interrupted and goes on")
         if begun
-        else Standing(session, "new", "new")
+        else SessionStatus(session, "new", "new")
     )
 
 
 def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Callable[[], str]]:
-    """Each says why the session in `document` is not the planned one any more, or nothing; the
-    cheapest first.
-    """
+    """Tests that say why a stored session is not the planned one, '' if it is; cheapest first."""
     return (
         lambda: _version_changed(document),
         lambda: _plan_changed(session.plan, document.get("plan", {})),
@@ -167,10 +184,15 @@ def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
 
 
 def input_stamp(recording: str) -> str:
-    """A short hash of names, sizes and times of the recording's files and of those beside them;
-    cheap to look up.
+    """A short hash of names, sizes and times of a recording's files and of the notes beside them.
 
-    Empty where there is no recording.
+    Cheap to look up. Notes are files such as .toml, .csv and .json.
+
+    Args:
+        recording: a path, or the address of a virtual recording, which is returned as it is.
+
+    Returns:
+        32 hexadecimal digits; '' where there is no recording.
     """
     if recording.startswith(VIRTUAL):
         return recording
@@ -194,8 +216,10 @@ def input_stamp(recording: str) -> str:
 
 
 def set_aside(folder: Path) -> None:
-    """Make room for failed.json: an older session's results stay under another name, an older
-    failed.json goes.
+    """Clear the way for failed.json: older results become NAME.outdated, an older one goes.
+
+    Args:
+        folder: the session folder.
     """
     if (folder / "session.json").is_file():
         older = folder.with_name(f"{folder.name}.outdated")

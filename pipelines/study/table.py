@@ -1,4 +1,4 @@
-"""The study's table: every session with its state, for people (CSV) and for programs (Parquet)."""
+"""The study's table: every session with its status, as CSV for people and Parquet for programs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from liex_lab.plan.study import Study
 from liex_lab.sessions.failure import write_whole
 from liex_lab.tables.schema import columns, dictionary, harmless, write_table
 
-from .status import Standing
+from .status import SessionStatus
 
 STUDY_SESSIONS = columns(
     "study",
@@ -48,8 +48,13 @@ STUDY_SESSIONS = columns(
 TABLE = "study"
 
 
-def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
-    """Write cohort/study.parquet, study.csv and study.json; returns the CSV."""
+def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
+    """Write study.parquet, study.csv and study_columns.json of a study; returns the CSV.
+
+    Args:
+        study: the study.
+        standings: the status of its sessions.
+    """
     import csv
     import io
 
@@ -73,12 +78,17 @@ def write_study_table(study: Study, standings: Sequence[Standing]) -> Path:
     return folder / f"{TABLE}.csv"
 
 
-def study_rows(study: Study, standings: Sequence[Standing]) -> list[dict[str, Any]]:
-    """One row per session, its keys the columns of STUDY_SESSIONS."""
+def study_rows(study: Study, standings: Sequence[SessionStatus]) -> list[dict[str, Any]]:
+    """One row per session, its keys the columns of `STUDY_SESSIONS`.
+
+    Args:
+        study: the study; paths are stated from its folder.
+        standings: the status of its sessions.
+    """
     return [_row(study, one) for one in standings]
 
 
-def _row(study: Study, one: Standing) -> dict[str, Any]:
+def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
     session = one.session
     failure = one.failure or {}
     document = _document(session.folder) if one.state == "done" else {}

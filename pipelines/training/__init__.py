@@ -1,1 +1,1 @@
-"""The jobs of `liex train`: pose models, motion models, action models, baselines."""
+"""Training jobs of `liex train`: pose models, motion models, action models, baselines."""

@@ -1,4 +1,11 @@
-"""The jobs behind `liex train actions` and `liex suggest`, and labels that people made."""
+"""Training of action recognisers, and active learning: `liex train actions`, `liex suggest`.
+
+The recogniser (a network on windowed features under a semi-Markov model, `liex_lab.actions`) learns
+from sessions that people labelled, and is then scored by leave-one-animal-out cross-validation; or,
+without any, from generated recordings of a virtual animal at several frame rates. Labels come from
+our tables, from CSV, from BORIS projects and from BORIS's exports. `suggest` is uncertainty
+sampling: it names what a person should label next by the entropy of the recogniser's words.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +40,19 @@ _SLOWER_HZ = (
 def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
-    """Generated recordings of an animal to learn from, at several frame rates, and cut-out
-    sequences.
+    """Generated recordings of an animal to learn from, and cut-out sequences of single actions.
+
+    Args:
+        animal: `fish` or `mouse`.
+        estimator: measures the rendered frames.
+        progress: told how far rendering and measuring is.
+
+    Returns:
+        The labelled tracks of uncut recordings, a third of the usual camera's once more as slower
+        ones (15 Hz, and 30 Hz for fish) see them; and the cut-out sequences, of fish only.
+
+    Raises:
+        LiexError: no actions are generated for this animal.
     """
     from .agent_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
     from .agent_tracks import acted, acted_tracks
@@ -64,12 +82,23 @@ def train_actions(
     pose_model: str | Path | None = None,
     progress: Progress = silent,
 ) -> tuple[Path, dict[str, Any]]:
-    """A recogniser learned from labelled sessions, or, without any, from generated recordings of an
-    animal.
+    """Train an action recogniser on labelled sessions or, without any, on generated recordings.
 
-    labels: tables of bouts or BORIS's projects or exports; without any, the sessions' own bouts
-    whose source is human. Returns the model's path and, for sessions, its scores on each animal
-    when it learned from the others only.
+    Args:
+        out: where the model is written.
+        animal: `fish` or `mouse`, where it learns from generated recordings.
+        sessions: labelled session folders.
+        labels: tables of bouts, BORIS projects or BORIS exports; without any, the sessions' own
+            bouts whose source is `human` are taken.
+        pose_model: measures the generated recordings, instead of the animal's own.
+        progress: told how far the job is.
+
+    Returns:
+        The model's path and, for sessions, its scores on each animal when it learned from the
+        others only; an empty dict for generated recordings.
+
+    Raises:
+        LiexError: the animal has no generated actions, or labels and sessions do not fit.
     """
     from liex_lab.actions.learning import learn, leave_one_animal_out, with_card
     from liex_lab.actions.storage import save_action_model
@@ -104,7 +133,19 @@ def train_actions(
 def labelled_sessions(
     sessions: Sequence[str | Path], labels: Sequence[str | Path]
 ) -> list[LabelledTrack]:
-    """The tracks of sessions with the words that people gave them."""
+    """The tracks of sessions with the word that people gave each frame.
+
+    Args:
+        sessions: session folders.
+        labels: files of labels; () takes the sessions' own human bouts. Where there are several
+            sessions, `session_id` in the labels says which one a bout is of.
+
+    Returns:
+        One labelled track per session, named by its subject, else by the session.
+
+    Raises:
+        LiexError: the labels do not name a session, or a session has no label at all.
+    """
     import pandas as pd
 
     from liex_lab.actions.ethogram import UNLABELLED
@@ -141,7 +182,17 @@ def _sessions_named(table: pd.DataFrame) -> set[str]:
 
 
 def read_any_labels(path: str | Path) -> pd.DataFrame:
-    """Labels from our table, a CSV, a BORIS project or BORIS's export of aggregated events."""
+    """Labels from our table, a CSV, a BORIS project or BORIS's export of aggregated events.
+
+    Args:
+        path: the file; `.boris` and `.boris.gz` are projects, a `.csv` or `.tsv` is looked into.
+
+    Returns:
+        One row per bout.
+
+    Raises:
+        LiexError: there is no such file.
+    """
     from liex_lab.actions.labels import read_labels
     from liex_lab.exchange.boris_labels import boris_export_labels, boris_labels, is_boris_export
 
@@ -158,8 +209,23 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
 def suggest(
     session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5
 ) -> pd.DataFrame:
-    """The stretches of a session most worth labelling next: where the recogniser is least sure, one
-    per kind of doubt first. Columns start_s, stop_s, guess, or_else, uncertainty (0 to 1).
+    """The segments of a session most worth labelling next: where the recogniser is least sure.
+
+    Segments are ranked by mean entropy, but of every pair of confused words the worst comes first,
+    so that no single confusion fills the list.
+
+    Args:
+        session: the session folder.
+        model: an action model's name or path; None takes that of the session's animal.
+        n: how many segments at most.
+        least_s: length of a segment, s.
+
+    Returns:
+        Columns `start_s`, `stop_s`, `guess`, `or_else` (the two likeliest words) and `uncertainty`
+        (entropy over its largest value, 0 to 1).
+
+    Raises:
+        LiexError: the model is of another animal.
     """
     import pandas as pd
 

@@ -1,5 +1,9 @@
-"""Which recordings action recognisers are trained on and judged by. Individuals are never on both
-sides.
+"""Training and test splits of generated behaviour for action recognition.
+
+Individuals (seeds) are never on both sides: cut-out sequences as in the paper (426 to
+train on and 173 to test on, of 5 and 2 fish), 24 uncut training recordings of 40 s, for fish 8 more
+of 20 s at 100 Hz, and up to 6 test recordings of about 300 s of individuals whose traits lie
+outside the range that all others come from. Cameras film fish at 50 Hz and mice at 30 Hz.
 """
 
 from __future__ import annotations
@@ -35,7 +39,12 @@ _FAST_SHARE = 1.0 / 6.0  # of every test recording is filmed by a faster camera 
 
 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
-    """Single actions, cut out by hand as it were: the paper's experiment."""
+    """Cut-out sequences of single actions, the actions in turn: the paper's experiment.
+
+    Args:
+        animal: `fish` or `mouse`, a key of `WORDS`.
+        test: the 173 test sequences of two individuals, else the 426 training sequences of five.
+    """
     individuals, n = (_TEST_FISH, N_TEST) if test else (_TRAIN_FISH, N_TRAIN)
     words = WORDS[animal]
     return [
@@ -51,7 +60,11 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
 
 def training_recordings(animal: str) -> list[Scenario]:
-    """Uncut recordings to learn from, a fish's last ones by a faster camera."""
+    """Uncut recordings to learn from, 40 s each; a fish's last 8 by a 100 Hz camera, 20 s each.
+
+    Args:
+        animal: `fish` or `mouse`.
+    """
     usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
     return usual + [
         Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())
@@ -59,13 +72,22 @@ def training_recordings(animal: str) -> list[Scenario]:
 
 
 def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
-    """Of the recordings of `training_recordings` those by the animal's usual camera."""
+    """Those by the animal's usual camera, the first 24.
+
+    Args:
+        recordings: one entry for each of `training_recordings`, in that order.
+    """
     return list(recordings[: len(_TRAIN_SET)])
 
 
 def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
-    """Uncut recordings, so many minutes in all, of individuals whose traits no other has; fast: the
-    beginnings of the same ones, by a faster camera.
+    """Uncut test recordings of individuals whose traits no other individual has.
+
+    Args:
+        animal: `fish` or `mouse`.
+        fast: the first sixth of the same recordings by a 100 Hz camera, instead of all of them by
+            the usual one.
+        minutes: length in all; about 5 minutes come from each of at most 6 individuals.
     """
     n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
     seconds = 60.0 * minutes / n

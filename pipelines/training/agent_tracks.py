@@ -1,9 +1,10 @@
-"""Tracks with known actions: acted by virtual animals, rendered, measured and tracked as recordings
-are.
+"""Labelled tracks of acting virtual animals: behaviour generated, rendered, measured and tracked.
 
-Everything is drawn from seeds. What single frames say is kept in the cache folder, recording by
-recording, by seed, model and generator, so that a job that was stopped goes on where it was; what
-the tracker makes of it is made anew.
+An agent strings actions together by their kinematic definitions; each frame is rendered in depth,
+and what single frames say is measured as in a recording. These observations are kept in the cache
+folder, recording by recording, by scenario, model and the code of the generator, so that a job that
+was stopped goes on where it was. The track is made from them anew, by the present tracker. All is
+drawn from seeds.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from liex_lab.simulation._render_kernels import WALL_COLUMNS
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
 from liex_lab.simulation.agents.agent import STEP_S, Individual, Motion
-from liex_lab.simulation.agents.render import Camerawork, film
-from liex_lab.simulation.fish import FishHabits
-from liex_lab.simulation.species import MouseHabits
+from liex_lab.simulation.agents.render import CameraPath, film
+from liex_lab.simulation.fish import FishSpecies
+from liex_lab.simulation.species import MouseSpecies
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.offline import Subject, track_whole
-from liex_lab.tracking.patch_observer import WindowTracker
+from liex_lab.tracking.patch_observer import PatchObserver
 
 from .pose_model import cache_folder
 
@@ -52,9 +53,17 @@ _CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
 
 @dataclass(frozen=True)
 class Scenario:
-    """One recording to be acted. seed: of everything in it; individual: the animal's own seed;
-    novel: an animal whose traits no other has; seconds long, or (word) one cut-out action;
-    filmed_s: only so much of its beginning is filmed, 0 all of it.
+    """One recording to be acted.
+
+    Attributes:
+        animal: `fish` or `mouse`.
+        individual: the animal's own seed: traits, size, shape.
+        seed: of everything else in the recording.
+        rate_hz: frames per second of the camera.
+        seconds: length of an uncut recording, s; 0 for a cut-out action.
+        word: the cut-out action, '' for an uncut recording.
+        novel: the individual has traits that no other has.
+        filmed_s: only so much of its beginning is filmed, s; 0 films all of it.
     """
 
     animal: str
@@ -68,11 +77,18 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class Acted:
-    """An acted recording as its single frames saw it. words (n,): what the animal really did;
-    animal: who it is; wall_mm (n,): from its middle to the nearest wall, NaN where nobody knows;
-    truth (n, J, 3) mm: its true joints; cut: the word of a cut-out action, of which a little before
-    and after is seen as well.
+class AgentTrack:
+    """An acted recording of n frames as its single frames saw it, with labels and truth.
+
+    Attributes:
+        seen: hypotheses of all frames, arena frame.
+        subject: the animal and its camera.
+        words: (n,) what the animal really did.
+        animal: who it is.
+        wall_mm: (n,) distance of its middle from the nearest wall, mm; NaN where nobody knows.
+        truth: (n, J, 3) float32 true joints, mm, arena frame.
+        cut: the word of a cut-out action, of which a little before and after is seen as well; ''
+            for an uncut recording.
     """
 
     seen: Observations
@@ -84,8 +100,11 @@ class Acted:
     cut: str = ""
 
     def tracked(self, rate_hz: float = 0.0) -> LabelledTrack:
-        """Its track; rate_hz: as a camera of so many frames a second would have seen it, which has
-        only the frames nearest to its times to go by; 0 all.
+        """The labelled track of the recording, of a cut-out action the frames of that action alone.
+
+        Args:
+            rate_hz: as a camera of so many frames per second would have seen it, which has only the
+                frames nearest to its times to go by; 0 takes all frames.
         """
         rows = np.arange(len(self.words)) if not rate_hz else thinned(self.seen.times_ns, rate_hz)
         seen = Observations(
@@ -99,8 +118,11 @@ class Acted:
 
 
 def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """The rows of frames at these times that lie nearest to those of a camera of another rate; none
-    twice.
+    """Rows (m,) of the frames that lie nearest to those of a camera of another rate; none twice.
+
+    Args:
+        times_ns: (n,) int64 times of the frames, ns.
+        rate_hz: frames per second of the other camera.
     """
     times = (times_ns - times_ns[:1]) * 1e-9
     wanted = np.arange(0.0, times[-1] + 1e-9, 1.0 / rate_hz)
@@ -111,17 +133,32 @@ def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
 def acted_tracks(
     scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[LabelledTrack]:
-    """The tracks of `acted`, by the present tracker."""
+    """The labelled tracks of scenarios, by the present tracker; see `acted`.
+
+    Args:
+        scenarios: what is to be acted.
+        estimator: measures the frames.
+        progress: told recording by recording.
+    """
     return [one.tracked() for one in acted(scenarios, estimator, progress)]
 
 
 def acted(
     scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
-) -> list[Acted]:
-    """All scenarios, kept from earlier or measured now. Cut-outs of one individual share its size
-    and one file.
+) -> list[AgentTrack]:
+    """All scenarios as single frames saw them, from the cache or measured now.
+
+    Cut-outs of one individual share its measured size and one file of the cache.
+
+    Args:
+        scenarios: all uncut, or all cut-out actions, of one animal.
+        estimator: measures the frames; its model's digest is a part of the cache key.
+        progress: told recording by recording, where one has to be measured.
+
+    Returns:
+        One for each scenario, in their order.
     """
-    found: dict[int, Acted] = {}
+    found: dict[int, AgentTrack] = {}
     made_by = estimator.model.digest()
     whole = bool(scenarios[0].seconds)
     for name in dict.fromkeys((k if whole else one.individual) for k, one in enumerate(scenarios)):
@@ -132,7 +169,7 @@ def acted(
         path = cache_folder() / "acted" / f"{animal}-seen-{key}.npz"
         if not path.is_file():
             sizes: dict[int, float] = {}
-            measured: list[Acted] = []
+            measured: list[AgentTrack] = []
             for one in group:
                 progress(
                     len(found) + len(measured), len(scenarios), "acting, rendering and measuring"
@@ -145,15 +182,20 @@ def acted(
 
 def act(
     scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | None = None
-) -> Acted:
-    """One scenario acted, rendered and measured; sizes: of individuals that have been measured
-    already.
+) -> AgentTrack:
+    """One scenario acted, rendered and measured frame by frame.
+
+    Args:
+        scenario: what is to be acted.
+        estimator: measures the frames.
+        sizes: size over home size by individual; those in it are taken, others are measured over up
+            to 128 frames and added. None starts without any.
     """
     stage = {"fish": _fish, "mouse": _mouse}[scenario.animal]
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     motion, rows, pose, girth, walls, habits, camera, shape, room = stage(scenario, rng)
     window_px = _FISH_WINDOW if scenario.animal == "fish" else _MOUSE_WINDOW
-    tracker = WindowTracker(estimator)
+    tracker = PatchObserver(estimator)
     sizes = {} if sizes is None else sizes
     n_sample = 1 if scenario.individual in sizes else min(_SIZE_FRAMES, len(rows))
     some = np.linspace(0, len(rows) - 1, n_sample).astype(int)
@@ -182,7 +224,7 @@ def act(
     whole = Camera(*camera.intrinsics, *(int(x) for x in camera.picture))
     subject = tracker.subject(whole, sample.floor(0).T_arena_camera, size)
     wall = np.full(n, np.nan) if room is None else room[:n]
-    return Acted(
+    return AgentTrack(
         seen,
         subject,
         motion.word[rows[:n]],
@@ -199,16 +241,16 @@ _Staged = tuple[
     Pose,
     Array,
     Array | None,
-    FishHabits | MouseHabits,
-    Camerawork,
+    FishSpecies | MouseSpecies,
+    CameraPath,
     BodyShape,
     Array | None,
 ]
 
 
 def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
-    """A fish on its stage."""
-    habits = FishHabits()
+    """A fish in a tank: its motion, poses and camera."""
+    habits = FishSpecies()
     own = np.random.default_rng([scenario.individual, 0])
     fish = Individual.draw(own, (25.0 / 30.0, 34.0 / 30.0), scenario.novel)
     shape = habits.shapes(own, "train", 1)
@@ -219,13 +261,13 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     motion = actor.cut(rng, scenario.word) if scenario.word else actor.uncut(rng, scenario.seconds)
     rows = motion.at(scenario.rate_hz)
     pose = fish_acts.fish_poses(rng, habits, motion, rows, fish.size)
-    camera = Camerawork.draw(rng, habits, habits.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
+    camera = CameraPath.draw(rng, habits, habits.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
     return motion, rows, pose, np.full(len(rows), fish.size), None, habits, camera, shape, None
 
 
 def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
-    """A mouse in its box."""
-    habits = MouseHabits()
+    """A mouse in a box: its motion, poses, girth, camera, and wall distances, mm."""
+    habits = MouseSpecies()
     own = np.random.default_rng([scenario.individual, 0])
     mouse = Individual.draw(own, (0.95, 1.3), scenario.novel)
     shape = habits.shapes(own, "train", 1)
@@ -236,7 +278,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     pose, girth = mouse_acts.mouse_poses(rng, habits, motion, rows, mouse.size, shape)
     middle = pose.joints(habits.skeleton)[..., :2].mean(axis=1)
     sensor = habits.sensors[int(rng.integers(len(habits.sensors)))]
-    camera = Camerawork.draw(rng, habits, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
+    camera = CameraPath.draw(rng, habits, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
     room = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
     known = (
         scenario.novel or rng.random() < 0.75
@@ -255,7 +297,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
 
 
 def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
-    """The wall nearest to each place (n, 2) mm, as the renderer takes it."""
+    """The wall nearest to each position (n, 2) mm, as columns (n, WALL_COLUMNS) of the renderer."""
     walls = np.zeros((len(middle), WALL_COLUMNS))
     axis = np.argmin(half - np.abs(middle), axis=1)
     rows = np.arange(len(middle))
@@ -268,13 +310,13 @@ def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
 
 
 def _generator(animal: str) -> bytes:
-    """A hash of the code that acts."""
+    """SHA-256 of the code that generates and renders the behaviour."""
     folder = Path(agents.__file__).parent
     names = (*_SOURCES, f"{animal}.py")
     return hashlib.sha256(b"".join((folder / name).read_bytes() for name in names)).digest()
 
 
-def _save(path: Path, group: list[Acted]) -> None:
+def _save(path: Path, group: list[AgentTrack]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     columns: dict[str, Any] = {
         name: np.concatenate([_of_animal(one.seen, name) for one in group]) for name in COLUMNS
@@ -299,15 +341,15 @@ def _save(path: Path, group: list[Acted]) -> None:
 
 
 def _of_animal(seen: Observations, name: str) -> NDArray[Any]:
-    """A column of what was seen, without the hypotheses of a second thing in view."""
+    """A column of the observations without the hypotheses of a second object in view."""
     values = getattr(seen, name)
     return np.asarray(values if values.ndim == 1 else values[:, :_WAYS])
 
 
-def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> list[Acted]:
+def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> list[AgentTrack]:
     with np.load(path) as kept:
         data = {name: kept[name] for name in kept.files}
-    tracker = WindowTracker(estimator)
+    tracker = PatchObserver(estimator)
     stops = np.cumsum(data["lengths"])
     found = []
     for k, (stop, length) in enumerate(zip(stops, data["lengths"], strict=True)):
@@ -318,7 +360,7 @@ def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> li
             camera, SE3(data["camera_turn"][k], data["camera_shift"][k]), float(data["sizes"][k])
         )
         found.append(
-            Acted(
+            AgentTrack(
                 seen,
                 subject,
                 data["words"][part],

@@ -1,4 +1,9 @@
-"""The paper's baselines as models: trained when first asked for, kept in the user's cache."""
+"""Training of the paper's baselines RF and CNN (Lie-X section 5.2), kept in the user's cache.
+
+RF is a pair of regression forests, CNN an AlexNet that regresses all joints. Both learn when they
+are first asked for, from rendered images like those of our own models, half of them degraded; the
+number of images is fixed here, so that a baseline stays what it is when our models learn from more.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +33,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Training:
-    """What a baseline is trained on, and how."""
+    """What a baseline is trained on, and how.
+
+    Attributes:
+        recipe: the rendered images.
+        plan: numbers of the forests or of the network.
+    """
 
     recipe: Recipe
     plan: ForestPlan | CnnPlan
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values: equal ones, equal training."""
+        """Plain values of the training, a cache key: equal values mean equal training."""
         plain: dict[str, Any] = json.loads(
             json.dumps({"recipe": vars(self.recipe), "plan": asdict(self.plan)})
         )
@@ -51,10 +61,16 @@ _DEGRADED = 0.5
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
-    """Rendered images as our own model learns from, half of them degraded; all animals near home
-    size, for like the paper's variant the baselines are told nothing of an animal's size. Their
-    number is no one else's, so that a baseline stays what it is when our own model learns from more
-    or fewer.
+    """The training of a baseline: images as our own model learns from, half of them degraded.
+
+    All animals are near home size since, like the paper's variant, the baselines are told nothing
+    of an animal's size. The number of images is the baseline's own (40,960 for the mouse, 20,480
+    for the hand, 16,384 for others); the CNN sees about 122,880 in all, over as many epochs as that
+    takes.
+
+    Args:
+        variant: `rf` or `cnn`, a key of `BASELINES`.
+        skeleton: the animal's skeleton.
     """
     from .pose_model import recipe_of
 
@@ -69,7 +85,16 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
 
 
 def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> Baseline:
-    """The baseline of an animal, from the cache or trained now."""
+    """The baseline of an animal, from the cache or trained now.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: `rf` or `cnn`.
+        progress: told how far the training is.
+
+    Raises:
+        MissingPackageError: the CNN is asked for and torch is not installed.
+    """
     from liex_lab.body.skeleton import Skeleton
 
     if variant == "cnn":
@@ -85,7 +110,13 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
 
 
 def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:
-    """Where the cache keeps it; its card lies beside it, as .json."""
+    """The path at which the cache keeps a baseline (.npz); its card lies beside it as .json.
+
+    Args:
+        variant: `rf` or `cnn`.
+        skeleton: the animal's skeleton.
+        training: what it is trained on; a hash of it and of the program's version is in the name.
+    """
     from liex_lab.sessions.provenance import package_version
 
     from .pose_model import cache_folder
@@ -100,7 +131,15 @@ def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Pat
 def train_baseline(
     variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress
 ) -> None:
-    """Train and write a baseline, and its card."""
+    """Train a baseline and write it with its card, under its own name only when it is whole.
+
+    Args:
+        variant: `rf` or `cnn`.
+        skeleton: the animal's skeleton.
+        training: images and numbers.
+        path: where the model is written (.npz); the card goes beside it (.json).
+        progress: told how far rendering and training are.
+    """
     import numba
 
     from liex_lab.estimation.method import method_of
@@ -114,6 +153,7 @@ def train_baseline(
     began = time.perf_counter()
 
     def tell(share: float, what: str) -> None:
+        """Report that a `share` (0 to 1) of the training is done, and `what` is being trained."""
         progress(round(100 * share), 100, f"training {what}")
 
     model = _trained(training, data, skeleton, tell)

@@ -1,10 +1,16 @@
-"""The job `liex train tracking`: what the tracker believes of an animal, found on rendered
-sequences with the truth.
+"""Fit of the tracker's motion model and error calibration on rendered sequences with truth.
 
-Sequences of the kinds that tracking is measured on, with other seeds, are measured frame by frame
-once; what the filter says of its own errors is held against them. Before that, if it is asked for,
-numbers of the chain and of the motion are changed at random, some at a time, and kept where the
-tracks come nearer to the truth.
+`liex train tracking` measures sequences of the kinds that tracking is evaluated on, with other
+seeds, frame by frame once. Three fits follow on these observations:
+
+- If asked for, a random search (hill climbing): up to three numbers of association and motion are
+  multiplied by log-normal factors, sd 0.5, and kept where the tracks come nearer to the truth.
+- Calibration factors of the joints (`honest`) at three levels of the stated error, by bisection,
+  together with the standard deviation of the body's stretch over a grid of two coefficients, so
+  that nine errors in ten lie within the 90 % interval, in all sequences and in each of them.
+- The same factors for the root's six coordinates and for the bend angles about three axes.
+
+Everything starts from fixed seeds, so `tunings.toml` is byte for byte the same on every run.
 """
 
 from __future__ import annotations
@@ -63,8 +69,17 @@ _CHUNK = 32
 
 @dataclass(frozen=True)
 class Seen:
-    """A sequence as it was measured: what frames say, of whom, and the true poses (n) and joints
-    (n, J, 3) mm in the same arena. blur, size_spread: see `FrameTracker`.
+    """A rendered sequence as it was measured: what frames say, of whom, and the truth.
+
+    Attributes:
+        kind: `easy` or `hard`.
+        seen: hypotheses of all n frames, arena frame.
+        subject: the animal and its camera.
+        pose: (n) true poses, in the same arena frame.
+        truth: (n, J, 3) true joints, mm, in the same arena frame.
+        events: what happens in the sequence, such as occlusions.
+        blur: median distance of body and depth over the body's length, see `FrameTracker`.
+        size_spread: standard deviation of the log size that frames tell, see `FrameTracker`.
     """
 
     kind: str
@@ -77,7 +92,12 @@ class Seen:
     size_spread: float
 
     def errors(self, joints: Array) -> Array:
-        """Errors over the animal's length of the frames in view, as `in_view_ratio` counts them."""
+        """Errors (m,) over the length of the frames in view, as `in_view_ratio` counts them.
+
+        Args:
+            joints: (n, J, 3) joints of a track, mm, arena frame; NaN where there is no pose, which
+                counts as an error of half the length.
+        """
         length = self.subject.length_mm
         return (
             Followed(joints, self.truth, joints[..., 0], 1.0).in_view(self.events, length) / length
@@ -94,12 +114,22 @@ def train_tracking(
     workers: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Write `tunings.toml` with an animal's table found again, byte for byte the same whenever and
-    however it is run.
+    """Write `tunings.toml` with an animal's table fitted again; the same bytes on every run.
 
-    Chain and motion are those of the file, or the best of n_tries changes of them; how far off the
-    track may be is measured. n_frames, seeds: of other sequences than `SEEDS`; workers: threads, 0
-    for all.
+    Association and motion are those of the file, or the best of `n_tries` changes of them; how far
+    off the track may be is always measured anew.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        out: path of the file that is written; it holds the other animals' tables as they are.
+        n_tries: steps of the random search; 0 leaves association and motion alone.
+        n_frames: frames of each sequence; None takes its usual length.
+        seeds: of the sequences, instead of `SEEDS`.
+        workers: threads of the kernels; 0 takes all.
+        progress: told how far the job is.
+
+    Returns:
+        `out`.
     """
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
@@ -117,7 +147,18 @@ def train_tracking(
 def measure(
     animal: str, kind: str, seed: int, n_frames: int | None, progress: Progress = silent
 ) -> Seen:
-    """One sequence, frame by frame; scene and size are found by the product."""
+    """One rendered sequence, measured frame by frame; background and size are found by the product.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        kind: `easy` or `hard`.
+        seed: of the sequence.
+        n_frames: its length; None takes the usual one.
+        progress: told frame by frame.
+
+    Returns:
+        Observations and truth in the arena frame that the product found.
+    """
     plan = plan_of(animal)
     estimator = estimator_of(animal, "default", progress)
     recording = tracking_sequence(
@@ -152,7 +193,18 @@ def search(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Tuning:
-    """The best of n random changes in a row, each of up to three numbers."""
+    """The best tuning of a random search; a step changes up to three numbers of the best so far.
+
+    Args:
+        measured: the sequences.
+        tuning: where the search starts.
+        n_tries: number of steps.
+        rng: draws the changes.
+        progress: told the step and the cost.
+
+    Returns:
+        The tuning with the least cost; `tuning` itself where nothing is better.
+    """
     alone = {kind: _of_kind(measured, kind, None) for kind in SEEDS}
     best = _cost(measured, alone, tuning)
     for tried in range(n_tries):
@@ -168,7 +220,14 @@ def search(
 
 
 def changed(tuning: Tuning, rng: np.random.Generator) -> Tuning:
-    """The same with one number multiplied at random."""
+    """The same tuning with one number multiplied by a log-normal factor, sd of the logarithm 0.5.
+
+    Numbers that have a fit of their own (`_FOUND_OTHERWISE`, such as the calibration factors) stay.
+
+    Args:
+        tuning: what is changed; of association in 35 % of the cases, else of motion.
+        rng: draws the number and the factor.
+    """
     factor = float(np.exp(rng.normal(0.0, _STEP)))
     part = "chain" if rng.random() < 0.35 else "motion"
     values: Any = getattr(tuning, part)
@@ -208,8 +267,10 @@ def _track(each: Seen, tuning: Tuning | None) -> Track:
 
 
 def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: Tuning) -> float:
-    """Mean, median, third quartile and 95th percentile of the errors over those of single
-    frames.
+    """Cost of a tuning: its errors over those of single frames, in four statistics.
+
+    The ratios of mean, median, 75 % and 95 % quantile are summed, those of easy sequences with a
+    weight of 2: a track must never be worse than single frames where these are good.
     """
     total = 0.0
     for kind, weight in (("easy", _EASY_WEIGHT), ("hard", 1.0)):
@@ -222,15 +283,26 @@ def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: Tuning) -> 
 
 
 def with_motion(tuning: Tuning, **changes: Any) -> Tuning:
-    """The same with something else in its motion."""
+    """The same tuning with some numbers of its motion replaced.
+
+    Args:
+        tuning: what is changed.
+        **changes: fields of `Motion` by their names.
+    """
     return replace(tuning, motion=replace(tuning.motion, **changes))
 
 
 @dataclass(frozen=True)
 class _Claim:
-    """What the filter says of a sequence's frames that have a pose, over the animal's length: said
-    (n,); sd (n, J) and away (n, J), see `stretch_of`, of a stretch of 1; off (n, J, 3): how far off
-    the joints are.
+    """Stated and true errors of a sequence's frames that have a pose, over the animal's length.
+
+    Attributes:
+        blur: see `Seen`.
+        size_spread: see `Seen`.
+        said: (n,) stated mean joint error.
+        sd: (n, J) stated standard deviation of each joint.
+        away: (n, J) standard deviation that a stretch of 1 gives each joint, see `stretch_of`.
+        off: (n, J, 3) how far off the joints are.
     """
 
     blur: float
@@ -241,11 +313,16 @@ class _Claim:
     off: Array
 
     def stretch_sd(self, per_blur: float, per_spread: float) -> float:
-        """The sequence's `Subject.stretch_sd`."""
+        """The sequence's `Subject.stretch_sd` at coefficients `per_blur` and `per_spread`."""
         return float(np.hypot(per_blur * self.blur, per_spread * self.size_spread))
 
     def over(self, knots: Knots, stretch: tuple[float, float]) -> Array:
-        """Errors (n, J, 3) over their standard deviations."""
+        """Errors (n, J, 3) over their calibrated standard deviations.
+
+        Args:
+            knots: (stated error, factor) pairs, interpolated over the logarithm.
+            stretch: coefficients of blur and of size spread.
+        """
         factor = np.interp(
             np.log(self.said), *np.array([(np.log(said), factor) for said, factor in knots]).T
         )
@@ -254,8 +331,15 @@ class _Claim:
 
 
 def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
-    """The same with the `stretch` and `honest` by which nine errors in ten lie within their
-    intervals in all sequences together, and as nearly as possible in each of them.
+    """The same tuning with factors and stretch by which the joints' 90 % intervals hold 90 %.
+
+    Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
+    all sequences together; the pair is taken by which each sequence alone comes nearest, in the
+    mean squared logarithm of the factor that it still lacks.
+
+    Args:
+        measured: the sequences.
+        tuning: what is changed: `honest`, `stretch` and `usual_stretch` of its motion.
     """
     plain = with_motion(tuning, honest=((1.0, 1.0),), stretch=(0.0, 0.0), usual_stretch=0.0)
     claims = [_claim(each, plain) for each in measured]
@@ -276,7 +360,7 @@ def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
 
 
 def _claim(each: Seen, plain: Tuning) -> _Claim:
-    """What the filter says of a sequence by itself."""
+    """Stated and true errors of a sequence tracked with factors of 1 and no stretch."""
     length = each.subject.length_mm
     track = _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain)
     there = track.posed
@@ -292,8 +376,17 @@ def _claim(each: Seen, plain: Tuning) -> _Claim:
 
 
 def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
-    """How many times larger errors are than the filter says, by what it says, beside a stretch: see
-    `Motion.honest`.
+    """Calibration factors at three levels of the stated error, by bisection; see `Motion.honest`.
+
+    The frames are cut into `_BINS` groups of equal size by their stated error. In each the factor f
+    is sought at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
+
+    Args:
+        claims: stated and true errors of all sequences.
+        stretch: coefficients of blur and of size spread.
+
+    Returns:
+        (median stated error over the length, factor) for each group, in rising order.
     """
     said, sd, off = (
         np.concatenate([getattr(claim, name) for claim in claims]) for name in ("said", "sd", "off")
@@ -317,8 +410,14 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
 
 
 def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
-    """The same with the `honest_root` and `honest_bend` by which nine errors in ten lie within
-    their intervals.
+    """The same tuning with factors by which 90 % intervals of root and bends hold 90 %.
+
+    The root's error is the twist log(g_est^-1 g_true), rotation and then translation in its own
+    frame.
+
+    Args:
+        measured: the sequences.
+        tuning: what is changed: `honest_root` (6,) and `honest_bend` (3,) of its motion.
     """
     plain = with_motion(tuning, honest_root=(1.0,) * 6, honest_bend=(1.0,) * 3)
     roots = []

@@ -1,5 +1,16 @@
-"""The job `liex train`: rendered images in, a model with its card out, the same bytes whenever it
-is run.
+"""Training of a pose model: Algorithm 2 of Lie-X (section 4.1) on rendered depth, `liex train`.
+
+Per skeleton joint and round a regression forest learns the twist that is still missing,
+`d_theta = log(g_est^-1 g_true)` (Eq 11), from the state that its predecessors leave behind; a
+further forest, boosted in the default variant, learns the mean joint error of a pose without the
+truth (the learned metric Rm). Images that no tree has seen teach, in this order, the correction of
+the chosen pose of an animal that is one chain (a boosted forest, a ridge regression, or neither),
+the calibration of the predicted error with its 90 % interval, and the head-tail classifier.
+
+Images are rendered from a seed, cut out by the product's own foreground segmentation, and made in
+numbered blocks. The forests grow from seeds and BLAS runs on one thread, so the same command
+writes the same bytes whenever it is run. `Recipe` says how much of what a model sees; `RECIPES` and
+`_OWN` hold one for each animal and variant.
 """
 
 from __future__ import annotations
@@ -23,20 +34,27 @@ if TYPE_CHECKING:
     from liex_lab.estimation.method import Method
     from liex_lab.estimation.model import Model
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.foreground.background_segmenter import Crops
-    from liex_lab.simulation.training_patches import TrainingWindows
+    from liex_lab.foreground.height_maps import HeightMaps
+    from liex_lab.simulation.training_patches import TrainingPatches
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How much a model is trained on. degraded_share of the images have up to 2.5 times the noise
-    (METHOD lesson 5).
+    """How many rendered images a model is trained on, and of which animals.
 
-    sizes: the animals' mean spine in mm and the window in pixels that holds them, for one block of
-    images after the other; 0 is the skeleton's own length. Features do not depend on size, but
-    pixels and noise do.
+    Features do not depend on the animal's size, but pixels and noise do, so the images cover
+    several sizes, one after the other by block.
+
+    Attributes:
+        seed: seed of the images and of the forests.
+        n_images: images for the cascade and the learned metric.
+        n_correction: further images for the correction of the chosen pose; 0 leaves it out.
+        n_calibration: further images for the predicted error; 0 leaves the calibration out.
+        degraded_share: share of the images that have up to 2.5 times the noise (METHOD lesson 5).
+        sizes: (mean spine length mm, patch width px that holds the animal), for one block of images
+            after the other; a length of 0 is the skeleton's own.
     """
 
     seed: int = 20
@@ -58,8 +76,8 @@ class Recipe:
 _CALIBRATION = 1
 _CORRECTION = 2
 # of the images that an animal's predicted error is calibrated on show bodies that vary as
-# individuals do; intervals for
-# bodies that vary far more, as the others do, are wider than most animals need
+# individuals do; intervals for bodies that vary far more, as the others do, are wider than most
+# animals need
 _ORDINARY_SHARE = {"mouse": 0.5}
 _AREAS_MM2 = {
     "mouse": 1070.0
@@ -95,13 +113,23 @@ _OWN: dict[tuple[str, str], Recipe] = {
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
-    """How much the variant is trained on for an animal; for one of the user's own, sizes around its
-    home length.
+    """The recipe of a variant for an animal: its own where it has one, else that of the variant.
+
+    An animal of the user's own (a skeleton from TOML) gets as many images as the fish, of sizes
+    around its home length: 1, 0.8, 1 and 1.25 times it, and of the paper's variant the first of
+    these alone.
+
+    Args:
+        variant: `default` or `paper`, a key of `RECIPES`.
+        skeleton: the animal's skeleton.
+
+    Returns:
+        The recipe.
     """
-    from liex_lab.simulation.simulator import GenericWorld, world_of
+    from liex_lab.simulation.simulator import GenericSimulator, world_of
 
     world = world_of(skeleton)
-    if not isinstance(world, GenericWorld):
+    if not isinstance(world, GenericSimulator):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
     sizes = tuple(
         (factor * skeleton.length, world.window_px(factor * skeleton.length))
@@ -120,10 +148,22 @@ def train_model(
     n_images: int | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Train an animal's model and write it, and its card, to `out` (.npz); returns the path.
+    """Train an animal's pose model and write it with its card beside it (`.json`).
 
-    animal: a known one, or the path of a skeleton's TOML; n_images: to train on, and a quarter of
-    that to correct and to calibrate on, instead of what the recipe says.
+    The model is written under another name and renamed when it is whole. The card holds how it was
+    made, its SHA-256 and its number of bytes.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: `default` or `paper`.
+        out: path of the model file (.npz); missing folders are made.
+        workers: threads of the kernels, at most those of the machine; 0 takes all of them.
+        n_images: images to train on instead of what the recipe says, and a quarter of that each for
+            the correction and for the calibration.
+        progress: told how far the job is.
+
+    Returns:
+        The path of the model.
     """
     import numba
 
@@ -154,8 +194,21 @@ def train_model(
 
 @serial_products()
 def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
-    """Algorithm 2, the learned metric, and on images that no tree has seen the last correction and
-    the calibration.
+    """A trained model: cascade, learned metric, and what held-out images teach of its choices.
+
+    The cascade and the metric are Algorithm 2 of Lie-X. Images that no tree has seen then teach the
+    correction of the chosen pose, the calibration of the predicted error and the head-tail
+    classifier, where method and recipe have them. Images are numbered in blocks, and amounts that
+    are whole blocks share no image.
+
+    Args:
+        skeleton: the animal's skeleton.
+        method: the variant's numbers: rounds, candidates, growth of the forests.
+        recipe: how many images of what.
+        progress: told how far the job is.
+
+    Returns:
+        The model with its card, in memory.
     """
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
     from liex_lab.estimation.model import Calibration, Model
@@ -167,6 +220,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     steps = len(skeleton.solved) * method.rounds + 2
 
     def tell(share: float, what: str) -> None:
+        """Report that a `share` (0 to 1) of the forests is grown, and `what` is being grown."""
         progress(round(share * (steps - 2)), steps, f"growing forests: {what}")
 
     cascade, candidates = train_cascade(data, skeleton, method, rng, tell)
@@ -214,8 +268,22 @@ def rendered_set(
     progress: Progress,
     family: str = "augmented",
 ) -> TrainingSet:
-    """N training images from number `first` on, of bodies of a family, cut out by the product's own
-    foreground.
+    """Training images from number `first` on, segmented, with the truth in their view frames.
+
+    Images come in whole blocks, so there are at least n of them before those are left out in which
+    animal and distractor have run together; of each picture up to two objects are cut.
+
+    Args:
+        skeleton: the animal's skeleton.
+        method: the variant: camera or height view, session size or none.
+        recipe: seed, sizes and share of degraded images.
+        first: number of the first image; it is rounded up to whole blocks.
+        n: how many images are rendered; it is rounded up to whole blocks.
+        progress: told block by block.
+        family: family of body shapes, `augmented` (more varied than individuals are) or `train`.
+
+    Returns:
+        The images, animals and other objects of about their size.
     """
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.simulation.simulator import world_of
@@ -242,8 +310,20 @@ def rendered_set(
 
 
 def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
-    """Training images from number `first` on as a model is calibrated on them: some of ordinary
-    bodies, see `_ORDINARY_SHARE`, the rest as varied as those that it was trained on.
+    """Held-out images as a model's predicted error is calibrated on them.
+
+    A share of them (`_ORDINARY_SHARE`, half for the mouse) shows bodies that vary as individuals
+    do, the rest bodies as varied as those the model was trained on: intervals from the latter alone
+    would be wider than most animals need.
+
+    Args:
+        skeleton: the animal's skeleton.
+        method: the variant.
+        recipe: seed, sizes, and `n_calibration`, the number of images in all.
+        first: number of the first image.
+
+    Returns:
+        The images, varied bodies first.
     """
     from liex_lab.estimation.training import TrainingSet
 
@@ -257,53 +337,83 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
     )
 
 
-def cut_out(skeleton: Skeleton, method: Method, windows: TrainingWindows) -> TrainingSet:
-    """Training images of what the foreground found in the windows, with the truth in their view
-    frames.
+def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> TrainingSet:
+    """Training images of the two largest finds of the product's segmentation in each patch.
+
+    A hand is segmented by distance (`HandPatches`), every other animal by background subtraction
+    (`Patches`) with the patch's own estimated floor and, where the sensor's noise is known, a
+    threshold of `SPREADS` standard deviations of the background's readings.
+
+    Args:
+        skeleton: the animal's skeleton; its view says which segmentation is used.
+        method: the variant; whether crops follow the camera's axis, and whether the size is known.
+        windows: rendered patches with their background and truth.
+
+    Returns:
+        The images of the first finds of all patches, then those of the second ones.
     """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.foreground.background_segmenter import SPREADS, Windows
-    from liex_lab.foreground.hand_segmenter import NearestWindows
+    from liex_lab.foreground.background_segmenter import SPREADS
+    from liex_lab.foreground.hand_segmenter import HandPatches
+    from liex_lab.foreground.height_maps import Patches
 
     size = windows.spine_mm / skeleton.length
     origin = windows.origin.astype(float)
     shown = size if method.session_size else np.ones(len(size))
     if skeleton.view.foreground == FOREGROUNDS[1]:
-        held = NearestWindows(windows.depth, windows.intrinsics, origin, skeleton.view)
-        crops, looks = held.extract(shown, method.camera_view, n_things=2)
+        held = HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view)
+        crops, crop_cameras = held.extract(shown, method.camera_view, n_things=2)
     else:
         depth, background = (
             picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
             for picture in (windows.depth, windows.background)
         )
-        cut = Windows(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+        cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
         area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
         # a scene learned from a recording knows how much its readings spread
         least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-        crops, looks = cut.extract(shown, area, least, method.camera_view, n_things=2)
+        crops, crop_cameras = cut.extract(shown, area, least, method.camera_view, n_things=2)
     n = len(size)
     return TrainingSet.join(
         [
-            with_truth(skeleton, method, windows, crops[thing], looks[thing])
+            with_truth(skeleton, method, windows, crops[thing], crop_cameras[thing])
             for thing in (slice(n), slice(n, None))
         ]
     )
 
 
 def with_truth(
-    skeleton: Skeleton, method: Method, windows: TrainingWindows, crops: Crops, looks: Array
+    skeleton: Skeleton,
+    method: Method,
+    windows: TrainingPatches,
+    crops: HeightMaps,
+    crop_cameras: Array,
 ) -> TrainingSet:
-    """Training images of blobs that were cut from the windows, with the truth in their view
-    frames.
+    """Training images of segmented blobs, labelled as animal or other object by the true pose.
+
+    A blob within 0.4 spine lengths of the true middle (in the image plane and, in the camera's
+    view, in depth) is the animal, one beyond 0.8 of it is another object, which teaches the learned
+    metric alone. In between the two have run together; such images are left out, as they teach
+    nothing.
+
+    Args:
+        skeleton: the animal's skeleton.
+        method: the variant; whether crops follow the camera's axis.
+        windows: the patches (n) that the blobs were cut from, with root poses, angles and scales.
+        crops: the blobs' height maps (n), one a patch.
+        crop_cameras: (n, 17) crop cameras, which give the view frame of each.
+
+    Returns:
+        The images that are left, poses in their view frames, mm.
     """
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.foreground.height_maps import view_of
+    from liex_lab.foreground.crop_camera import view_of
     from liex_lab.geometry import SE3
 
-    T_view_camera = view_of(looks)
+    T_view_camera = view_of(crop_cameras)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
     joints = frames.translation
@@ -324,7 +434,7 @@ def with_truth(
         animal | other
     )  # in between the two have run together, which teaches nothing
     return TrainingSet(
-        ImageSet(crops.heights[good], looks[good], crops.moments[good]),
+        ImageSet(crops.heights[good], crop_cameras[good], crops.moments[good]),
         Truth(frames.rotation[good], joints[good], pose.scale[good]),
         (windows.spine_mm / skeleton.length)[good],
         animal[good],
@@ -332,15 +442,32 @@ def with_truth(
 
 
 def home_area_mm2(skeleton: Skeleton) -> float:
-    """About the area of a home-sized animal seen from above."""
+    """About the area, mm^2, of a home-sized animal seen from above; it only ranks blobs by size.
+
+    Args:
+        skeleton: the animal's skeleton.
+
+    Returns:
+        A stated value for the mouse, else the area of the skeleton's surface in the home pose.
+    """
     from liex_lab.body.surface import Surface
 
     return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
 
 
 def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
-    """A model that does not come with the package, trained once and kept in the user's cache
-    folder.
+    """The path of a model that is not bundled: trained once, kept in the user's cache folder.
+
+    Its name holds a hash of the program's version, method, recipe and skeleton; where one of these
+    changes, a new model is trained.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: `default` or `paper`.
+        progress: told how far the training is, where there is one.
+
+    Returns:
+        The path of the model (.npz).
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.method import method_of
@@ -362,7 +489,7 @@ def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path
 
 
 def cache_folder() -> Path:
-    """Where programs of this user keep what can be made again."""
+    """The user's folder for what can be made again: `LIEX_CACHE`, or the system's cache folder."""
     if stated := os.environ.get("LIEX_CACHE"):
         return Path(stated)
     if sys.platform == "win32":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.actions.semi_markov import ActionChain
+from liex_lab.actions.semi_markov import SemiMarkovModel
 from tests.oracles.actions import every_path
 
 
@@ -13,7 +13,7 @@ from tests.oracles.actions import every_path
 def test_best_path_and_probabilities_agree_with_every_path(seed: int) -> None:
     rng = np.random.default_rng(seed)
     follow = rng.random((3, 3)) * (1 - np.eye(3))
-    chain = ActionChain(
+    chain = SemiMarkovModel(
         np.array([1.0, 2.0, 1.0]), np.array([2.5, 3.0, 1.6]), follow / follow.sum(1, keepdims=True)
     )
     scores = rng.normal(0.0, 1.0, (6, 3))
@@ -31,7 +31,7 @@ def test_best_path_and_probabilities_agree_with_every_path(seed: int) -> None:
 
 def test_no_action_is_shorter_than_its_shortest_but_at_the_ends() -> None:
     rng = np.random.default_rng(1)
-    chain = ActionChain(
+    chain = SemiMarkovModel(
         np.array([0.1, 0.5]), np.array([0.6, 0.9]), np.array([[0.0, 1.0], [1.0, 0.0]])
     )
     label = chain.decode(rng.normal(0.0, 2.0, (2000, 2)), 0.05)
@@ -43,7 +43,7 @@ def test_no_action_is_shorter_than_its_shortest_but_at_the_ends() -> None:
 
 
 def test_durations_and_successions_are_learned_from_bouts() -> None:
-    chain = ActionChain.learn([[(0, 1.0), (1, 2.0), (0, 1.2), (1, 2.2)]], 3)
+    chain = SemiMarkovModel.learn([[(0, 1.0), (1, 2.0), (0, 1.2), (1, 2.2)]], 3)
     assert chain.mean_s[:2] == pytest.approx([1.1, 2.1])
     assert chain.follow[0, 1] > chain.follow[0, 2]
     np.testing.assert_allclose(chain.follow.sum(axis=1), 1.0)
@@ -53,7 +53,7 @@ def test_pieces_of_a_long_recording_have_the_probabilities_of_the_whole(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(2)
-    chain = ActionChain(
+    chain = SemiMarkovModel(
         np.array([0.1, 0.3]), np.array([0.6, 0.9]), np.array([[0.0, 1.0], [1.0, 0.0]])
     )
     scores = rng.normal(0.0, 1.0, (900, 2))

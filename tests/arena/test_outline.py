@@ -17,10 +17,10 @@ from liex_lab.arena.outline import Arena, find_arena, fit_circle, fit_rectangle
 from liex_lab.foreground.background import learn_background
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera
 from liex_lab.recordings import open_recording
-from liex_lab.simulation.scene import Stage
+from liex_lab.simulation.scene import SimulatedScene
 
 
-def seen(stage: Stage, rng: np.random.Generator) -> np.ndarray:
+def seen(stage: SimulatedScene, rng: np.random.Generator) -> np.ndarray:
     """A stage's still picture with noise and unread pixels."""
     noisy = np.where(stage.still > 0, stage.still + rng.normal(0, 1.0, stage.still.shape), 0)
     return np.where(rng.random(noisy.shape) < 0.03, 0, noisy).astype(np.float32)
@@ -34,7 +34,7 @@ def test_drawn_arenas_are_found_as_they_are() -> None:
     kinds = {"round": 0, "rectangular": 0, "open": 0}
     for k in range(24):
         camera = (KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA)[k % 3]
-        stage = Stage.draw(rng, camera, 80.0)
+        stage = SimulatedScene.draw(rng, camera, 80.0)
         picture = seen(stage, rng)
         arena = find_arena(picture, find_floor(picture, camera), camera)
         kinds[arena.kind] += 1

@@ -106,7 +106,7 @@ def test_the_true_coordinates_unfold_to_the_true_pose():
 @given(n_points=st.integers(1, 40), phase=st.floats(0.0, 0.999))
 def test_points_lie_on_the_animal_and_are_spread_over_all_of_it(n_points, phase):
     data = training_set(toy_mice(1, 3), PAPER)
-    heights, look = data.images.heights[0], data.images.looks[0]
+    heights, look = data.images.heights[0], data.images.crop_cameras[0]
     points = np.full((n_points, 3), np.nan)
     kernels.animal_points(heights, look, phase, points)
     z = look[13] - points[:, 2]  # the paper's view is upright: y and z are turned over
@@ -192,12 +192,12 @@ def test_a_file_gives_the_forest_back_and_a_damaged_one_is_told_in_a_sentence(gr
 def test_the_plain_mean_is_the_mean_of_all_candidates():
     estimator = PoseEstimator(trained("paper").model)
     toy = toy_mice(8, 4)
-    crops, looks = see(toy.depths, SCENE, True)
-    _, positions, _, _ = estimator.candidates(crops, looks, 1.0)
+    crops, crop_cameras = see(toy.depths, SCENE, True)
+    _, positions, _, _ = estimator.candidates(crops, crop_cameras, 1.0)
     guesses = PlainMean(estimator).estimate(toy.depths, SCENE, 1.0)
     np.testing.assert_allclose(
         guesses.joints,
-        (positions.mean(axis=1) - [0, 0, 1] * looks[:, None, 13:14]) * [1, -1, -1],
+        (positions.mean(axis=1) - [0, 0, 1] * crop_cameras[:, None, 13:14]) * [1, -1, -1],
         atol=1e-9,
     )
     one = replace(estimator, n_candidates=1)

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.baselines.baseline import in_camera_frame, in_view_frame
 from liex_lab.baselines.patches import PATCH, frames_of, joints_of, patches_of, targets_of
 from liex_lab.estimation.method import METHODS
+from liex_lab.foreground.crop_camera import in_camera_frame, in_view_frame
 from tests.estimation.toy import toy_mice, training_set
 
 
@@ -28,11 +28,15 @@ def drawn(seed: int, step: int = 1) -> tuple[np.ndarray, np.ndarray]:
     heights = np.zeros((2, 96, 96), np.int16)
     heights[0, 20:51, 30:41] = rng.integers(1500, 2300, (31, 11))
     heights[1, 40:49, 5:90] = rng.integers(1, 2500, (9, 85))
-    looks = np.zeros((2, 17))
-    looks[:, :4] = 500.0, 510.0, 320.0, 240.0
-    looks[:, 4:13] = np.diag([1.0, -1.0, -1.0]).ravel()
-    looks[:, 13], looks[:, 14:16], looks[:, 16] = [700.0, 900.0], [[100, 50], [300, 200]], step
-    return heights, looks
+    crop_cameras = np.zeros((2, 17))
+    crop_cameras[:, :4] = 500.0, 510.0, 320.0, 240.0
+    crop_cameras[:, 4:13] = np.diag([1.0, -1.0, -1.0]).ravel()
+    crop_cameras[:, 13], crop_cameras[:, 14:16], crop_cameras[:, 16] = (
+        [700.0, 900.0],
+        [[100, 50], [300, 200]],
+        step,
+    )
+    return heights, crop_cameras
 
 
 def patch_by_hand(heights: np.ndarray, look: np.ndarray) -> np.ndarray:
@@ -58,24 +62,26 @@ def patch_by_hand(heights: np.ndarray, look: np.ndarray) -> np.ndarray:
 
 @given(seed=st.integers(0, 2**20), step=st.integers(1, 3))
 def test_what_is_said_of_joints_can_be_undone(seed, step):
-    heights, looks = drawn(seed, step)
-    frames = frames_of(heights, looks)
+    heights, crop_cameras = drawn(seed, step)
+    frames = frames_of(heights, crop_cameras)
     joints = np.random.default_rng(seed).uniform([-200, -150, 400], [200, 150, 1000], (2, 7, 3))
-    told = targets_of(joints, looks, frames)
+    told = targets_of(joints, crop_cameras, frames)
     assert told.shape == (2, 21)
-    np.testing.assert_allclose(joints_of(told, looks, frames), joints, atol=2e-3)
+    np.testing.assert_allclose(joints_of(told, crop_cameras, frames), joints, atol=2e-3)
 
 
 def test_a_patch_is_what_a_reader_would_cut():
-    heights, looks = drawn(3)
-    patches = patches_of(heights, looks, frames_of(heights, looks))
+    heights, crop_cameras = drawn(3)
+    patches = patches_of(heights, crop_cameras, frames_of(heights, crop_cameras))
     for k in range(2):
-        np.testing.assert_allclose(patches[k], patch_by_hand(heights[k], looks[k]), atol=0.05)
+        np.testing.assert_allclose(
+            patches[k], patch_by_hand(heights[k], crop_cameras[k]), atol=0.05
+        )
 
 
 def test_the_animal_fills_its_patch_and_its_middle_is_grey(data):
-    heights, looks = data.images.heights, data.images.looks
-    patches = patches_of(heights, looks, frames_of(heights, looks))
+    heights, crop_cameras = data.images.heights, data.images.crop_cameras
+    patches = patches_of(heights, crop_cameras, frames_of(heights, crop_cameras))
     assert patches.min() == 0.0
     assert patches.max() <= 255.0
     for patch in patches:
@@ -87,39 +93,41 @@ def test_the_animal_fills_its_patch_and_its_middle_is_grey(data):
 
 
 def test_a_camera_of_twice_the_resolution_sees_the_same_patch_and_the_same_joints():
-    heights, looks = drawn(1, step=1)
-    finer = looks.copy()
+    heights, crop_cameras = drawn(1, step=1)
+    finer = crop_cameras.copy()
     finer[:, :4] *= 2
     finer[:, 14:17] *= 2
     joints = np.random.default_rng(0).uniform([-50, -50, 500], [50, 50, 700], (2, 4, 3))
-    one, two = frames_of(heights, looks), frames_of(heights, finer)
+    one, two = frames_of(heights, crop_cameras), frames_of(heights, finer)
     np.testing.assert_allclose(
-        patches_of(heights, looks, one), patches_of(heights, finer, two), atol=1e-3
+        patches_of(heights, crop_cameras, one), patches_of(heights, finer, two), atol=1e-3
     )
     np.testing.assert_allclose(
-        targets_of(joints, looks, one), targets_of(joints, finer, two), atol=1e-5
+        targets_of(joints, crop_cameras, one), targets_of(joints, finer, two), atol=1e-5
     )
 
 
 def test_a_joint_in_the_middle_of_the_square_at_the_mean_depth_is_zero_and_nearer_is_positive():
-    heights, looks = drawn(2)
-    frames = frames_of(heights, looks)
+    heights, crop_cameras = drawn(2)
+    frames = frames_of(heights, crop_cameras)
     z = frames[:, 3] - [0.0, 10.0]
     x, y = (
-        (frames[:, 0] - looks[:, 2]) / looks[:, 0] * z,
-        (frames[:, 1] - looks[:, 3]) / looks[:, 1] * z,
+        (frames[:, 0] - crop_cameras[:, 2]) / crop_cameras[:, 0] * z,
+        (frames[:, 1] - crop_cameras[:, 3]) / crop_cameras[:, 1] * z,
     )
-    told = targets_of(np.stack([x, y, z], axis=-1)[:, None], looks, frames)
+    told = targets_of(np.stack([x, y, z], axis=-1)[:, None], crop_cameras, frames)
     np.testing.assert_allclose(told[0], 0.0, atol=1e-6)
     assert told[1, 2] == pytest.approx(10.0 / frames[1, 4])
 
 
 def test_view_and_camera_frame_undo_each_other(data):
-    looks, points = data.images.looks, data.truth.positions
-    camera = in_camera_frame(points, looks)
-    np.testing.assert_allclose(in_view_frame(camera, looks), points, atol=1e-9)
+    crop_cameras, points = data.images.crop_cameras, data.truth.positions
+    camera = in_camera_frame(points, crop_cameras)
+    np.testing.assert_allclose(in_view_frame(camera, crop_cameras), points, atol=1e-9)
     assert (camera[..., 2] > 300).all()
-    np.testing.assert_allclose(in_camera_frame(points[:, 0], looks), camera[:, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        in_camera_frame(points[:, 0], crop_cameras), camera[:, 0], atol=1e-12
+    )
 
 
 if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pyproject.toml
@@ -134,11 +142,13 @@ if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pypro
             train_cnn(some, toy.skeleton, plan, np.random.default_rng(0), lambda share, what: None)
             for _ in range(2)
         ]
-        heights, looks = some.images.heights[:32], some.images.looks[:32]
-        said = nets[0].joints(heights, looks)
-        off = np.linalg.norm(said - in_camera_frame(some.truth.positions[:32], looks), axis=-1)
+        heights, crop_cameras = some.images.heights[:32], some.images.crop_cameras[:32]
+        said = nets[0].joints(heights, crop_cameras)
+        off = np.linalg.norm(
+            said - in_camera_frame(some.truth.positions[:32], crop_cameras), axis=-1
+        )
         assert np.median(off) < 25.0
-        np.testing.assert_allclose(nets[1].joints(heights, looks), said, atol=1.0)
+        np.testing.assert_allclose(nets[1].joints(heights, crop_cameras), said, atol=1.0)
         (tmp_path / "net.npz").write_bytes(nets[0].to_bytes())
         again = Cnn.load(tmp_path / "net.npz", toy.skeleton, plan)
-        np.testing.assert_array_equal(again.joints(heights, looks), said)
+        np.testing.assert_array_equal(again.joints(heights, crop_cameras), said)

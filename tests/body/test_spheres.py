@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.spheres import Balls
+from liex_lab.body.spheres import Spheres
 from liex_lab.body.surface import Surface
 from liex_lab.estimation._residual_kernels import place_balls
 from liex_lab.estimation.cascade import body_of
 
 
 def placed(skeleton: Skeleton, pose: Pose) -> np.ndarray:
-    balls, frames = Balls.of(skeleton), pose.frames(skeleton)
+    balls, frames = Spheres.of(skeleton), pose.frames(skeleton)
     out = np.empty((len(balls.radius), 3))
     place_balls(
         frames.rotation[0], frames.translation[0], float(pose.scale[0]), body_of(balls), out
@@ -26,7 +26,7 @@ def placed(skeleton: Skeleton, pose: Pose) -> np.ndarray:
 )  # not the fish: it is flat, and balls are as thick as it is wide
 def test_balls_lie_within_the_body_and_reach_its_skin(animal: str) -> None:
     skeleton = Skeleton.load(animal)
-    balls, surface = Balls.of(skeleton), Surface.of(skeleton)
+    balls, surface = Spheres.of(skeleton), Surface.of(skeleton)
     middles = placed(skeleton, Pose.home(skeleton, 1))[: balls.n_own]
     skin = surface.vertices(Pose.home(skeleton))
     to_ball = np.linalg.norm(skin[:, None] - middles, axis=-1) - balls.radius[: balls.n_own]
@@ -39,7 +39,7 @@ def test_balls_lie_within_the_body_and_reach_its_skin(animal: str) -> None:
 
 def test_every_bone_of_a_hand_has_a_ball_at_its_end() -> None:
     hand = Skeleton.load("hand")
-    balls = Balls.of(hand)
+    balls = Spheres.of(hand)
     middles = placed(hand, Pose.home(hand, 1))
     joints = Pose.home(hand, 1).joints(hand)[0]
     off = np.linalg.norm(joints[1:, None] - middles[None, : balls.n_own], axis=-1).min(axis=1)
@@ -48,8 +48,10 @@ def test_every_bone_of_a_hand_has_a_ball_at_its_end() -> None:
 
 def test_an_arm_may_go_on_behind_a_hand_and_is_none_of_it() -> None:
     hand = Skeleton.load("hand")
-    balls = Balls.of(hand)
+    balls = Spheres.of(hand)
     beyond = placed(hand, Pose.home(hand, 1))[balls.n_own :]
     assert len(beyond) > 0
     assert (beyond[:, 0] < hand.offsets[1, 0]).all()  # further back than the wrist
-    assert Balls.of(Skeleton.load("mouse")).n_own == len(Balls.of(Skeleton.load("mouse")).radius)
+    assert Spheres.of(Skeleton.load("mouse")).n_own == len(
+        Spheres.of(Skeleton.load("mouse")).radius
+    )

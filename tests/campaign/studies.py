@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from liex_lab.pipelines.study.status import Standing, standings
+from liex_lab.pipelines.study.status import SessionStatus, standings
 
 from liex_lab.plan.study import Study
 from tests.campaign.runs import SAMPLE, tables_of
@@ -134,11 +134,11 @@ def broken(n: int, n_frames: int, n_workers: int, kept: Path | None = None) -> d
     return {**figures, "done_after_they_were_mended_and_tried_again": _count(after, "done")}
 
 
-def _count(found: list[Standing], state: str) -> int:
+def _count(found: list[SessionStatus], state: str) -> int:
     return [one.state for one in found].count(state)
 
 
-def _said(one: Standing) -> dict[str, Any]:
+def _said(one: SessionStatus) -> dict[str, Any]:
     failure = one.failure or {}
     return {name: failure.get(name) for name in ("stage", "reason", "remedy")}
 

@@ -45,11 +45,11 @@ def test_all_candidates_agree_with_the_slow_twin_of_algorithm_1(variant):
     model, size = trained(variant).model, 1.0 if variant == "paper" else 1.07
     estimator = PoseEstimator(model)
     crops = SCENE.extract(unseen().depths[:4], size, camera_view=model.method.camera_view)
-    looks = SCENE.looks(crops, model.method.camera_view)
-    rotations, positions, scales, scores = estimator.candidates(crops, looks, size)
+    crop_cameras = SCENE.crop_cameras(crops, model.method.camera_view)
+    rotations, positions, scales, scores = estimator.candidates(crops, crop_cameras, size)
     for i in range(4):
         picture = algorithm1.Picture(
-            crops.heights[i], looks[i], crops.moments[i], size, model.method.reach_mm
+            crops.heights[i], crop_cameras[i], crops.moments[i], size, model.method.reach_mm
         )
         for k in range(scores.shape[1]):
             drawn = estimator._starts[0, k]
@@ -177,9 +177,9 @@ def pruned_model(survivors: int):
 def test_candidates_that_outlive_the_base_end_as_they_do_among_all():
     model, depths = pruned_model(3), unseen().depths[:30]
     crops = SCENE.extract(depths, 1.0)
-    looks = SCENE.looks(crops)
-    few = PoseEstimator(model).candidates(crops, looks, 1.0)
-    all_of_them = PoseEstimator(model, unpruned=True).candidates(crops, looks, 1.0)
+    crop_cameras = SCENE.crop_cameras(crops)
+    few = PoseEstimator(model).candidates(crops, crop_cameras, 1.0)
+    all_of_them = PoseEstimator(model, unpruned=True).candidates(crops, crop_cameras, 1.0)
     assert few[3].shape == (30, 3)
     assert all_of_them[3].shape == (30, model.method.n_candidates)
     for i in range(30):
@@ -192,9 +192,9 @@ def test_survivors_are_better_than_those_that_do_not_go_on_and_cost_little():
     model, depths = pruned_model(4), unseen().depths
     true = FLOOR.T_arena_camera.inverse() @ unseen().joints
     crops = SCENE.extract(depths, 1.0)
-    looks = SCENE.looks(crops)
+    crop_cameras = SCENE.crop_cameras(crops)
     few, all_of_them = (
-        PoseEstimator(model, unpruned=u).candidates(crops, looks, 1.0) for u in (False, True)
+        PoseEstimator(model, unpruned=u).candidates(crops, crop_cameras, 1.0) for u in (False, True)
     )
     assert few[3].mean() < all_of_them[3].mean()
     off = [
@@ -230,7 +230,7 @@ def test_more_candidates_may_be_asked_for_than_the_model_was_made_with():
     for n in (0, 2, 24):
         estimator = PoseEstimator(model, n)
         crops = SCENE.extract(depths, 1.0)
-        assert estimator.candidates(crops, SCENE.looks(crops), 1.0)[3].shape == (
+        assert estimator.candidates(crops, SCENE.crop_cameras(crops), 1.0)[3].shape == (
             40,
             n or model.method.n_candidates,
         )

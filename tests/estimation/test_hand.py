@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.hand_segmenter import NearestScene
-from liex_lab.simulation.hand.simulator import HandWorld
+from liex_lab.foreground.hand_segmenter import HandSegmenter
+from liex_lab.simulation.hand.simulator import HandSimulator
 
 
 def test_gestures_are_measured_from_the_pictures_alone() -> None:
     estimator = PoseEstimator.load("hand")
-    gestures = HandWorld(estimator.skeleton).motion(3, 24)
-    scene, sample = NearestScene.learn(gestures, estimator.skeleton.view, 24)
+    gestures = HandSimulator(estimator.skeleton).motion(3, 24)
+    scene, sample = HandSegmenter.learn(gestures, estimator.skeleton.view, 24)
     size = estimator.find_size(sample, scene)
     found = estimator.estimate(sample, scene, size)
     assert found.found.all()

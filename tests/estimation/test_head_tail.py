@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.head_tail import UNSURE_MM, Facing, both_ways, laid_along
+from liex_lab.estimation.head_tail import UNSURE_MM, HeadTailClassifier, both_ways, laid_along
 from liex_lab.estimation.method import METHODS
 from liex_lab.estimation.model import Model
 from liex_lab.mlp import Network
@@ -36,11 +36,11 @@ def network(mice) -> Network:
     pictures = np.concatenate(
         [laid_along(skeleton, images, joints, size) for joints in (right, wrong)]
     )
-    return Facing.fit(pictures, np.repeat([True, False], N), seed=3)
+    return HeadTailClassifier.fit(pictures, np.repeat([True, False], N), seed=3)
 
 
-def facing(network: Network) -> Facing:
-    return Facing(toy_mice(1, seed=0).skeleton, network)
+def facing(network: Network) -> HeadTailClassifier:
+    return HeadTailClassifier(toy_mice(1, seed=0).skeleton, network)
 
 
 def test_who_looks_the_other_way_sees_the_picture_turned_round(mice):
@@ -148,7 +148,7 @@ def test_it_is_learned_again_with_the_same_bits(mice, network):
     pictures = np.concatenate(
         [laid_along(skeleton, images, joints, size) for joints in (right, wrong)]
     )
-    again = Facing.fit(pictures, np.repeat([True, False], N), seed=3)
+    again = HeadTailClassifier.fit(pictures, np.repeat([True, False], N), seed=3)
     assert all(
         np.array_equal(a, b)
         for one, other in zip(again.layers, network.layers, strict=True)

@@ -9,7 +9,8 @@ from liex_lab.arena.floor import Floor
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
-from liex_lab.foreground.background_segmenter import Crops, Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
@@ -25,10 +26,10 @@ class Window:
         floor = Floor.from_plane(
             np.array([np.sin(tilt), -0.4 * np.sin(tilt), np.cos(tilt)]), 700.0, camera
         )
-        scene = Scene.from_floor(camera, floor)
+        scene = BackgroundSubtraction.from_floor(camera, floor)
         distance = 655.0 if camera_view else floor.distance_mm
         origin = np.array([[camera.width // 2 - 30, camera.height // 2 - 70]], np.int32)
-        crops = Crops(
+        crops = HeightMaps(
             np.zeros((1, 96, 96), np.int16),
             origin,
             np.array([step], np.int32),
@@ -37,7 +38,7 @@ class Window:
             np.array([distance]),
             np.ones(1, np.int64),
         )
-        self.look = scene.looks(crops, camera_view)[0]
+        self.look = scene.crop_cameras(crops, camera_view)[0]
         self.camera, self.origin, self.step = camera, origin[0], step
         self.T_camera_view = SE3(
             scene.view_rotation(camera_view), np.array([0.0, 0.0, distance])

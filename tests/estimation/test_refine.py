@@ -13,28 +13,29 @@ from scipy.ndimage import distance_transform_edt
 from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.spheres import Balls
+from liex_lab.body.spheres import Spheres
 from liex_lab.body.surface import Surface
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation._residual_kernels import place_balls
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.refine import Refiner
-from liex_lab.foreground.hand_segmenter import NearestScene, sight_rotations
-from liex_lab.foreground.height_maps import Crops, view_of
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.foreground.hand_segmenter import HandSegmenter, sight_rotations
+from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.hand.pose_prior import draw_seen
 from tests.oracles.explain import explained
 
 HAND = Skeleton.load("hand")
-BALLS = Balls.of(HAND)
+BALLS = Spheres.of(HAND)
 REFINER = Refiner.of(HAND, BALLS)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
-SCENE = NearestScene(CAMERA, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 900.0, CAMERA), HAND.view)
+SCENE = HandSegmenter(CAMERA, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 900.0, CAMERA), HAND.view)
 
 
 @cache
-def hands(n: int = 24, seed: int = 0) -> tuple[Crops, np.ndarray, Pose]:
+def hands(n: int = 24, seed: int = 0) -> tuple[HeightMaps, np.ndarray, Pose]:
     """Height maps of bare hands, how they were cut, and their poses in the view frames."""
     rng = np.random.default_rng(seed)
     angles, turns = draw_seen(rng, HAND, n)
@@ -43,8 +44,8 @@ def hands(n: int = 24, seed: int = 0) -> tuple[Crops, np.ndarray, Pose]:
     surface = Surface.of(HAND)
     depths = np.stack([surface.render(pose[k], CAMERA) for k in range(n)])
     crops = SCENE.extract(depths, 1.0)
-    looks = SCENE.looks(crops)
-    return crops, looks, pose.moved(view_of(looks))
+    crop_cameras = SCENE.crop_cameras(crops)
+    return crops, crop_cameras, pose.moved(view_of(crop_cameras))
 
 
 def shaken(pose: Pose, seed: int, strength: float = 1.0) -> Pose:
@@ -64,8 +65,10 @@ def alone(pose: Pose) -> Pose:
     return Pose(root, pose.angles[:, None], pose.scale[:, None])
 
 
-def refined(pose: Pose, heights: np.ndarray, looks: np.ndarray, size: float, n_steps: int) -> Pose:
-    after = REFINER.refine(alone(pose), heights, looks, size, n_steps)
+def refined(
+    pose: Pose, heights: np.ndarray, crop_cameras: np.ndarray, size: float, n_steps: int
+) -> Pose:
+    after = REFINER.refine(alone(pose), heights, crop_cameras, size, n_steps)
     return Pose(
         SE3(after.root.rotation[:, 0], after.root.translation[:, 0]),
         after.angles[:, 0],
@@ -74,9 +77,9 @@ def refined(pose: Pose, heights: np.ndarray, looks: np.ndarray, size: float, n_s
 
 
 def fit_of(
-    pose: Pose, heights: np.ndarray, looks: np.ndarray, moments: np.ndarray, size: float
+    pose: Pose, heights: np.ndarray, crop_cameras: np.ndarray, moments: np.ndarray, size: float
 ) -> np.ndarray:
-    return REFINER.fit(alone(pose), heights, looks, moments, size)[:, 0]
+    return REFINER.fit(alone(pose), heights, crop_cameras, moments, size)[:, 0]
 
 
 def off(a: Pose, b: Pose) -> np.ndarray:
@@ -84,21 +87,21 @@ def off(a: Pose, b: Pose) -> np.ndarray:
 
 
 def test_poses_go_where_the_readings_are() -> None:
-    crops, looks, true = hands()
+    crops, crop_cameras, true = hands()
     before = shaken(true, 1)
-    after = refined(before, crops.heights, looks, 1.0, 8)
+    after = refined(before, crops.heights, crop_cameras, 1.0, 8)
     assert np.median(off(after, true)) < 0.6 * np.median(off(before, true))
     assert (off(after, true) < off(before, true)).mean() > 0.85
 
 
 def test_a_true_pose_stays_about_where_it_is() -> None:
-    crops, looks, true = hands()
-    assert np.median(off(refined(true, crops.heights, looks, 1.0, 8), true)) < 4.0
+    crops, crop_cameras, true = hands()
+    assert np.median(off(refined(true, crops.heights, crop_cameras, 1.0, 8), true)) < 4.0
 
 
 def test_joints_stay_within_their_limits_and_hinges_on_their_axes() -> None:
-    crops, looks, true = hands()
-    after = refined(shaken(true, 2, 3.0), crops.heights, looks, 1.0, 8)
+    crops, crop_cameras, true = hands()
+    after = refined(shaken(true, 2, 3.0), crops.heights, crop_cameras, 1.0, 8)
     low, high = HAND.limits[..., 0], HAND.limits[..., 1]
     assert ((after.angles >= low - 1e-12) & (after.angles <= high + 1e-12))[:, 1:].all()
     np.testing.assert_allclose(np.linalg.det(after.root.rotation), 1.0)
@@ -106,21 +109,21 @@ def test_joints_stay_within_their_limits_and_hinges_on_their_axes() -> None:
 
 
 def test_the_pose_that_came_in_is_left_as_it_was() -> None:
-    crops, looks, true = hands()
+    crops, crop_cameras, true = hands()
     kept = true.angles.copy(), true.root.translation.copy()
-    refined(true, crops.heights, looks, 1.0, 2)
+    refined(true, crops.heights, crop_cameras, 1.0, 2)
     np.testing.assert_array_equal(true.angles, kept[0])
     np.testing.assert_array_equal(true.root.translation, kept[1])
 
 
 def test_a_picture_of_nothing_moves_nothing_far() -> None:
-    crops, looks, true = hands()
-    after = refined(true, np.zeros_like(crops.heights), looks, 1.0, 8)
+    crops, crop_cameras, true = hands()
+    after = refined(true, np.zeros_like(crops.heights), crop_cameras, 1.0, 8)
     np.testing.assert_allclose(after.joints(HAND), true.joints(HAND), atol=1e-6)
 
 
 def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> None:
-    crops, looks, true = hands()
+    crops, crop_cameras, true = hands()
     poses = [alone(shaken(true, 5, 6.0)), alone(true), alone(shaken(true, 6, 6.0))]
     both = Pose(
         SE3(
@@ -132,19 +135,21 @@ def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> No
         np.concatenate([p.angles for p in poses], axis=1),
         np.concatenate([p.scale for p in poses], axis=1),
     )
-    best, fit = REFINER.best(both, ImageSet(crops.heights, looks, crops.moments), 1.0, 2)
-    near = refined(refined(true, crops.heights, looks, 1.0, 1), crops.heights, looks, 1.0, 1)
+    best, fit = REFINER.best(both, ImageSet(crops.heights, crop_cameras, crops.moments), 1.0, 2)
+    near = refined(
+        refined(true, crops.heights, crop_cameras, 1.0, 1), crops.heights, crop_cameras, 1.0, 1
+    )
     taken = off(best, near) < 1e-9
     assert taken.mean() > 0.9
     np.testing.assert_allclose(
-        fit[taken], fit_of(near, crops.heights, looks, crops.moments, 1.0)[taken]
+        fit[taken], fit_of(near, crops.heights, crop_cameras, crops.moments, 1.0)[taken]
     )
 
 
 def test_the_true_pose_explains_the_picture_best() -> None:
-    crops, looks, true = hands()
+    crops, crop_cameras, true = hands()
     fit, wrong = (
-        fit_of(pose, crops.heights, looks, crops.moments, 1.0)
+        fit_of(pose, crops.heights, crop_cameras, crops.moments, 1.0)
         for pose in (true, shaken(true, 3, 2.0))
     )
     worse = wrong[:, [0, 1, 4, 5]] > fit[:, [0, 1, 4, 5]]
@@ -152,13 +157,13 @@ def test_the_true_pose_explains_the_picture_best() -> None:
 
 
 def test_explanations_agree_with_the_slow_twin() -> None:
-    crops, looks, true = hands()
+    crops, crop_cameras, true = hands()
     pose = shaken(true, 4)
-    fit, frames = fit_of(pose, crops.heights, looks, crops.moments, 1.07), pose.frames(HAND)
+    fit, frames = fit_of(pose, crops.heights, crop_cameras, crops.moments, 1.07), pose.frames(HAND)
     for k in range(4):
         slow = explained(
             crops.heights[k],
-            looks[k],
+            crop_cameras[k],
             crops.moments[k, 5],
             BALLS,
             frames.rotation[k],
@@ -250,13 +255,13 @@ def test_small_systems_are_solved() -> None:
 
 def test_a_chain_is_refined_as_well() -> None:
     mouse = Skeleton.load("mouse")
-    refiner = Refiner.of(mouse, Balls.of(mouse))
+    refiner = Refiner.of(mouse, Spheres.of(mouse))
     assert refiner.tree.moves.shape == (mouse.n_joints, mouse.dof - 6)
     assert refiner.tree.moves[-1].all()  # every joint turns the tip
     turned = so3.exp(np.zeros((2, 3)))
     pose = Pose(SE3(turned, np.zeros((2, 3))), np.zeros((2, mouse.n_joints, 3)), np.ones(2))
     empty = np.zeros((2, 96, 96), np.int16)
-    looks = np.tile(
+    crop_cameras = np.tile(
         [300.0, 300.0, 0.0, 0.0, *np.diag([1.0, -1.0, -1.0]).ravel(), 600.0, 0.0, 0.0, 1.0], (2, 1)
     )
-    assert np.isfinite(refiner.refine(alone(pose), empty, looks, 1.0, 3).joints(mouse)).all()
+    assert np.isfinite(refiner.refine(alone(pose), empty, crop_cameras, 1.0, 3).joints(mouse)).all()

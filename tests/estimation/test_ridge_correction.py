@@ -14,7 +14,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _profile_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.model import Model
-from liex_lab.estimation.ridge_correction import Settler, tangents
+from liex_lab.estimation.ridge_correction import RidgeCorrection, tangents
 from liex_lab.geometry import SE3, so3
 from tests.estimation.toy import trained
 
@@ -86,10 +86,12 @@ def images_of(heights: np.ndarray) -> ImageSet:
 
 
 @pytest.fixture(scope="module")
-def settler() -> Settler:
+def settler() -> RidgeCorrection:
     true = fish(400, 1)
     off, size = wrong(true, 2)
-    return Settler.fit(FISH, off, images_of(maps(true)), size, true.joints(FISH), true.scale)
+    return RidgeCorrection.fit(
+        FISH, off, images_of(maps(true)), size, true.joints(FISH), true.scale
+    )
 
 
 def test_the_height_of_the_back_over_a_joint_leaves_gross_errors_out():

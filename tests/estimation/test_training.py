@@ -53,7 +53,7 @@ def all_candidates(variant: str, toy: Toy) -> tuple[np.ndarray, np.ndarray]:
     truth = training_set(toy, model.method).truth
     crops = SCENE.extract(toy.depths, 1.0, camera_view=model.method.camera_view)
     _, positions, _, scores = PoseEstimator(model).candidates(
-        crops, SCENE.looks(crops, model.method.camera_view), 1.0
+        crops, SCENE.crop_cameras(crops, model.method.camera_view), 1.0
     )
     return scores, np.linalg.norm(positions - truth.positions[:, None], axis=-1).mean(axis=-1)
 
@@ -182,7 +182,7 @@ def test_what_is_no_animal_teaches_the_metric_and_not_the_regressors():
         frames[:60] + rng.normal(0, 1, frames[:60].shape).astype(np.float32),
     ):
         crops = SCENE.extract(depths, 1.0)
-        best.append(estimator.candidates(crops, SCENE.looks(crops), 1.0)[3].min(axis=1))
+        best.append(estimator.candidates(crops, SCENE.crop_cameras(crops), 1.0)[3].min(axis=1))
     assert np.quantile(best[0], 0.95) < 10.0 < 20.0 < np.quantile(best[1], 0.05)
 
 
@@ -197,12 +197,14 @@ def test_calibrated_intervals_hold_nine_tenths_of_their_own_images_and_about_as_
     for toy, tolerance in ((held_out, 0.06), (easy_and_hard(200, 12), 0.1)):
         data = training_set(toy, method)
         crops = SCENE.extract(toy.depths, 1.0, camera_view=method.camera_view)
-        _, positions, _, _ = found = PoseEstimator(model).candidates(crops, data.images.looks, 1.0)
+        _, positions, _, _ = found = PoseEstimator(model).candidates(
+            crops, data.images.crop_cameras, 1.0
+        )
         picked = choose(
             model.skeleton, method, model.calibration, 1.0, found[0], positions, found[3]
         )
         expected = with_expected_error(
-            picked, model, data.images.moments, data.images.looks, 1.0
+            picked, model, data.images.moments, data.images.crop_cameras, 1.0
         ).error_mm
         joints = picked.pose.joints(model.skeleton)
         error = np.linalg.norm(joints - data.truth.positions, axis=-1).mean(axis=1)
@@ -226,9 +228,9 @@ def test_without_an_expectation_forest_the_straight_line_stays():
     model, toy = trained("default").model, unseen()
     assert model.expectation is None
     crops = SCENE.extract(toy.depths[:5], 1.0)
-    looks = SCENE.looks(crops)
-    rotations, positions, _, scores = PoseEstimator(model).candidates(crops, looks, 1.0)
+    crop_cameras = SCENE.crop_cameras(crops)
+    rotations, positions, _, scores = PoseEstimator(model).candidates(crops, crop_cameras, 1.0)
     picked = choose(
         model.skeleton, model.method, model.calibration, 1.0, rotations, positions, scores
     )
-    assert with_expected_error(picked, model, crops.moments, looks, 1.0) is picked
+    assert with_expected_error(picked, model, crops.moments, crop_cameras, 1.0) is picked

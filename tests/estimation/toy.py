@@ -21,14 +21,14 @@ from liex_lab.estimation.cascade import Candidates, ImageSet, Truth
 from liex_lab.estimation.method import METHODS, Method
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.training import TrainingSet, train_cascade, train_metric
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 FLOOR = Floor.from_plane(np.array([0.06, -0.04, 1.0]), 600.0, CAMERA)
-SCENE = Scene.from_floor(CAMERA, FLOOR)
+SCENE = BackgroundSubtraction.from_floor(CAMERA, FLOOR)
 
 
 @dataclass(frozen=True)
@@ -105,16 +105,16 @@ def with_box(depth: NDArray[np.float32], x_mm: float, y_mm: float) -> NDArray[np
 def training_set(toy: Toy, method: Method) -> TrainingSet:
     """The toy's height maps with the truth in their view frames."""
     crops = SCENE.extract(toy.depths, 1.0, camera_view=method.camera_view)
-    looks = SCENE.looks(crops, method.camera_view)
+    crop_cameras = SCENE.crop_cameras(crops, method.camera_view)
     rotation = SCENE.view_rotation(method.camera_view)
-    n = len(looks)
+    n = len(crop_cameras)
     above = np.stack([np.zeros(n), np.zeros(n), crops.distance], 1)
     T_view_camera = SE3(np.repeat(rotation[None], n, 0), above)
     pose = toy.pose.moved(T_view_camera @ SCENE.floor.T_arena_camera.inverse())
     frames = pose.frames(toy.skeleton)
     assert crops.found.all()
     return TrainingSet(
-        ImageSet(crops.heights, looks, crops.moments),
+        ImageSet(crops.heights, crop_cameras, crops.moments),
         Truth(frames.rotation, frames.translation, pose.scale),
         pose.scale.copy(),
         np.ones(n, np.bool_),

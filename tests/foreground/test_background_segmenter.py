@@ -11,7 +11,8 @@ import pytest
 
 from liex_lab.arena.floor import Floor, find_floor
 from liex_lab.errors import EstimationError
-from liex_lab.foreground.background_segmenter import Scene, learn_background
+from liex_lab.foreground.background import learn_background
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 
@@ -93,7 +94,7 @@ def test_the_background_survives_an_animal_that_leaves_only_at_the_end():
 
 def test_an_animal_that_never_moves_is_found_against_the_floor():
     recording = recording_of([with_box(tilted(2.0), (60, 60))] * 20)
-    scene, sample = Scene.learn(recording, SPINES)
+    scene, sample = BackgroundSubtraction.learn(recording, SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     u = crops.origin[:, 0] + 48
@@ -108,7 +109,7 @@ def test_the_animal_is_told_from_a_larger_thing_that_comes_and_goes():
         if k % 2:
             frame[80:116, 20:100] -= 60.0
         frames.append(frame)
-    scene, sample = Scene.learn(recording_of(frames), SPINES)
+    scene, sample = BackgroundSubtraction.learn(recording_of(frames), SPINES)
     crops = scene.extract(sample, 1.0)
     centre = crops.origin[:, 0] + 48
     assert crops.found.all()
@@ -126,14 +127,14 @@ def test_heights_are_true_whatever_the_tilt_and_holes_are_filled():
     depth = floor.depth(160, 120)
     depth[50:70, 60:100] = roof[50:70, 60:100]
     depth[60, 80] = 0.0
-    crops = Scene.from_floor(CAMERA, floor).extract(depth[None], 1.0)
+    crops = BackgroundSubtraction.from_floor(CAMERA, floor).extract(depth[None], 1.0)
     inner = crops.heights[0][48 - 6 : 48 + 6, 48 - 12 : 48 + 12] / 16.0
     np.testing.assert_allclose(inner, 20.0, atol=0.2)
 
 
 def test_an_empty_frame_is_not_found_and_costs_nothing_else():
     floor = tilted(2.0)
-    scene = Scene.from_floor(CAMERA, floor)
+    scene = BackgroundSubtraction.from_floor(CAMERA, floor)
     stack = np.stack(
         [floor.depth(160, 120), with_box(floor, (60, 60)), np.zeros((120, 160), np.float32)]
     )
@@ -143,7 +144,7 @@ def test_an_empty_frame_is_not_found_and_costs_nothing_else():
 def test_serial_and_parallel_extraction_agree():
     floor = tilted(5.0)
     stack = np.stack([with_box(floor, (40 + 10 * k, 50 + 3 * k)) for k in range(6)])
-    scene = Scene.from_floor(CAMERA, floor)
+    scene = BackgroundSubtraction.from_floor(CAMERA, floor)
     one, two = scene.extract(stack, 1.0, parallel=False), scene.extract(stack, 1.0, parallel=True)
     np.testing.assert_array_equal(one.heights, two.heights)
     np.testing.assert_array_equal(one.moments, two.moments)
@@ -155,7 +156,9 @@ def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
     beside = np.where(
         alone < with_box(floor, (110, 60), (10, 6)), alone, with_box(floor, (110, 60), (10, 6))
     )
-    scene = replace(Scene.from_floor(CAMERA, floor), area_mm2=24 * 12 * (575.0 / 300.0) ** 2)
+    scene = replace(
+        BackgroundSubtraction.from_floor(CAMERA, floor), area_mm2=24 * 12 * (575.0 / 300.0) ** 2
+    )
     first, second = scene.extract_both(np.stack([alone, beside]), 1.0)
     np.testing.assert_array_equal(
         first.heights, scene.extract(np.stack([alone, beside]), 1.0).heights
@@ -169,7 +172,9 @@ def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
 
 def test_the_long_axis_and_area_of_a_box_are_its_own():
     floor = tilted(0.0)
-    crops = Scene.from_floor(CAMERA, floor).extract(with_box(floor, (80, 60), (20, 8))[None], 1.0)
+    crops = BackgroundSubtraction.from_floor(CAMERA, floor).extract(
+        with_box(floor, (80, 60), (20, 8))[None], 1.0
+    )
     area, angle = crops.moments[0, 1], crops.moments[0, 5]
     scale = (600.0 - 25.0) / 300.0
     assert area == pytest.approx(40 * 16 * scale**2, rel=0.03)
@@ -189,4 +194,4 @@ def test_a_recording_that_shows_no_background_is_told_why(n: int, depth_mm: int,
         read=lambda row: pictures,
     )
     with pytest.raises(EstimationError, match=says):
-        Scene.learn(still, (40.0, 115.0))
+        BackgroundSubtraction.learn(still, (40.0, 115.0))

@@ -14,7 +14,7 @@ from liex_lab.body.skeleton import View
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.foreground import _blob_kernels as segment
 from liex_lab.foreground.background import stride_for
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 
@@ -23,10 +23,12 @@ FLOOR = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 300.0, CAMERA)
 BEHIND, HIGH = 20.0, 40.0
 
 
-def scene(frame: str) -> Scene:
-    bare = Scene.from_floor(CAMERA, FLOOR, 3.0)
+def scene(frame: str) -> BackgroundSubtraction:
+    bare = BackgroundSubtraction.from_floor(CAMERA, FLOOR, 3.0)
     view = View(frame, behind_mm=BEHIND, smooth_mm=0.6)
-    return Scene(CAMERA, FLOOR, bare.background, bare.limit, bare.on_floor, view=view)
+    return BackgroundSubtraction(
+        CAMERA, FLOOR, bare.background, bare.limit, bare.on_floor, view=view
+    )
 
 
 def bar(rise: float = 0.0, turned: float = 0.3) -> np.ndarray:

@@ -16,20 +16,20 @@ from liex_lab.body import Skeleton
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _geodesic_kernels as ends
 from liex_lab.foreground._blob_kernels import BLOCK
-from liex_lab.foreground.hand_segmenter import NearestScene, sight_rotations
-from liex_lab.foreground.height_maps import view_of
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.foreground.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.images.nyu_labels import NYU_CAMERA, NyuReference
 from liex_lab.recordings.recording import Recording
-from liex_lab.simulation.hand.simulator import HandSession, HandWorld
+from liex_lab.simulation.hand.simulator import HandSession, HandSimulator
 from tests.oracles.ends import ends_by_hand
 
 HAND = Skeleton.load("hand")
 KINECT = Camera(363.9, 363.9, 255.4, 206.3, 512, 424)
 
 
-def scene_of(camera: Camera) -> NearestScene:
-    return NearestScene(
+def scene_of(camera: Camera) -> HandSegmenter:
+    return HandSegmenter(
         camera, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1000.0, camera), HAND.view
     )
 
@@ -37,14 +37,14 @@ def scene_of(camera: Camera) -> NearestScene:
 @cache
 def people() -> tuple[HandSession, np.ndarray]:
     """Independent pictures of one person's hand, and their depth."""
-    session = HandWorld(HAND).test_split("clean", n_sessions=1)[0]
+    session = HandSimulator(HAND).test_split("clean", n_sessions=1)[0]
     return session, session.depths(0, 40)
 
 
-def joints_in_view(session: HandSession, looks: np.ndarray) -> np.ndarray:
-    T = view_of(looks)
+def joints_in_view(session: HandSession, crop_cameras: np.ndarray) -> np.ndarray:
+    T = view_of(crop_cameras)
     return (
-        np.einsum("nij,nkj->nki", T.rotation, session.joints_camera[: len(looks)])
+        np.einsum("nij,nkj->nki", T.rotation, session.joints_camera[: len(crop_cameras)])
         + T.translation[:, None]
     )
 
@@ -54,7 +54,7 @@ def test_the_hand_is_what_is_cut_out() -> None:
     scene = scene_of(session.camera)
     crops = scene.extract(depths, session.spine_mm / HAND.length)
     assert crops.found.all()
-    joints = joints_in_view(session, scene.looks(crops))
+    joints = joints_in_view(session, scene.crop_cameras(crops))
     off = np.linalg.norm(crops.moments[:, 3:5] - joints.mean(axis=1)[:, :2], axis=1)
     assert (off < 70.0).mean() >= 0.95
     assert np.median(off) < 40.0
@@ -127,7 +127,7 @@ def test_the_long_axis_points_to_the_fingers() -> None:
     session, depths = people()
     scene = scene_of(session.camera)
     crops = scene.extract(depths, session.spine_mm / HAND.length)
-    joints = joints_in_view(session, scene.looks(crops))
+    joints = joints_in_view(session, scene.crop_cameras(crops))
     forward = joints[:, 0] - joints[:, 1:3].mean(axis=1)
     axis = crops.moments[:, 5]
     plain = np.linalg.norm(forward[:, :2], axis=1) > 50.0  # hands that do not point at the camera
@@ -141,13 +141,13 @@ def test_heights_are_the_readings_in_the_view_frame(camera_view: bool) -> None:
     session, depths = people()
     scene = scene_of(session.camera)
     crops = scene.extract(depths[:10], 1.0, camera_view=camera_view)
-    looks = scene.looks(crops, camera_view)
-    T_camera_view = view_of(looks).inverse()
+    crop_cameras = scene.crop_cameras(crops, camera_view)
+    T_camera_view = view_of(crop_cameras).inverse()
     for k in range(10):
         rows, columns = np.nonzero(crops.heights[k])
         uv = crops.origin[k] + crops.step[k] * np.stack([columns, rows], axis=-1)
         seen = session.camera.unproject(uv, depths[k][uv[:, 1], uv[:, 0]])
-        view = view_of(looks[k : k + 1])
+        view = view_of(crop_cameras[k : k + 1])
         height = (view.rotation[0] @ seen.T).T[:, 2] + view.translation[0, 2]
         read = depths[k][uv[:, 1], uv[:, 0]] > 0
         assert (
@@ -187,7 +187,7 @@ def test_a_picture_without_a_hand_holds_none() -> None:
         name="wall", format="test", camera=NYU_CAMERA, times_ns=np.arange(3), read=lambda k: wall
     )
     with pytest.raises(EstimationError, match="no hand was found in 3 frames"):
-        NearestScene.learn(blank, HAND.view)
+        HandSegmenter.learn(blank, HAND.view)
 
 
 def test_one_core_finds_what_two_find() -> None:
@@ -242,7 +242,7 @@ def test_real_hands_before_real_people_are_found(reference_data: Path) -> None:
     scene = scene_of(NYU_CAMERA)
     crops = scene.extract(depth, 1.1)
     view, truth = (
-        view_of(scene.looks(crops)),
+        view_of(scene.crop_cameras(crops)),
         NyuReference.load(reference_data / "hand_nyu").truth[0],
     )
     middle = truth.mean(axis=0) @ view.rotation[0].T + view.translation[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 BODY = ((80, 60), (12, 8))  # centre and half sides, pixels
@@ -21,9 +21,11 @@ def nodding(k: int) -> np.ndarray:
 
 @pytest.mark.parametrize("n_frames", [20, 60])
 def test_an_animal_that_only_turns_its_head_is_found_whole(n_frames):
-    scene, sample = Scene.learn(recording_of([nodding(k) for k in range(n_frames)]), SPINES)
+    scene, sample = BackgroundSubtraction.learn(
+        recording_of([nodding(k) for k in range(n_frames)]), SPINES
+    )
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
-    whole = Scene.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
+    whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
     np.testing.assert_allclose(crops.moments[:, 1], whole[:, 1], rtol=0.3)
     assert np.linalg.norm(crops.moments[:, 3:5] - whole[:, 3:5], axis=1).max() < 8.0

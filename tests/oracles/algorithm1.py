@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.spheres import Balls
+from liex_lab.body.spheres import Spheres
 from liex_lab.estimation.model import Model
 from liex_lab.forests.forest import Forest
 from tests.oracles import motion
@@ -200,7 +200,7 @@ def solve(model: Model, picture: Picture, candidate: Candidate) -> Candidate:
             picture.heights,
             picture.look,
             picture.moments[5],
-            Balls.of(skeleton),
+            Spheres.of(skeleton),
             joints[:, :3, :3],
             joints[:, :3, 3],
             candidate.scale,

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.body.spheres import Balls
+from liex_lab.body.spheres import Spheres
 
 STRIDE = 6  # every so many crop pixels a reading is looked at
 
 
-def placed(balls: Balls, rotations: np.ndarray, positions: np.ndarray, scale: float) -> np.ndarray:
+def placed(
+    balls: Spheres, rotations: np.ndarray, positions: np.ndarray, scale: float
+) -> np.ndarray:
     """Middles (B, 3) mm of the balls of one pose."""
     ends = [
         [positions[j] + scale * rotations[j] @ offset for j, offset in zip(pair, at, strict=True)]
@@ -24,7 +26,7 @@ def explained(
     heights: np.ndarray,
     look: np.ndarray,
     axis: float,
-    balls: Balls,
+    balls: Spheres,
     rotations: np.ndarray,
     positions: np.ndarray,
     scale: float,

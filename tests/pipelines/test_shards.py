@@ -144,6 +144,6 @@ def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(
     with build_recording(mouse, plan) as opened:
         tracker = build_tracker(opened, plan)
         origin = build_provenance(opened, plan, tracker)
-    sent = pickle.dumps(stretches.Stretch("recording", plan, tracker, origin, tmp_path, 0, 8))
+    sent = pickle.dumps(stretches.Shard("recording", plan, tracker, origin, tmp_path, 0, 8))
     assert len(sent) < 0.2 * len(pickle.dumps(tracker))
     assert pickle.loads(sent).tracker.estimator is tracker.estimator  # of the same process

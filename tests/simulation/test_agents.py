@@ -10,8 +10,8 @@ import pytest
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
 from liex_lab.simulation.agents.agent import SPEED, STEP_S, Individual
-from liex_lab.simulation.fish import FishHabits
-from liex_lab.simulation.species import MouseHabits
+from liex_lab.simulation.fish import FishSpecies
+from liex_lab.simulation.species import MouseSpecies
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def fish() -> fish_acts.FishActor:
 
 @pytest.fixture(scope="module")
 def mouse() -> mouse_acts.MouseActor:
-    rng, habits = np.random.default_rng(3), MouseHabits()
+    rng, habits = np.random.default_rng(3), MouseSpecies()
     return mouse_acts.MouseActor.of(
         Individual.draw(rng, (1.1, 1.1)),
         habits.skeleton,
@@ -39,7 +39,7 @@ def measured(fish: fish_acts.FishActor, word: str, n: int = 25) -> dict[str, np.
     for seed in range(n):
         motion = fish.cut(np.random.default_rng(seed), word)
         steps = np.flatnonzero(motion.word == word)
-        pose = fish_acts.fish_poses(np.random.default_rng(seed), FishHabits(), motion, steps, 1.0)
+        pose = fish_acts.fish_poses(np.random.default_rng(seed), FishSpecies(), motion, steps, 1.0)
         bend = np.degrees(np.abs(pose.angles[..., 2].sum(axis=1)).max())
         rise = (motion.position[steps[-1], 2] - motion.position[steps[0], 2]) / fish.length_mm
         turn = np.degrees(abs(motion.heading[steps[-1]] - motion.heading[steps[0]]))
@@ -98,7 +98,7 @@ def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse
 
 
 def test_a_reared_mouse_has_its_nose_high(mouse) -> None:
-    rng, habits = np.random.default_rng(5), MouseHabits()
+    rng, habits = np.random.default_rng(5), MouseSpecies()
     motion = mouse.uncut(rng, 120.0)
     rows = motion.at(10.0)
     pose, _ = mouse_acts.mouse_poses(rng, habits, motion, rows, 1.1, habits.shapes(rng, "train", 1))

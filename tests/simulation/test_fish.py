@@ -14,21 +14,21 @@ from liex_lab.body.surface import Surface
 from liex_lab.optics.camera import RAYTRIX_R5
 from liex_lab.simulation import _sensor_kernels as k
 from liex_lab.simulation import training_patches as windows
-from liex_lab.simulation.fish import KINDS, FishHabits, draw_bends
+from liex_lab.simulation.fish import KINDS, FishSpecies, draw_bends
 from liex_lab.simulation.locomotion import swimming_session
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR
-from liex_lab.simulation.training_patches import TrainingWindows, training_blocks
+from liex_lab.simulation.training_patches import TrainingPatches, training_blocks
 
 FISH = Skeleton.load("fish")
 
 
 @pytest.fixture(scope="module")
-def pictures() -> TrainingWindows:
+def pictures() -> TrainingPatches:
     """Sixteen training windows of fish."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(windows, "BLOCK", 16)
-        return next(training_blocks(3, 1, FishHabits(), window_px=272))
+        return next(training_blocks(3, 1, FishSpecies(), window_px=272))
 
 
 def real_bends(reference_data: Path) -> np.ndarray:
@@ -100,7 +100,7 @@ def test_the_joints_lie_within_the_fish_of_the_picture(pictures):
 
 def test_fish_hang_between_the_floor_and_the_nearest_that_the_camera_sees_whole():
     rng = np.random.default_rng(4)
-    habits, n = FishHabits(), 600
+    habits, n = FishSpecies(), 600
     size, camera_mm = rng.uniform(0.6, 1.5, n), rng.uniform(230.0, 330.0, n)
     shape = habits.shapes(rng, "train", n)
     pose, girth, kind = habits.postures(rng, size, shape, camera_mm)
@@ -130,7 +130,7 @@ def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
 
 
 def test_the_same_seed_gives_the_same_fish():
-    first, again = (SyntheticSession.draw([7, 1], 2, habits=FishHabits()) for _ in range(2))
+    first, again = (SyntheticSession.draw([7, 1], 2, habits=FishSpecies()) for _ in range(2))
     np.testing.assert_array_equal(first.depths(0, 2), again.depths(0, 2))
     assert first.camera == RAYTRIX_R5
     assert 25.0 <= first.spine_mm <= 40.0

@@ -12,9 +12,9 @@ from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu_labels import N_FIRST_PERSON, NyuReference
 from liex_lab.simulation.hand import simulator as hand_world
-from liex_lab.simulation.hand.simulator import HandWorld, find_reference, gesture_session
+from liex_lab.simulation.hand.simulator import HandSimulator, find_reference, gesture_session
 from liex_lab.simulation.simulator import world_of
-from liex_lab.simulation.training_patches import TrainingWindows
+from liex_lab.simulation.training_patches import TrainingPatches
 
 HAND = Skeleton.load("hand")
 
@@ -25,20 +25,20 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @cache
-def block() -> TrainingWindows:
-    (windows,) = HandWorld(HAND).training_blocks(5, 1)
+def block() -> TrainingPatches:
+    (windows,) = HandSimulator(HAND).training_blocks(5, 1)
     return windows
 
 
 def test_the_world_of_a_hand_is_its_own() -> None:
     world = world_of(HAND)
-    assert isinstance(world, HandWorld)
+    assert isinstance(world, HandSimulator)
     assert world.splits == ("clean", "hard", "other-body")
     assert "NYU" in world.sources
 
 
 def test_blocks_are_the_same_bits_on_one_core_and_on_two_and_in_any_order() -> None:
-    world = HandWorld(HAND)
+    world = HandSimulator(HAND)
     first, second = world.training_blocks(5, 2, parallel=False)
     (again,) = world.training_blocks(5, 1, first=1)
     for name in ("depth", "joints_mm", "angles", "origin"):
@@ -77,7 +77,7 @@ def test_poses_and_joints_are_of_one_hand() -> None:
 
 
 def test_splits_are_fixed_and_their_people_differ() -> None:
-    world = HandWorld(HAND)
+    world = HandSimulator(HAND)
     clean, again = (world.test_split("clean", n_sessions=2) for _ in range(2))
     np.testing.assert_array_equal(clean[1].joints_camera, again[1].joints_camera)
     np.testing.assert_array_equal(clean[0].depths(3, 5), again[0].depths(3, 5))
@@ -91,9 +91,9 @@ def test_splits_are_fixed_and_their_people_differ() -> None:
 
 
 def test_with_the_reference_test_postures_are_the_second_persons(reference_data: Path) -> None:
-    world = HandWorld(HAND, reference_data / "hand_nyu")
+    world = HandSimulator(HAND, reference_data / "hand_nyu")
     assert f"from {N_FIRST_PERSON + 1} on" in world.protocol
-    assert "statistics" in HandWorld(HAND).protocol
+    assert "statistics" in HandSimulator(HAND).protocol
     session = world.test_split("clean", n_sessions=1)[0]
     truth = NyuReference.load(reference_data / "hand_nyu").truth[N_FIRST_PERSON:]
     mine = session.joints_camera - session.joints_camera[:, :1]

@@ -21,7 +21,7 @@ from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, SEN
 from liex_lab.simulation.training_patches import (
     BLOCK,
     PER_SESSION,
-    TrainingWindows,
+    TrainingPatches,
     training_blocks,
     training_windows,
 )
@@ -30,7 +30,7 @@ MOUSE = Skeleton.load("mouse")
 
 
 @pytest.fixture(scope="module")
-def windows() -> TrainingWindows:
+def windows() -> TrainingPatches:
     return training_windows(11, BLOCK)
 
 
@@ -78,7 +78,7 @@ def test_headings_have_no_favourite() -> None:
 
 
 def test_windows_hold_the_animal_and_their_truth_projects_into_them(
-    windows: TrainingWindows,
+    windows: TrainingPatches,
 ) -> None:
     uv = windows.joints_mm[..., :2] / windows.joints_mm[..., 2:] * windows.intrinsics[:, None, :2]
     uv = uv + windows.intrinsics[:, None, 2:] - windows.origin[:, None]
@@ -95,7 +95,7 @@ def test_windows_hold_the_animal_and_their_truth_projects_into_them(
     assert near / total > 0.97
 
 
-def test_the_pose_of_a_window_has_its_joints(windows: TrainingWindows) -> None:
+def test_the_pose_of_a_window_has_its_joints(windows: TrainingPatches) -> None:
     joints = Pose(windows.root, windows.angles, windows.scale).joints(MOUSE)
     np.testing.assert_allclose(joints, windows.joints_mm, atol=1e-9)
     heights = (windows.T_arena_camera @ windows.joints_mm.transpose(1, 0, 2)).transpose(1, 0, 2)[
@@ -105,7 +105,7 @@ def test_the_pose_of_a_window_has_its_joints(windows: TrainingWindows) -> None:
     assert heights.max() < 130.0
 
 
-def test_the_true_floor_plane_is_the_floor(windows: TrainingWindows) -> None:
+def test_the_true_floor_plane_is_the_floor(windows: TrainingPatches) -> None:
     side = np.arange(windows.depth.shape[1])
     shares = []
     for i in range(0, len(windows), 16):
@@ -121,7 +121,7 @@ def test_the_true_floor_plane_is_the_floor(windows: TrainingWindows) -> None:
     assert np.median(shares) > 0.95
 
 
-def test_frames_of_a_mini_session_share_animal_camera_and_floor(windows: TrainingWindows) -> None:
+def test_frames_of_a_mini_session_share_animal_camera_and_floor(windows: TrainingPatches) -> None:
     for column in (windows.spine_mm, windows.intrinsics, windows.floor_true, windows.floor):
         grouped = column.reshape(BLOCK // PER_SESSION, PER_SESSION, -1)
         np.testing.assert_array_equal(grouped, grouped[:, :1].repeat(PER_SESSION, axis=1))
@@ -131,7 +131,7 @@ def test_frames_of_a_mini_session_share_animal_camera_and_floor(windows: Trainin
 
 
 def test_windows_depend_on_the_seed_alone_not_on_threads_or_on_where_one_starts(
-    windows: TrainingWindows,
+    windows: TrainingPatches,
 ) -> None:
     np.testing.assert_array_equal(
         training_windows(11, 40, parallel=False).depth, windows.depth[:40]

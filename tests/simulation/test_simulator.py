@@ -11,12 +11,12 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.simulation import training_patches as windows
-from liex_lab.simulation.generic import GenericHabits, draw_angles, moving_session
+from liex_lab.simulation.generic import GenericSpecies, draw_angles, moving_session
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.simulator import GenericWorld, world_of
-from liex_lab.simulation.species import MouseHabits
+from liex_lab.simulation.simulator import GenericSimulator, world_of
+from liex_lab.simulation.species import MouseSpecies
 
 SNAKE = Skeleton.load(find_sample("snake.toml"))
 # a spider's legs end in the air or on the floor; its joints turn about all axes
@@ -80,7 +80,7 @@ def test_splits_are_drawn_of_the_animal_and_a_stated_size_is_taken(animal):
 
 @pytest.mark.parametrize("skeleton", [SNAKE, STAR], ids=["snake", "star"])
 def test_an_unknown_animal_rests_on_the_floor_within_its_joints_limits(skeleton):
-    rng, habits = np.random.default_rng(8), GenericHabits(skeleton)
+    rng, habits = np.random.default_rng(8), GenericSpecies(skeleton)
     n = 200
     shape = habits.shapes(rng, "augmented", n)
     pose, girth, _ = habits.postures(rng, rng.uniform(0.7, 1.4, n), shape, np.full(n, 700.0))
@@ -106,7 +106,7 @@ def test_bends_next_to_one_another_are_alike_and_reach_the_limits():
 
 def test_an_animal_of_the_camera_view_hangs_above_the_floor():
     table = {**SNAKE.table, "view": {"frame": "camera"}}
-    habits = GenericHabits(Skeleton.from_table(table, "eel.toml"))
+    habits = GenericSpecies(Skeleton.from_table(table, "eel.toml"))
     rng = np.random.default_rng(10)
     shape = habits.shapes(rng, "train", 100)
     pose, girth, _ = habits.postures(rng, np.ones(100), shape, np.full(100, 900.0))
@@ -120,7 +120,7 @@ def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
     monkeypatch.setattr(windows, "BLOCK", 32)
     for skeleton in (SNAKE, STAR):
         world = world_of(skeleton)
-        assert isinstance(world, GenericWorld)
+        assert isinstance(world, GenericSimulator)
         (block,) = world.training_blocks(11, 1, window_px=world.window_px(skeleton.length))
         uv = block.joints_mm[..., :2] / block.joints_mm[..., 2:] * block.intrinsics[:, None, :2]
         uv = uv + block.intrinsics[:, None, 2:] - block.origin[:, None]
@@ -129,7 +129,7 @@ def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
 
 
 def test_an_unknown_animal_moves_smoothly_over_the_floor():
-    recording = moving_session(12, 120, habits=GenericHabits(SNAKE))
+    recording = moving_session(12, 120, habits=GenericSpecies(SNAKE))
     step = np.linalg.norm(np.diff(recording.joints_arena, axis=0), axis=-1)
     assert step.max() < 0.15 * recording.spine_mm
     assert step.mean() > 0.1
@@ -142,7 +142,9 @@ def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it
     skeleton, habits = world.skeleton, world.habits  # type: ignore[attr-defined]
     recording = SyntheticSession.draw([13, 2], 20, habits=habits)
     spans = (0.6 * skeleton.length, 1.5 * skeleton.length)
-    scene, sample = Scene.learn(recording, spans, 20, skeleton.view.min_height_mm, skeleton.view)
+    scene, sample = BackgroundSubtraction.learn(
+        recording, spans, 20, skeleton.view.min_height_mm, skeleton.view
+    )
     assert scene.stride == (2 if animal == "fish" else 1)
     crops = scene.extract(sample, recording.spine_mm / skeleton.length, camera_view=habits.floats)
     assert crops.found.mean() > 0.9
@@ -158,11 +160,11 @@ def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it
 
 def test_the_mouse_of_the_world_is_the_mouse_of_the_modules():
     world = world_of(Skeleton.load("mouse"))
-    assert isinstance(world.habits, MouseHabits)  # type: ignore[attr-defined]
+    assert isinstance(world.habits, MouseSpecies)  # type: ignore[attr-defined]
     drawn = world.test_split("clean", n_sessions=1)[0]
     again = SyntheticSession.draw([71_001, 0], sensor=drawn_sensor(), name="clean-00")
     np.testing.assert_array_equal(drawn.depths(0, 1), again.depths(0, 1))
 
 
 def drawn_sensor():
-    return MouseHabits().sensors[0]
+    return MouseSpecies().sensors[0]

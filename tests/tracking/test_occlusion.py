@@ -11,11 +11,11 @@ from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface, render_meshes
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.tracking.observations import reversed_pose
-from liex_lab.tracking.occlusion import FreeEnds
+from liex_lab.tracking.occlusion import OcclusionCorrection
 
 FISH = Skeleton.load("fish")
 CAMERA = Camera(900.0, 900.0, 159.5, 119.5, 320, 240)
@@ -48,12 +48,14 @@ def drawn(turn: float, u: float = 0.0) -> tuple[Pose, np.ndarray]:
 
 
 WHOLE, PICTURE = drawn(0.4)
-BARE = Scene.from_floor(CAMERA, FLOOR, 3.0)
-KNOWN = Scene(CAMERA, FLOOR, BARE.background, BARE.limit, BARE.on_floor, view=FISH.view)
+BARE = BackgroundSubtraction.from_floor(CAMERA, FLOOR, 3.0)
+KNOWN = BackgroundSubtraction(
+    CAMERA, FLOOR, BARE.background, BARE.limit, BARE.on_floor, view=FISH.view
+)
 SCENE = replace(
     KNOWN, area_mm2=float(KNOWN.extract(PICTURE[None], 1.0, camera_view=True).moments[0, 1])
 )
-ENDS = FreeEnds.fit(
+ENDS = OcclusionCorrection.fit(
     FISH, SCENE, WHOLE, SCENE.extract(PICTURE[None], 1.0, camera_view=True), PICTURE[None]
 )
 

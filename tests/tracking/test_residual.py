@@ -12,7 +12,7 @@ import pytest
 from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.tracking.residual import BodyResidual, render_crops
@@ -47,7 +47,7 @@ def test_the_true_pose_explains_a_clean_picture(clean, surface):
 
 def test_a_crop_of_every_second_pixel_is_explained_as_well(clean, surface):
     few = clean.pose[slice(0, 6)]
-    scene = Scene.from_floor(LARGE, LARGE_FLOOR)
+    scene = BackgroundSubtraction.from_floor(LARGE, LARGE_FLOOR)
     depths = rendered(clean.skeleton, few, camera=LARGE, floor=LARGE_FLOOR).astype(np.float32)
     crops = scene.extract(depths, 1.0)
     assert (crops.step > 1).all()

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.background_segmenter import Scene
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import so3
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.tracking.track import Track
@@ -33,7 +33,7 @@ def frames(toy: Toy) -> list[DepthFrame]:
 
 
 @pytest.fixture(scope="module")
-def scene(toy: Toy) -> Scene:
+def scene(toy: Toy) -> BackgroundSubtraction:
     moments = SCENE.extract(toy.depths, 1.0).moments
     return replace(
         SCENE, area_mm2=float(np.median(moments[:, 1])), volume_mm3=float(np.median(moments[:, 2]))
@@ -41,7 +41,7 @@ def scene(toy: Toy) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def tracker(toy: Toy, scene: Scene) -> FrameTracker:
+def tracker(toy: Toy, scene: BackgroundSubtraction) -> FrameTracker:
     return FrameTracker.prepare(PoseEstimator(trained("default").model), scene, toy.depths)
 
 

@@ -1,1 +1,1 @@
-"""One room for each family of files; `recordings.open` knows which one reads what."""
+"""Readers and writers of depth formats, one package to a family; `recordings.open` chooses."""

@@ -1,9 +1,10 @@
-"""How an animal goes from one act to the next: its own way of moving, acts that flow into one
-another, and a place.
+"""Behaviour simulator: labelled actions in a row, smoothed by a causal filter, kept in bounds.
 
-An act is a stretch of channels on a fine clock: speed, turning, climbing, and what the species adds
-(bends, postures). A `Story` strings acts together, smooths them with a causal filter as a body
-does, and keeps the animal inside its place: an act that would lead outside is drawn again.
+An action is a stretch of control channels on a clock of 5 ms: speed, turning, climbing, and what
+the species adds (bends, postures). A `BehaviourSequence` strings actions together, smooths them
+with a critically damped second-order low pass, two poles at exp(-dt / tau), as a body does,
+integrates heading and position, and rejects an action that would lead outside: it is drawn again.
+Animals differ in log-uniform traits (`Individual`).
 """
 
 from __future__ import annotations
@@ -34,8 +35,16 @@ _TRAITS = {
 
 @dataclass(frozen=True)
 class Individual:
-    """One animal's own way: factors of speed, of rhythm, of bending and of how long its acts last;
-    its size over home, how restless it is (0 to 1), and which side it prefers (-1 right to 1 left).
+    """One animal's own way of moving.
+
+    Attributes:
+        size: over home size.
+        vigour: factor of speed.
+        tempo: factor of rhythm.
+        bend: factor of bending.
+        patience: factor of how long its actions last.
+        restless: from 0 to 1.
+        side: the side it prefers, from -1 (right) to 1 (left).
     """
 
     size: float
@@ -50,8 +59,16 @@ class Individual:
     def draw(
         rng: np.random.Generator, sizes: tuple[float, float], novel: bool = False
     ) -> Individual:
-        """An animal; a novel one has traits at and beyond the ends of the range that all others
-        come from.
+        """An animal with traits exp(spread z), z uniform.
+
+        Args:
+            rng: source of randomness.
+            sizes: smallest and largest animal over home size.
+            novel: draws |z| from 0.7 to 1.5, at and beyond the ends of the range from 0 to 1 that
+                all others come from.
+
+        Returns:
+            The animal.
         """
         low, high = (0.7, 1.5) if novel else (0.0, 1.0)
         reach = rng.uniform(low, high, len(_TRAITS)) * rng.choice([-1.0, 1.0], len(_TRAITS))
@@ -64,14 +81,27 @@ class Individual:
         return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
 
     def way(self, rng: np.random.Generator) -> float:
-        """Left (1) or right (-1)."""
+        """A direction to turn in, left (1) or right (-1), by the side it prefers.
+
+        Args:
+            rng: source of randomness.
+
+        Returns:
+            1.0 or -1.0.
+        """
         return 1.0 if rng.random() < 0.5 + 0.5 * self.side else -1.0
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A story told: channels (m, C), heading (m,) rad, position (m, 3) mm of the body's middle and
-    the word (m,) of every step of the clock; `act` (m,) numbers the acts.
+    """A behaviour sequence, step by step of the 5 ms clock.
+
+    Attributes:
+        channels: (m, C) speed mm/s, turning rad/s, climb rad, and the species' own.
+        heading: (m,) rad.
+        position: (m, 3) of the body's middle, mm, arena frame.
+        word: (m,) name of the action, '' where it has none.
+        act: (m,) int64, number of the action in the sequence.
     """
 
     channels: Array
@@ -81,7 +111,14 @@ class Motion:
     act: NDArray[np.int64]
 
     def __getitem__(self, rows: NDArray[np.int64]) -> Motion:
-        """Some steps of it."""
+        """Some steps of it.
+
+        Args:
+            rows: (n,) int64 numbers of steps.
+
+        Returns:
+            The motion at these steps.
+        """
         return Motion(
             self.channels[rows],
             self.heading[rows],
@@ -91,13 +128,24 @@ class Motion:
         )
 
     def at(self, rate_hz: float) -> NDArray[np.int64]:
-        """The steps that a camera of this rate sees."""
+        """The steps that a camera sees.
+
+        Args:
+            rate_hz: of the camera, Hz.
+
+        Returns:
+            (n,) int64 numbers of steps.
+        """
         return np.arange(0.0, len(self.heading), 1.0 / (rate_hz * STEP_S)).astype(np.int64)
 
 
-class Story:
-    """Acts, one after the other. fits: whether an animal can be at positions (m, 3) mm with
-    headings (m,) rad.
+class BehaviourSequence:
+    """Actions, one after the other, with the state of the animal at the end of the last one.
+
+    Attributes:
+        position: (3,) of the body's middle, mm, arena frame.
+        heading: rad.
+        n_steps: steps of the clock so far.
     """
 
     def __init__(
@@ -108,6 +156,15 @@ class Story:
         heading: float,
         fits: Callable[[Array, Array], bool],
     ) -> None:
+        """Begin a sequence at rest.
+
+        Args:
+            rest: (C,) channels of the animal at rest, the filter's first state.
+            blend_s: time constant of each of the filter's two poles, s.
+            position: (3,) to begin at, mm.
+            heading: to begin with, rad.
+            fits: whether an animal can be at positions (m, 3) mm with headings (m,) rad.
+        """
         gain = 1.0 - np.exp(-STEP_S / blend_s)
         self._taps = (
             np.array([gain * gain]),
@@ -122,8 +179,15 @@ class Story:
         self.n_steps = 0
 
     def play(self, word: str, draw: Callable[[], Array], tries: int = _TRIES) -> bool:
-        """Add the act that `draw` returns, channels (m, C); False where none of the tries leads to
-        a possible place.
+        """Add an action, drawn again until it leads only to possible positions.
+
+        Args:
+            word: name of the action.
+            draw: makes its channels (m, C), anew on every call.
+            tries: how often to draw.
+
+        Returns:
+            False where none of the tries fits; the sequence is then as before.
         """
         for _ in range(tries):
             channels, state = lfilter(*self._taps, wanted := draw(), axis=0, zi=self._state)
@@ -145,13 +209,22 @@ class Story:
         return False
 
     def nudge(self, position: Array) -> None:
-        """Cornered: the animal stops there and is put a little inside."""
+        """Stop a cornered animal and put it a little inside.
+
+        Args:
+            position: (3,) to go on from, mm.
+        """
         self.position = np.array(position, float)
         self._state[:, SPEED] = 0.0
 
     def told(self) -> Motion:
-        """All of it. A word begins when the body, which follows with a lag, begins to show
-        its act.
+        """All of the sequence so far.
+
+        A word begins when the body, which follows with a lag of 2 time constants of the filter,
+        begins to show its action.
+
+        Returns:
+            The motion on the 5 ms clock.
         """
         lengths = [len(heading) for _, heading, _, _ in self._told]
         word = np.repeat([word for *_, word in self._told], lengths)
@@ -165,13 +238,27 @@ class Story:
 
 
 def clock(seconds: float) -> Array:
-    """(m,) s: the steps of an act of that length."""
+    """Times of the steps of an action, at least two.
+
+    Args:
+        seconds: its length, s.
+
+    Returns:
+        (m,) s, from 0 in steps of `STEP_S`.
+    """
     return np.asarray(np.arange(max(2, round(seconds / STEP_S))) * STEP_S)
 
 
 def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
-    """(m,) rises from 0 to 1 at `peak` of the length and falls back, smooth at both ends; 0
-    outside.
+    """Raised cosine that rises from 0 to 1 at `peak` of the length and falls back; 0 outside.
+
+    Args:
+        t: (m,) s.
+        length_s: of the bump, s.
+        peak: where it reaches 1, over the length.
+
+    Returns:
+        (m,) from 0 to 1.
     """
     x = np.clip(t / length_s, 0.0, 1.0)
     phase = np.where(x < peak, 0.5 * x / peak, 0.5 + 0.5 * (x - peak) / (1.0 - peak))
@@ -179,7 +266,19 @@ def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
 
 
 def slow_noise(rng: np.random.Generator, m: int, seconds: float, columns: int = 1) -> Array:
-    """(m, columns) of unit deviation that wanders over about so many seconds."""
+    """Noise of about unit deviation that wanders over about so many seconds.
+
+    Normal numbers (deviation 1.2) at knots, joined by raised cosines.
+
+    Args:
+        rng: source of randomness.
+        m: number of steps.
+        seconds: between two knots, s.
+        columns: number of independent channels.
+
+    Returns:
+        (m, columns).
+    """
     knots = int(m * STEP_S / seconds) + 3
     at = np.arange(m) * STEP_S / seconds + rng.random()
     low = at.astype(int)

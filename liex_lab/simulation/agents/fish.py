@@ -1,9 +1,9 @@
-"""The nine actions of a fish, and what it does between them, by their kinematic definitions.
+"""Kinematic definitions of nine zebrafish actions, and of what lies between, as control channels.
 
 Ranges follow the definitions of the literature where there are any (bends of scoots and turns,
 speeds, durations) and overlap as those do: strong routine turns are weak C-turns, J-turns bend no
 more than scoots do, only elsewhere. Bends are degrees a joint of 20 bones; speeds body lengths a
-second.
+second. `agents.agent` filters and strings them together, `fish_poses` bends the body by them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from liex_lab.simulation.agents.agent import (
     STEP_S,
     TURN,
     UNLABELLED,
+    BehaviourSequence,
     Individual,
     Motion,
-    Story,
     bump,
     clock,
     slow_noise,
 )
-from liex_lab.simulation.fish import FishHabits, bend_profile, hung
+from liex_lab.simulation.fish import FishSpecies, bend_profile, hung
 from liex_lab.simulation.pose_prior import root_rotation
 
 Array = NDArray[np.float64]
@@ -58,8 +58,13 @@ _BETWEEN = 0.75  # of the acts are followed by something without a name
 
 @dataclass(frozen=True)
 class FishActor:
-    """A fish that acts. water: its lowest and highest middle, mm above the floor; camera_mm: height
-    of the camera, in whose view it stays; length_mm: its own.
+    """A fish that acts in the view of a camera.
+
+    Attributes:
+        fish: its traits.
+        length_mm: its length, mm.
+        water: its lowest and highest middle, mm above the floor.
+        camera_mm: height of the camera above the floor, mm; the fish stays in its view.
     """
 
     fish: Individual
@@ -68,7 +73,15 @@ class FishActor:
     camera_mm: float
 
     def fits(self, position: Array, heading: Array) -> bool:
-        """Whether all positions (m, 3) lie in the water and in view."""
+        """Whether all positions lie in the water and in view.
+
+        Args:
+            position: (m, 3) of the body's middle, mm.
+            heading: (m,) rad, not used.
+
+        Returns:
+            True where all m do.
+        """
         low, high = self.water
         seen = np.abs(position[:, :2]).max(axis=1) < self._half(position[:, 2])
         return bool((seen & (position[:, 2] > low) & (position[:, 2] < high)).all())
@@ -77,20 +90,39 @@ class FishActor:
         """Half the side of the view, mm, at a height."""
         return _VIEW * (self.camera_mm - z) - 0.6 * self.length_mm
 
-    def begin(self, rng: np.random.Generator, word: str = UNLABELLED) -> Story:
-        """A story that begins somewhere in the middle, for a dive near the top."""
+    def begin(self, rng: np.random.Generator, word: str = UNLABELLED) -> BehaviourSequence:
+        """A sequence that begins somewhere in the middle, for a dive near the top.
+
+        Args:
+            rng: source of randomness.
+            word: of the action to come; 'surface' begins low, 'dive' high.
+
+        Returns:
+            The empty sequence.
+        """
         low, high = self.water
         level = {"surface": rng.uniform(0.0, 0.4), "dive": rng.uniform(0.6, 1.0)}.get(
             word, rng.uniform(0.1, 0.9)
         )
         z = low + level * (high - low)
         place = [*(rng.uniform(-0.6, 0.6, 2) * self._half(z)), z]
-        return Story(
+        return BehaviourSequence(
             np.zeros(_CHANNELS), _BLEND_S, np.array(place), rng.uniform(-np.pi, np.pi), self.fits
         )
 
     def cut(self, rng: np.random.Generator, word: str) -> Motion:
-        """One action with a little before and after it; the word marks it."""
+        """One action with a quarter of a second of something unnamed before and after it.
+
+        Args:
+            rng: source of randomness.
+            word: one of `ACTIONS`; it marks the steps of the action.
+
+        Returns:
+            The motion on the 5 ms clock.
+
+        Raises:
+            AssertionError: none of 50 tries leaves space for the action.
+        """
         for _ in range(50):
             story = self.begin(rng, word)
             before = story.play(UNLABELLED, lambda: self._between(rng, 0.25))
@@ -100,7 +132,15 @@ class FishActor:
         raise AssertionError(f"no room for {word}")
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
-        """A recording: actions in random order, most of them with something unnamed between."""
+        """A recording: actions in random order, most of them with something unnamed between.
+
+        Args:
+            rng: source of randomness.
+            seconds: least length, s.
+
+        Returns:
+            The motion on the 5 ms clock.
+        """
         story = self.begin(rng)
         names = list(_SHARES)
         share = np.array([_SHARES[name] for name in names]) * np.exp(
@@ -114,7 +154,7 @@ class FishActor:
                 self._go_home(rng, story)
         return story.told()
 
-    def _go_home(self, rng: np.random.Generator, story: Story) -> None:
+    def _go_home(self, rng: np.random.Generator, story: BehaviourSequence) -> None:
         """An unnamed slow turn towards the middle, or, cornered, one on the spot."""
         x, y, z = story.position
         low, high = self.water
@@ -143,7 +183,16 @@ class FishActor:
         return t, c
 
     def act(self, rng: np.random.Generator, word: str) -> Array:
-        """Channels of one action."""
+        """Control channels of one action.
+
+        Args:
+            rng: source of randomness.
+            word: one of `ACTIONS`.
+
+        Returns:
+            (m, 8): speed mm/s, turning rad/s, climb rad, roll rad, bend of the front and of the
+            hind half and amplitude of the wave in degrees a joint, beat Hz.
+        """
         table: dict[str, Callable[[np.random.Generator], Array]] = {
             "scoot": self._scoot,
             "j_turn": self._j_turn,
@@ -365,13 +414,22 @@ class FishActor:
 
 def fish_poses(
     rng: np.random.Generator,
-    habits: FishHabits,
+    habits: FishSpecies,
     motion: Motion,
     rows: NDArray[np.int64],
     size: float,
 ) -> Pose:
-    """Poses (n) in the arena frame, at steps `rows` (n,), of a fish of this size over home that
-    moves so.
+    """Poses of a fish at some steps of its motion.
+
+    Args:
+        rng: source of randomness, for small standing waves and the length of the travelling one.
+        habits: the species.
+        motion: its motion.
+        rows: (n,) int64 steps of it.
+        size: of the fish over home size.
+
+    Returns:
+        Poses (n) in the arena frame.
     """
     m = len(motion.heading)
     n = len(rows)
@@ -396,10 +454,18 @@ def fish_poses(
 
 
 def depth_of_water(
-    habits: FishHabits, shape: BodyShape, size: float, camera_mm: float
+    habits: FishSpecies, shape: BodyShape, size: float, camera_mm: float
 ) -> tuple[float, float]:
-    """The lowest and the highest middle of a fish, mm above the floor, so that all of it stays in
-    the water.
+    """Lowest and highest middle of a fish, so that all of it stays in the water.
+
+    Args:
+        habits: the species.
+        shape: its body.
+        size: over home size.
+        camera_mm: height of the camera above the floor, mm; no part comes nearer than 185 mm to it.
+
+    Returns:
+        Lowest and highest, mm above the floor.
     """
     reach = size * (float(np.max(shape.half_height)) + 0.36 * habits.skeleton.length)
     return reach, camera_mm - _NEAREST_MM - reach

@@ -1,8 +1,9 @@
-"""The actions of a mouse, and what it does between them, by their kinematic definitions.
+"""Kinematic definitions of twelve mouse actions, and of what lies between, as control channels.
 
 Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are
 mm/s of a mouse of home size. A posture is one elevation for each of the four bones, a turn at each
-of the three inner joints, and how far the body is stretched.
+of the three inner joints, and how far the body is stretched. `agents.agent` filters and strings
+them together, `mouse_poses` stands them on the floor.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from liex_lab.simulation.agents.agent import (
     STEP_S,
     TURN,
     UNLABELLED,
+    BehaviourSequence,
     Individual,
     Motion,
-    Story,
     bump,
     clock,
     slow_noise,
 )
 from liex_lab.simulation.pose_prior import Posture, resting_heights, stand
-from liex_lab.simulation.species import MouseHabits
+from liex_lab.simulation.species import MouseSpecies
 
 Array = NDArray[np.float64]
 
@@ -76,8 +77,13 @@ _WALL_MM = 50.0  # a nose nearer to a wall can lean on it
 
 @dataclass(frozen=True)
 class MouseActor:
-    """A mouse that acts. half: half sides x and y (2,) mm of its box around the origin; rest (4,)
-    rad: elevations of its bones when it stands; spine_mm: its own.
+    """A mouse that acts in a box around the origin.
+
+    Attributes:
+        mouse: its traits.
+        spine_mm: its length, mm.
+        half: (2,) half sides x and y of the box, mm.
+        rest: (4,) elevations of its bones when it stands, rad.
     """
 
     mouse: Individual
@@ -87,7 +93,17 @@ class MouseActor:
 
     @staticmethod
     def of(mouse: Individual, skeleton: Skeleton, shape: BodyShape, half: Array) -> MouseActor:
-        """An actor with this body."""
+        """An actor with a given body.
+
+        Args:
+            mouse: its traits.
+            skeleton: of the mouse, with four bones.
+            shape: its body, a batch of which the first counts.
+            half: (2,) half sides x and y of its box, mm.
+
+        Returns:
+            The actor.
+        """
         height = resting_heights(skeleton, shape)[0] + np.array([0.5, 1.5, 2.5, 3.0, 3.5])
         height[-1] = 9.0
         rest = np.arcsin(
@@ -96,8 +112,14 @@ class MouseActor:
         return MouseActor(mouse, mouse.size * skeleton.length, half, rest)
 
     def fits(self, position: Array, heading: Array) -> bool:
-        """Whether a body with these middles and headings stays inside the box, nose and
-        rump too.
+        """Whether the body stays inside the box, nose and rump too.
+
+        Args:
+            position: (m, 3) of the body's middle, mm.
+            heading: (m,) rad.
+
+        Returns:
+            True where it does in all m steps.
         """
         ahead = 0.55 * self.spine_mm * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         middle = position[:, :2]
@@ -105,12 +127,20 @@ class MouseActor:
         return bool((reach < self.half).all())
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
-        """A recording: actions in random order, some of them with something unnamed between."""
+        """A recording: actions in random order, some of them with something unnamed between.
+
+        Args:
+            rng: source of randomness.
+            seconds: least length, s.
+
+        Returns:
+            The motion on the 5 ms clock.
+        """
         rest = np.zeros(_CHANNELS)
         rest[_RISE] = self.rest
         rest[_STRETCH] = 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
-        story = Story(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
+        story = BehaviourSequence(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
         names = list(_SHARES)
         share = np.array([_SHARES[name] for name in names]) * np.exp(
             rng.normal(0.0, 0.25, len(names))
@@ -129,7 +159,7 @@ class MouseActor:
                 self._turn_home(rng, story)
         return story.told()
 
-    def _possible(self, story: Story, word: str) -> bool:
+    def _possible(self, story: BehaviourSequence, word: str) -> bool:
         """Whether a rear here is of that kind: one on a wall has it before the nose, any other is
         away from walls.
         """
@@ -140,7 +170,7 @@ class MouseActor:
         )
         return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
 
-    def _room(self, story: Story) -> float:
+    def _room(self, story: BehaviourSequence) -> float:
         """From the nose to the wall ahead, mm."""
         way = np.array([np.cos(story.heading), np.sin(story.heading)])
         nose = story.position[:2] + 0.5 * self.spine_mm * way
@@ -151,7 +181,7 @@ class MouseActor:
         )
         return float(ahead.min())
 
-    def _to_wall(self, rng: np.random.Generator, story: Story) -> None:
+    def _to_wall(self, rng: np.random.Generator, story: BehaviourSequence) -> None:
         """Turn to the nearest wall and walk up to it."""
         axis = int(np.argmin(self.half - np.abs(story.position[:2])))
         toward = np.zeros(2)
@@ -165,13 +195,13 @@ class MouseActor:
             seconds = max(0.3, (room - 0.3 * _WALL_MM) / speed)
             story.play("walk", partial(self._stride, rng, seconds, speed), 2)
 
-    def _turn_home(self, rng: np.random.Generator, story: Story) -> None:
+    def _turn_home(self, rng: np.random.Generator, story: BehaviourSequence) -> None:
         """Turn to the middle of the box, on the spot where there is no room."""
         self._turn_by(
             rng, story, np.arctan2(-story.position[1], -story.position[0]) + rng.normal(0.0, 0.3)
         )
 
-    def _turn_by(self, rng: np.random.Generator, story: Story, heading: float) -> None:
+    def _turn_by(self, rng: np.random.Generator, story: BehaviourSequence, heading: float) -> None:
         away = (heading - story.heading + np.pi) % (2 * np.pi) - np.pi
         if abs(away) < np.radians(32.0):
             return
@@ -182,7 +212,16 @@ class MouseActor:
             story.play(word, lambda: self._turning(rng, away, 0.0), 3)
 
     def act(self, rng: np.random.Generator, word: str) -> Array:
-        """Channels of one action."""
+        """Control channels of one action.
+
+        Args:
+            rng: source of randomness.
+            word: one of `ACTIONS`.
+
+        Returns:
+            (m, 12): speed mm/s, turning rad/s, climb rad, elevations of four bones rad, turns of
+            three joints rad, stretch, roll rad.
+        """
         vigour = self.mouse.vigour
         size = self.mouse.size
         table: dict[str, Callable[[], Array]] = {
@@ -379,14 +418,24 @@ class MouseActor:
 
 def mouse_poses(
     rng: np.random.Generator,
-    habits: MouseHabits,
+    habits: MouseSpecies,
     motion: Motion,
     rows: NDArray[np.int64],
     size: float,
     shape: BodyShape,
 ) -> tuple[Pose, Array]:
-    """Poses (n) in the arena frame, at steps `rows` (n,), of a mouse of this size over home, and
-    girths (n,).
+    """Poses of a mouse at some steps of its motion, and its girths.
+
+    Args:
+        rng: source of randomness, for the gap under the trunk (up to 2 mm).
+        habits: the species.
+        motion: its motion.
+        rows: (n,) int64 steps of it.
+        size: of the mouse over home size.
+        shape: its body, a batch of which the first counts.
+
+    Returns:
+        Poses (n) in the arena frame and girths (n,).
     """
     c = motion.channels[rows]
     n = len(rows)

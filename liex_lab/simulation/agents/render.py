@@ -1,8 +1,7 @@
-"""An acting animal before a virtual depth camera: the window around it, frame by frame, with the
-truth.
+"""Renders an acting animal before a virtual depth camera: the patch around it, frame by frame.
 
-Whole pictures of a long recording would be far more work than what an action recogniser needs of
-them.
+The patches carry the floor as the camera would have estimated it, with an error. Whole pictures of
+a long recording would be far more work than what an action recogniser needs of them.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Body, Surface
-from liex_lab.foreground.height_maps import Windows
+from liex_lab.foreground.height_maps import Patches
 from liex_lab.geometry import SE3
 from liex_lab.simulation import _render_kernels as _stage
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.objects import PART_FACES, rounded
 from liex_lab.simulation.scene import draw_views
 from liex_lab.simulation.sensors import Sensor
-from liex_lab.simulation.species import Habits
+from liex_lab.simulation.species import Species
 from liex_lab.simulation.training_patches import inverse_depth_plane, window_origin
 
 Array = NDArray[np.float64]
@@ -31,10 +30,16 @@ _BLOCK = 256  # frames rendered at a time
 
 
 @dataclass(frozen=True)
-class Camerawork:
-    """One camera over a place: intrinsics (4,) of the pictures that are looked at, their size (2,)
-    px, T_arena_camera, the unit's sensor parameters (N,), and how far off the floor is taken to be
-    (3,).
+class CameraPath:
+    """One camera over a scene, at rest.
+
+    Attributes:
+        intrinsics: (4,) fx, fy, cx, cy of the pictures that are read, px.
+        picture: (2,) their width and height, px.
+        T_arena_camera: its pose.
+        parameters: (N_PARAMETERS,) of the unit's sensor.
+        floor_error: (3,) how far off the floor is estimated to be: slopes along x and y, rad, and
+            mm farther below the camera.
     """
 
     intrinsics: Array
@@ -46,17 +51,27 @@ class Camerawork:
     @staticmethod
     def draw(
         rng: np.random.Generator,
-        habits: Habits,
+        habits: Species,
         sensor: Sensor,
         fur: Array,
         height_mm: float,
         stride: int,
-    ) -> Camerawork:
-        """A camera of that make, so high above the floor, of whose pictures only every `stride`-th
-        pixel is looked at.
+    ) -> CameraPath:
+        """A camera of a make at a given height, of whose pixels every `stride`-th is read.
 
-        Its picture is twice as wide and high as the sensor's, so that an animal has room for long
+        Its picture is twice as wide and high as the sensor's, so that an animal has space for long
         stretches of action.
+
+        Args:
+            rng: source of randomness.
+            habits: the species; its scene's tilt and scale are drawn from.
+            sensor: the camera's make.
+            fur: (1,) of the animal, from 0 to 1.
+            height_mm: of the camera above the floor, mm.
+            stride: px of the sensor that one pixel stands for.
+
+        Returns:
+            The camera.
         """
         camera = sensor.camera.every(stride)
         focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
@@ -66,7 +81,7 @@ class Camerawork:
         margin = np.array([camera.width, camera.height]) / 2.0
         picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
         error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * habits.setting.scale]
-        return Camerawork(
+        return CameraPath(
             np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]),
             picture,
             place,
@@ -77,18 +92,28 @@ class Camerawork:
 
 def film(
     rng: np.random.Generator,
-    habits: Habits,
-    camera: Camerawork,
+    habits: Species,
+    camera: CameraPath,
     shape: Body,
     pose: Pose,
     girth: Array,
     walls: Array | None,
     window_px: int,
-) -> Iterator[Windows]:
-    """Windows around the animal in poses (n) of the arena frame and girths (n,), some hundred at a
-    time.
+) -> Iterator[Patches]:
+    """Patches around an animal in given poses, 256 frames at a time.
 
-    walls (n, WALL_COLUMNS): what wall each frame shows, None none.
+    Args:
+        rng: source of randomness, for the noise and the tail.
+        habits: the species.
+        camera: that looks at it.
+        shape: its body, a batch of which the first counts.
+        pose: (n) arena frame.
+        girth: (n,) factor of all lengths across the body.
+        walls: (n, WALL_COLUMNS) the wall that each frame shows; None shows none.
+        window_px: side of the patches, px.
+
+    Yields:
+        Up to 256 patches: depth and background float32 mm with the camera's intrinsics and floor.
     """
     surface = Surface.of(habits.skeleton)
     n = len(girth)
@@ -130,7 +155,7 @@ def film(
         )
         unit = np.float32(camera.parameters[UNIT])
         floor = inverse_depth_plane(T, intrinsics, np.tile(camera.floor_error, (m, 1)))
-        yield Windows(
+        yield Patches(
             depth * unit,
             background * unit,
             intrinsics,

@@ -1,1 +1,1 @@
-"""The virtual hand: its postures, its gestures, the scene around it."""
+"""The simulated hand: its pose prior, its gestures, the scene around it."""

@@ -1,5 +1,7 @@
-"""Kernels that compose a picture of a hand: what is behind it, the body that it belongs to, things
-beside it.
+"""Depth renderer of hands: wall plane, body, arm, hand and objects by z-buffer, then the sensor.
+
+Meshes come in the camera frame. The wall behind them is 1 / z = a u + b v + c plus smooth
+unevenness; arm and hand count as ANIMAL for the sensor, body and objects as OBJECT.
 """
 
 from __future__ import annotations
@@ -31,11 +33,27 @@ def picture(
     table,
     out,
 ):
-    """One picture or window (H, W) uint16 mm; meshes (V, 3) mm in the camera frame.
+    """Render one picture or patch (H, W) of a hand.
 
-    wall (4,): 1 / z = a u + b v + c behind everything and its unevenness, mm; c = 0: nothing is in
-    range there. size: (width, height) of the whole picture, whose pixel `origin` comes to lie at
-    (0, 0).
+    Args:
+        hand: (V, 3) mesh, mm, camera frame.
+        hand_faces: (F, 3) int32 its triangles.
+        arm: (A, 3) mesh, mm, camera frame.
+        arm_faces: (G, 3) int32 its triangles.
+        body: (B, 3) mesh of the body behind it, mm, camera frame.
+        body_faces: (K, 3) int32 its triangles.
+        thing: (W, 3) mesh of the object, mm, camera frame.
+        thing_faces: (L, 3) int32 its triangles.
+        has_thing: whether the object is there.
+        wall: (4,) a, b, c of 1 / z = a u + b v + c behind everything, and its unevenness, mm; c =
+            0: nothing is in range there.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        size: (2,) width and height of the whole picture, px; outside it nothing is read.
+        origin: (2,) pixel (u, v) of the whole picture that comes to lie at (0, 0).
+        sensor: (N_PARAMETERS,) of the sensor.
+        seed: uint64 of the noise, not 0.
+        table: (2^13,) float32 normal quantiles.
+        out: (H, W) uint16 mm, filled, 0 = unread.
     """
     shape = out.shape
     state = np.array([seed], np.uint64)
@@ -101,7 +119,27 @@ def pictures(
     table,
     out,
 ):
-    """`picture` for a batch (n)."""
+    """Render n pictures or patches of hands, one thread a picture; see `picture`.
+
+    Args:
+        hand: (n, V, 3) meshes, mm, camera frame.
+        hand_faces: (F, 3) int32, shared.
+        arm: (n, A, 3) meshes, mm, camera frame.
+        arm_faces: (G, 3) int32, shared.
+        body: (n, B, 3) meshes, mm, camera frame.
+        body_faces: (K, 3) int32, shared.
+        thing: (n, W, 3) meshes, mm, camera frame.
+        thing_faces: (L, 3) int32, shared.
+        has_thing: (n,) bool.
+        wall: (n, 4) planes behind everything, as in `picture`.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        size: (n, 2) width and height of the whole pictures, px.
+        origin: (n, 2) first pixel (u, v) of each.
+        sensor: (n, N_PARAMETERS).
+        seed: (n,) uint64, not 0.
+        table: (2^13,) float32 normal quantiles, shared.
+        out: (n, H, W) uint16 mm, filled, 0 = unread.
+    """
     for i in prange(len(hand)):
         picture(
             hand[i],

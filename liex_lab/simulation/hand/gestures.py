@@ -1,5 +1,8 @@
-"""How a hand goes from gesture to gesture: along geodesics, as fast as people do, with a rest in
-each.
+"""Trajectories of hand gestures: geodesics in SO(3), straight lines in angles, cosine timing.
+
+Between two postures at t = 0 and 1 the palm turns as R(s) = R_0 exp(s log(R_0^T R_1)) and angles
+and position change in proportion to s = (1 - cos(pi t)) / 2, so that a move starts and ends at
+rest. It lasts as long as people take at the drawn peak speeds, with a rest after each.
 """
 
 from __future__ import annotations
@@ -29,8 +32,13 @@ _ASIDE_MM = 15.0
 
 
 class Gestures(NamedTuple):
-    """N moments: angles (n, J, 3); turns (n, 3, 3): T_view_palm; places (n, 3) mm, camera frame;
-    wrists (n, 3) rad.
+    """A hand at n moments.
+
+    Attributes:
+        angles: (n, J, 3) joint angles, rad.
+        turns: (n, 3, 3) T_view_palm.
+        places: (n, 3) of the palm, mm, camera frame.
+        wrists: (n, 3) how the wrist is bent, rad.
     """
 
     angles: Array
@@ -42,11 +50,20 @@ class Gestures(NamedTuple):
 def draw_gestures(
     rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: float, middle: Array
 ) -> Gestures:
-    """N moments of somebody who goes through postures that were seen, about a point (3,) mm of the
-    camera frame.
+    """Moments of somebody who goes through postures that were seen, about one point.
 
     Each move lasts as long as its longest part, turning, bending or going, takes at a speed drawn
-    for it.
+    for it, but 0.25 s at least.
+
+    Args:
+        rng: source of randomness.
+        skeleton: of the hand.
+        n: number of moments.
+        step_s: between two moments, s.
+        middle: (3,) point about which gestures are made, mm, camera frame.
+
+    Returns:
+        The hand at n moments.
     """
     keys = 2 + int(n * step_s / _SHORTEST_S)
     angles, turns = draw_seen(rng, skeleton, keys)

@@ -1,5 +1,8 @@
-"""Hands before a camera: somebody holds one out, an arm and a body behind it, a wall further back,
-things around.
+"""Model of a scene with an outstretched hand: arm, body and wall behind it, objects beside it.
+
+Torso, head and objects are superellipsoids, arms are capsules, the wall is a plane 1 / z = a u + b
+v + c. Everything lives in the camera frame; a palm's orientation is drawn in the view along its
+line of sight, so that what a hand looks like does not depend on where in the picture it is.
 """
 
 from __future__ import annotations
@@ -33,11 +36,22 @@ _EDGE_MM = 110.0  # the palm stays this far inside the picture
 
 
 @dataclass(frozen=True)
-class HandCast:
-    """n hands and what is around each, camera frame, mm: meshes hand, arm, body, thing (n, V, 3),
-    shown (n,) which things are there, wall (n, 4) as in `_hand_stage.picture`; pose (n) of the
-    hands, joints (n, J, 3), spine_mm (n,); parameters (n, N_PARAMETERS) of the sensors and seeds
-    (n,) of their noise. thing_faces (F, 3): of things' meshes.
+class HandFrameContents:
+    """Hands, n of them, and what is around each, in the camera frame.
+
+    Attributes:
+        pose: (n) of the hands.
+        joints: (n, J, 3) mm.
+        spine_mm: (n,) lengths of the hands, mm.
+        hand: (n, V, 3) meshes of the hands, mm.
+        arm: (n, A, 3) meshes of the arms, mm.
+        body: (n, B, 3) meshes of torso, head and something else, mm.
+        thing: (n, W, 3) meshes of the distractors, mm.
+        shown: (n,) bool, which distractors are there.
+        wall: (n, 4) planes behind everything and their unevenness, as in `_render_kernels.picture`.
+        parameters: (n, N_PARAMETERS) of the sensors.
+        seeds: (n,) uint64 of their noise.
+        thing_faces: (F, 3) int32, triangles of the distractors' meshes.
     """
 
     pose: Pose
@@ -53,8 +67,15 @@ class HandCast:
     seeds: NDArray[np.uint64]
     thing_faces: NDArray[np.int32] = field(default_factory=lambda: PART_FACES)
 
-    def __getitem__(self, index: slice | NDArray[np.int64]) -> HandCast:
-        """Some of the pictures."""
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> HandFrameContents:
+        """Some of the pictures.
+
+        Args:
+            index: slice or row numbers.
+
+        Returns:
+            The chosen pictures' contents.
+        """
         columns = [column.name for column in fields(self) if column.name != "thing_faces"]
         return replace(self, **{name: getattr(self, name)[index] for name in columns})
 
@@ -67,10 +88,18 @@ class HandCast:
         shape: tuple[int, int],
         parallel: bool = True,
     ) -> NDArray[np.uint16]:
-        """What the cameras read: (n, *shape) uint16 mm from picture pixel origin (n, 2) on.
+        """What the cameras read.
 
-        faces of the hands' meshes; intrinsics (n, 4); size (n, 2): width and height of the whole
-        pictures.
+        Args:
+            faces: (F, 3) int32, triangles of the hands' meshes, see `hand_faces`.
+            intrinsics: (n, 4) fx, fy, cx, cy, px.
+            size: (n, 2) int64 width and height of the whole pictures, px.
+            origin: (n, 2) int64 pixel (u, v) of the whole pictures to begin at.
+            shape: rows and columns of what is rendered.
+            parallel: render on all threads.
+
+        Returns:
+            (n, *shape) uint16 mm, 0 where unread.
         """
         out = np.empty((len(self.seeds), *shape), np.uint16)
         with threads(parallel):
@@ -104,11 +133,18 @@ def hold_out(
     size: Array,
     p_camera: Array,
 ) -> Pose:
-    """Poses (n) in the camera frame of hands with these angles (n, J, 3), palms at points (n, 3)
-    mm.
+    """Poses of hands held out at given points, oriented along the lines of sight.
 
-    turns (n, 3, 3): T_view_palm, in the view along the line of sight to the palm; size (n,) over
-    home size.
+    Args:
+        rng: not used.
+        skeleton: not used.
+        angles: (n, J, 3) joint angles, rad.
+        turns: (n, 3, 3) T_view_palm, in the view along the line of sight to the palm.
+        size: (n,) over home size.
+        p_camera: (n, 3) of the palms, mm, camera frame.
+
+    Returns:
+        Poses (n) in the camera frame.
     """
     rotation = np.swapaxes(sight_rotations(p_camera), 1, 2) @ turns
     return Pose(SE3(rotation, p_camera), angles, size)
@@ -117,8 +153,17 @@ def hold_out(
 def draw_places(
     rng: np.random.Generator, intrinsics: Array, picture: Array, low: Array, high: Array
 ) -> Array:
-    """Points (n, 3) mm, camera frame, between depths low and high (n,), that are well inside
-    pictures (n, 2) px.
+    """Points between two depths that are well inside their pictures, uniform in the picture.
+
+    Args:
+        rng: source of randomness.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        picture: (n, 2) width and height, px.
+        low: (n,) least depths, mm.
+        high: (n,) largest depths, mm.
+
+    Returns:
+        (n, 3) mm, camera frame.
     """
     n = len(low)
     depth = rng.uniform(low, high)
@@ -139,11 +184,23 @@ def assemble(
     thing_share: float,
     scenery: int,
     wrists: Array | None = None,
-) -> HandCast:
-    """Hands (n) with their arms, bodies, walls and things; `scenery` pictures in a row share the
-    same surroundings.
+) -> HandFrameContents:
+    """Hands with their arms, bodies, walls and distractors.
 
-    wrists (n, 3) rad: how each is bent, None draws it for every picture.
+    Args:
+        rng: source of randomness.
+        skeleton: of the hand.
+        pose: (n) camera frame.
+        shape: (n) the people's hands.
+        size: (n,) over home size.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        parameters: (n, N_PARAMETERS) of the sensors.
+        thing_share: of the pictures with a distractor beside the hand.
+        scenery: so many pictures in a row share body and wall.
+        wrists: (n, 3) how each wrist is bent, rad; None draws it for every picture.
+
+    Returns:
+        What stands before the cameras in n pictures.
     """
     n = len(size)
     rotations, positions = shape.joints(skeleton, pose)
@@ -156,7 +213,7 @@ def assemble(
     thing, shown = _things(rng, hand, thing_share)
     wall = _walls(rng, n_scenes, intrinsics[::scenery][:n_scenes], hand, body)[each]
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    return HandCast(
+    return HandFrameContents(
         pose,
         positions,
         size * skeleton.length,
@@ -172,11 +229,10 @@ def assemble(
 
 
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
-    """Torso, head and one more thing (n, V, 3) mm behind each hand, and the shoulders (n, 3) mm to
-    which the arms lead.
+    """Torso, head and one more object (n, V, 3) mm behind each hand, and the shoulders (n, 3) mm.
 
-    u (n, 3, 8) in [0, 1) says where and how large they are, and which are there. Without a torso
-    the arm goes straight on and leaves the picture.
+    The arms lead to the shoulders. u (n, 3, 8) in [0, 1) says where and how large the three are,
+    and which are there. Without a torso the arm goes straight on and leaves the picture.
     """
     n = len(joints)
     behind = np.maximum(joints[:, :, 2].max(axis=1), elbow[:, 2])
@@ -247,5 +303,12 @@ def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, bod
 
 
 def hand_faces(skeleton: Skeleton) -> NDArray[np.int32]:
-    """Triangles of the hands' meshes."""
+    """Triangles of the hands' meshes.
+
+    Args:
+        skeleton: of the hand.
+
+    Returns:
+        (F, 3) int32.
+    """
     return Capsules.of(skeleton).faces

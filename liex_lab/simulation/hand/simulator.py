@@ -1,5 +1,9 @@
-"""The world of the hand: training windows, test splits and gestures, rendered before an NYU camera,
-with the truth.
+"""Simulator of the hand: training patches, test splits and gestures, rendered before an NYU camera.
+
+Hands are drawn from the statistics in `hand.pose_prior`, posed along the line of sight, set before
+an arm, a body and a wall, and passed through a structured-light noise model. Test postures come
+from another person's labelled frames of the NYU Hand Pose data set (Tompson et al. 2014) where that
+reference is at hand.
 """
 
 from __future__ import annotations
@@ -34,7 +38,7 @@ from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
 from liex_lab.simulation.pose_prior import SIZE_RANGE
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
-from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingWindows, _degrade
+from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, _degrade
 
 Array = NDArray[np.float64]
 
@@ -63,16 +67,33 @@ _FLOOR_MM = 1300.0  # where the plane stands that is taken for the arena's floor
 
 
 class HandSession(TrueRecording):
-    """A virtual recording of one person's hand; the joints are the person's own."""
+    """A virtual recording of one person's hand; the joints are the person's own.
+
+    There is no floor in it: a plane at right angles to the optical axis, 1300 mm away, stands for
+    one and defines the arena frame.
+
+    Attributes:
+        sensor: the camera's make.
+        cast: the hand and what is around it, n frames.
+    """
 
     def __init__(
         self,
         name: str,
         skeleton: Skeleton,
         sensor: Sensor,
-        cast: stage.HandCast,
+        cast: stage.HandFrameContents,
         times_ns: NDArray[np.int64] | None = None,
     ) -> None:
+        """A recording of given contents.
+
+        Args:
+            name: of the recording.
+            skeleton: of the hand.
+            sensor: the camera's make.
+            cast: the hand and what is around it, n frames, camera frame.
+            times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
+        """
         n = len(cast.seeds)
         times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
         super().__init__(
@@ -93,7 +114,15 @@ class HandSession(TrueRecording):
         return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth (n, H, W) mm of frames start to stop, made on all threads."""
+        """Depth pictures of a range of frames, made on all threads.
+
+        Args:
+            start: first frame.
+            stop: one past the last frame.
+
+        Returns:
+            (stop - start, H, W) float32 mm, 0 where unread.
+        """
         c = self.camera
         part = self.cast[slice(start, stop)]
         n = len(part.seeds)
@@ -105,7 +134,15 @@ class HandSession(TrueRecording):
         ).astype(np.float32)
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames from `first` on in lists of `n_frames`, each list made on all threads."""
+        """The frames in lists, each list made on all threads.
+
+        Args:
+            n_frames: frames a list; the last may be shorter.
+            first: frame to begin with.
+
+        Yields:
+            Lists of depth frames in order of time.
+        """
         for start in range(first, len(self), n_frames):
             stop = min(start + n_frames, len(self))
             depths = self.depths(start, stop)
@@ -115,11 +152,14 @@ class HandSession(TrueRecording):
 
 
 @dataclass(frozen=True)
-class HandWorld:
-    """Somebody's right hand before a depth camera.
+class HandSimulator:
+    """Simulator of somebody's right hand before a depth camera.
 
-    reference: the folder with labelled hands from which the test postures come, the second
-    person's; None draws them from the statistics of the first.
+    Attributes:
+        skeleton: of the hand.
+        reference: folder with labelled hands from which the test postures come, the second
+            person's; None draws them from the statistics of the first.
+        splits: names of the test splits.
     """
 
     skeleton: Skeleton
@@ -128,7 +168,7 @@ class HandWorld:
 
     @property
     def protocol(self) -> str:
-        """What to say of the test splits beside figures measured on them."""
+        """One sentence on the test splits, to stand beside figures measured on them."""
         how = (
             "each of another person's right hand before an NYU camera; the hand and its size are "
             "found by the product, nothing is handed over; flips are told by the direction from "
@@ -146,7 +186,7 @@ class HandWorld:
 
     @property
     def sources(self) -> str:
-        """What the training images were made from."""
+        """One phrase on what the training images were made from."""
         return (
             "rendered from a seed; postures partly drawn from statistics of labelled points of "
             f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
@@ -165,8 +205,26 @@ class HandWorld:
         spine_mm: float | None = None,
         window_px: int = 320,
         parallel: bool = True,
-    ) -> Iterator[TrainingWindows]:
-        """Blocks of training images; see `windows.training_blocks`."""
+    ) -> Iterator[TrainingPatches]:
+        """Blocks of training patches with truth; see `training_patches.training_blocks`.
+
+        The patches have no floor and no background: these are zero.
+
+        Args:
+            seed: of the whole set; a block depends on it and on its own number alone.
+            n_blocks: how many blocks to make.
+            first: number of the first block.
+            family: of hand shapes.
+            noise: multiplies the sensor's random errors and its rate of holes.
+            erosion_px: pixels stripped off the hand's outline.
+            degraded_share: of the mini-sessions that get more noise, and half of them more erosion.
+            spine_mm: mean length of the hands, mm; None takes the skeleton's own.
+            window_px: side of the patches, px.
+            parallel: render on all threads.
+
+        Yields:
+            One set of `BLOCK` patches a block.
+        """
         for number in range(first, first + n_blocks):
             rng = np.random.default_rng([seed, number, 1])
             yield self._block(
@@ -192,7 +250,7 @@ class HandWorld:
         spine_mm: float | None,
         window_px: int,
         parallel: bool,
-    ) -> TrainingWindows:
+    ) -> TrainingPatches:
         """The images of one block."""
         skeleton = self.skeleton
         n = BLOCK
@@ -238,7 +296,7 @@ class HandWorld:
             parallel,
         )
         flat = np.zeros((n, 3))
-        return TrainingWindows(
+        return TrainingPatches(
             depth,
             np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
             origin.astype(np.int32),
@@ -260,7 +318,19 @@ class HandWorld:
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS
     ) -> list[HandSession]:
-        """The recordings of a split, 40 of 50 independent frames, each of another person."""
+        """The recordings of a split: 40 of 50 independent frames, each of another person.
+
+        Args:
+            name: 'clean', 'hard' or 'other-body'.
+            spine_mm: length of every hand, mm; None draws it.
+            n_sessions: takes only the first so many.
+
+        Returns:
+            The recordings, recording k named after the split and k.
+
+        Raises:
+            LiexError: there is no split of this name.
+        """
         if name not in SPLITS:
             raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
         seed, family, noise, erosion_px, thing_share = SPLITS[name]
@@ -320,15 +390,25 @@ class HandWorld:
         return pose.angles, sight_rotations(pose.root.translation) @ pose.root.rotation
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
-        """A hand that goes from one gesture to the next; settings: sensor, family, noise,
-        erosion_px, thing_share, spine_mm and name as in `walking.walking_session`.
+        """A recording of a hand that goes from one gesture to the next.
+
+        Args:
+            seed: or seeds, that everything is drawn from.
+            n_frames: length of the recording.
+            **settings: sensor, family, noise, erosion_px, thing_share, spine_mm and name, see
+                `gesture_session`.
+
+        Returns:
+            The recording with its truth.
         """
         return gesture_session(self.skeleton, seed, n_frames, **settings)
 
 
 def find_reference() -> Path | None:
-    """The folder of labelled hands beside the repository or the current folder, where there
-    is one.
+    """The folder of labelled hands beside the repository or the current folder.
+
+    Returns:
+        `../shared/data/hand_nyu` of either; None where neither holds the labels.
     """
     for base in (Path.cwd(), Path(__file__).resolve().parents[3]):
         folder = base.parent / "shared" / "data" / "hand_nyu"
@@ -350,8 +430,22 @@ def gesture_session(
     spine_mm: float | None = None,
     name: str = "gestures",
 ) -> HandSession:
-    """N frames at 30 a second of one person who goes from gesture to gesture, holding each for a
-    moment.
+    """A recording of one person who goes from gesture to gesture at 30 frames/s, with pauses.
+
+    Args:
+        skeleton: of the hand.
+        seed: or seeds, that everything is drawn from.
+        n_frames: length of the recording.
+        sensor: the camera's make.
+        family: of hand shapes.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels stripped off the hand's outline.
+        thing_share: of the frames with a distractor beside the hand.
+        spine_mm: length of the hand, mm; None draws it.
+        name: of the recording.
+
+    Returns:
+        The recording with its truth.
     """
     rng = np.random.default_rng(seed)
     drawn = float(rng.uniform(*SIZE_RANGE))

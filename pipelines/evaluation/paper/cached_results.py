@@ -1,5 +1,7 @@
-"""Results that took long to train for, kept as JSON in `datasets/kept_results` with how they were
-made.
+"""Cache of evaluation results whose models take long to train: JSON in `datasets/kept_results`.
+
+Each row is kept with how it was made (recipe, method, command, version) and with the true joints of
+each split's first frame; it is used again only where both agree with what would be measured now.
 """
 
 from __future__ import annotations
@@ -22,8 +24,14 @@ _SAME_MM = 0.05  # joints of the same test frame differ by less than this betwee
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
-    """What is kept for an animal: `rows` by variant, `sensitivity` by variant; empty where nothing
-    is.
+    """What is kept for an animal: `rows` and `sensitivity` by variant, empty where nothing is.
+
+    Args:
+        animal: name of the skeleton.
+        folder: where results are kept; None takes datasets/kept_results.
+
+    Raises:
+        LiexError: the file is no JSON, or of another schema.
     """
     path = (folder or kept_results_folder()) / f"{animal}.json"
     if not path.is_file():
@@ -44,8 +52,18 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
 def keep_results(
     folder: Path, animal: str, rows: Mapping[str, Any], sensitivity: Mapping[str, Any]
 ) -> Path:
-    """Write results in the form in which they are kept; copied into datasets/kept_results they are
-    used again.
+    """Write results in the form in which they are kept.
+
+    Copied into datasets/kept_results they are used again.
+
+    Args:
+        folder: where `ANIMAL.json` is written; it is made where it is missing.
+        animal: name of the skeleton.
+        rows: figures by variant.
+        sensitivity: curves by variant.
+
+    Returns:
+        The path of the file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{animal}.json"
@@ -66,8 +84,12 @@ def fits(
     made_from: Mapping[str, Any],
     tests: Mapping[str, Sequence[TrueRecording]],
 ) -> bool:
-    """Whether a kept row is of the same training and of the same test frames as would be measured
-    now.
+    """Whether a kept row is of the same training and the same test frames as would be measured now.
+
+    Args:
+        row: the kept row.
+        made_from: how the row's model would be trained now.
+        tests: recordings by split; each split's first frame has to agree within 0.05 mm.
     """
     if row["made"]["from"] != json.loads(json.dumps(made_from)):
         return False
@@ -81,7 +103,9 @@ def fits(
 
 
 def first_joints(sessions: Sequence[TrueRecording]) -> list[list[float]]:
-    """The true joints (J, 3) mm of a split's first frame, camera frame: what the test frames are
-    recognised by.
+    """True joints (J, 3), mm, camera frame, of a split's first frame, by which it is recognised.
+
+    Args:
+        sessions: recordings of the split with their truth.
     """
     return [[round(float(x), 3) for x in joint] for joint in sessions[0].joints_camera[0]]

@@ -1,5 +1,9 @@
-"""One image under the loupe: its candidates as the learned metric ranks them, and the way to them
-(Fig. 13-16).
+"""Candidates of one image ranked by the learned metric, and their convergence (Lie-X Fig 13-16).
+
+On rendered images that no tree has seen: the image shown is that whose best ranked candidate has
+the median error of all. Numbers: score and true error of each candidate, mm; Spearman's correlation
+of score and error over an image's candidates, mean over images; quartiles of the error over all
+candidates after every joint and round of Algorithm 1.
 """
 
 from __future__ import annotations
@@ -28,12 +32,17 @@ PROTOCOL = (
 
 
 def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
-    """What the figures of candidates and of convergence show, for a model on images it has not
-    seen.
+    """What the figures of candidates and convergence show, for a model on unseen images.
 
-    ranked: the example's candidates, best score first; rank_correlation: mean over images of
-    Spearman's correlation of score and error over an image's candidates; steps: error after every
-    joint and round, over all candidates.
+    Args:
+        model: the pose model.
+        n_images: number of images.
+
+    Returns:
+        `ranked`: the example's candidates, best score first; `rank_correlation`: mean over images
+        of Spearman's correlation of score and error over an image's candidates; `steps`: error, mm
+        at home size (of the example its own), after every joint and round; `heights`, `true_px` and
+        `edges` of the example; amounts and protocol.
     """
     from liex_lab.estimation.proposals import N_WAYS
     from liex_lab.estimation.training import Proposals, start_candidates
@@ -88,7 +97,7 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
 
 
 def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
-    """N animals near home size that come after all that the model was trained and calibrated on."""
+    """Images (n) of animals near home size that come after those of forests and calibration."""
     from liex_lab.estimation.training import TrainingSet
 
     from ...training.pose_model import recipe_of, rendered_set
@@ -108,9 +117,7 @@ def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
 def _follow(
     cascade: Cascade, data: TrainingSet, candidates: Candidates
 ) -> tuple[list[str], list[Array], list[Array]]:
-    """Move the candidates as Algorithm 1 does, and keep errors (n K,) mm at home size and positions
-    after each step.
-    """
+    """Names, errors (n K,) mm at home size, and positions after each step of Algorithm 1."""
     from liex_lab.estimation.training import joint_error
 
     skeleton = cascade.skeleton
@@ -152,11 +159,12 @@ def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
     """Where joints (m, J, 3) of one image's view frame lie in its height map: column and row (m, J,
     2).
     """
-    from liex_lab.baselines.baseline import in_camera_frame
+    from liex_lab.foreground.crop_camera import CropCamera, in_camera_frame
 
-    look = data.images.looks[image]
+    look = data.images.crop_cameras[image]
     x, y, z = np.moveaxis(
         in_camera_frame(positions, np.repeat(look[None], len(positions), 0)), -1, 0
     )
-    uv = np.stack([look[0] * x / z + look[2], look[1] * y / z + look[3]], axis=-1)
-    return (uv - look[14:16]) / look[16]
+    camera = CropCamera(*look)
+    uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
+    return (uv - [camera.u0, camera.v0]) / camera.step

@@ -1,5 +1,6 @@
-"""Models for `liex evaluate tables --quick`: trained within seconds, to see that every row runs.
-Nobody quotes them.
+"""Models for `liex evaluate tables --quick`, trained within seconds to see that every row runs.
+
+Nobody quotes their numbers.
 """
 
 from __future__ import annotations
@@ -37,8 +38,15 @@ QUICK_SWEEP = Sweep(
 def quick_subject(
     animal: str, variant: str, progress: Progress = silent
 ) -> PoseEstimator | Baseline:
-    """As `evaluate.subject_of`, from next to no training; the default is the bundled model all the
-    same.
+    """As `pose.subject_of`, from next to no training; the default is the bundled model.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: a row of the tables, such as `paper-no-metric` or `rf`.
+        progress: is not told anything.
+
+    Raises:
+        MissingPackageError: the CNN is asked for and torch is not installed.
     """
     from liex_lab.baselines.ablations import PlainMean
     from liex_lab.estimation.estimator import PoseEstimator

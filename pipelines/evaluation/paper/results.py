@@ -1,4 +1,4 @@
-"""What is measured of one animal for the tables and figures of the paper."""
+"""Everything that is measured of one animal for the tables and figures of Lie-X (section 5)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,16 @@ from typing import Any
 
 @dataclass
 class Results:
-    """All that is known of one animal: rows by variant, missing: why a row is not there,
-    sensitivity by variant, illustration of the default.
+    """All that is known of one animal.
+
+    Attributes:
+        animal: name of the skeleton.
+        joints: names of its joints.
+        splits: names of the test splits.
+        rows: figures by variant, see `run.measured_rows`.
+        missing: by variant, why its row is not there.
+        sensitivity: curves by variant, see `sensitivity.sensitivity`.
+        illustration: of the default, see `illustrations.illustrate`.
     """
 
     animal: str

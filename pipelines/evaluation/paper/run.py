@@ -1,5 +1,12 @@
-"""The job `liex evaluate tables`: every row of the paper's Tables 1-3 and the numbers behind its
-figures.
+"""Tables 1 to 3 of Lie-X (section 5.2) and the numbers behind its figures, on rendered data.
+
+`liex evaluate tables` measures six rows on an animal's test splits (40 recordings each): our
+default, Lie-X as the paper has it, its ablations without multiple initial poses and without the
+learned metric, and the baselines RF and CNN. All see the same frames, cut out by the product's own
+foreground. Numbers: the figures of `liex evaluate pose`, error of each joint and 101 quantiles of
+the error distribution (Fig 8), mm; frames/s on at most two cores; sensitivity to five parameters
+(Fig 7); candidates and convergence of one image (Fig 13 to 16). Rows whose models take long to
+train may be taken from kept results, if they fit the same training and the same frames.
 """
 
 from __future__ import annotations
@@ -41,9 +48,13 @@ Draw = Callable[[Mapping[str, Any], Path], list[Path]]
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured. n_frames: of each split, None all; kept: results that fit are taken
-    from datasets/kept_results; quick: every row is trained on next to nothing, to see that
-    everything runs; n_illustrated: images behind the figures of candidates and convergence.
+    """How much is measured.
+
+    Attributes:
+        n_frames: frames of each split, rounded up to whole recordings; None takes all.
+        kept: results that fit are taken from datasets/kept_results.
+        quick: every row is trained on next to nothing, to see that everything runs.
+        n_illustrated: images behind the figures of candidates and convergence.
     """
 
     n_frames: int | None = None
@@ -62,10 +73,20 @@ def make_tables(
     draw: Draw | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Write tables, figures and kept forms into the folder `out`; returns what was written.
+    """Write tables, figures and the form in which results are kept into a folder.
 
-    quick: few frames, every row trained on next to nothing; its numbers say only that everything
-    runs. fresh: nothing kept is used. draw: makes the figures from what `results` holds.
+    Args:
+        out: the folder; it is made where it is missing.
+        animals: names of bundled animals.
+        n_frames: frames of each split; None takes all.
+        quick: few frames, every row trained on next to nothing; its numbers say only that
+            everything runs.
+        fresh: nothing kept is used.
+        draw: makes the figures from what `results` holds, by animal, in the folder.
+        progress: told how far the job is.
+
+    Returns:
+        The paths of all files that were written.
     """
     from .cached_results import keep_results
     from .table_text import write_tables
@@ -102,7 +123,14 @@ def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def results_of(animal: str, budget: Budget, command: str, progress: Progress) -> Results:
-    """Every row, curve and illustration of one animal."""
+    """Every row, curve and illustration of one animal.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        budget: how much is measured.
+        command: the command line that makes the same numbers, noted beside them.
+        progress: told how far the job is.
+    """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
 
@@ -157,7 +185,15 @@ def _subjects(
 
 
 def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
-    """What decides a row's numbers: how its model is trained, and what is done with it."""
+    """What decides a row's numbers: how its model is trained, and what is done with it.
+
+    Args:
+        variant: a name of `ROWS`.
+        skeleton: the animal's skeleton.
+
+    Returns:
+        Plain values: recipe and method, or the training of a baseline.
+    """
     from liex_lab.estimation.method import method_of
 
     from ...training.baselines import BASELINES, training_of
@@ -193,7 +229,14 @@ def measured_rows(
     tests: Mapping[str, Sequence[TrueRecording]],
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:
-    """The numbers of each subject: `splits` and `rate`."""
+    """The measured figures of each subject: `splits` and `rate`.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        subjects: estimators and baselines by variant; `default` is among them.
+        tests: recordings with their truth by split.
+        progress: told recording by recording.
+    """
     from ..pose import errors_of
     from .cached_results import first_joints
 
@@ -231,8 +274,18 @@ def _numbers(errors: PoseErrors) -> dict[str, Any]:
 def rates_of(
     animal: str, subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording]
 ) -> dict[str, dict[str, Any]]:
-    """Frames per second of each subject on at most two cores, foreground included, all on the same
-    frames in memory.
+    """Frames per second of each subject on at most two cores, foreground included.
+
+    All are timed on the same 128 frames in memory, of the recording with the wider pictures of the
+    split's first two, the best of 3 repeats.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        subjects: estimators and baselines by variant; `default` is among them.
+        sessions: recordings of a split.
+
+    Returns:
+        By variant `frames_per_s`, `ratio_to_default`, `cores` and `picture`.
     """
     import numba
 

@@ -31,7 +31,7 @@ from liex_lab.runtime.progress import silent
 from liex_lab.simulation import simulator as worlds
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
-from liex_lab.simulation.species import MouseHabits
+from liex_lab.simulation.species import MouseSpecies
 from tests.estimation.toy import toy_mice, trained, training_set
 
 N_SESSIONS, N_FRAMES = 2, 10
@@ -44,11 +44,11 @@ FIGURES = [
 ]
 
 
-class SmallWorld(worlds.MouseWorld):
+class SmallWorld(worlds.MouseSimulator):
     """Two splits of two recordings of ten small frames."""
 
     def __init__(self) -> None:
-        super().__init__(MouseHabits(Skeleton.load("mouse")), ("clean", "hard"))
+        super().__init__(MouseSpecies(Skeleton.load("mouse")), ("clean", "hard"))
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40

@@ -11,7 +11,7 @@ import pytest
 from liex_lab.dashboards.paper.confusion import draw_confusions
 from liex_lab.pipelines.evaluation.actions import one_hour, track_error_mm
 from liex_lab.pipelines.training import agent_tracks as module
-from liex_lab.pipelines.training.agent_tracks import Acted, Scenario, acted, thinned
+from liex_lab.pipelines.training.agent_tracks import AgentTrack, Scenario, acted, thinned
 
 from liex_lab.actions.storage import load_action_model
 from liex_lab.estimation.estimator import PoseEstimator
@@ -28,16 +28,16 @@ def cache(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module")
-def cut() -> Acted:
+def cut() -> AgentTrack:
     return acted([CUT], PoseEstimator.load("fish"))[0]
 
 
 @pytest.fixture(scope="module")
-def recording() -> Acted:
+def recording() -> AgentTrack:
     return acted([RECORDING], PoseEstimator.load("mouse"))[0]
 
 
-def test_a_cut_out_action_is_tracked_with_what_lies_around_it(cut: Acted) -> None:
+def test_a_cut_out_action_is_tracked_with_what_lies_around_it(cut: AgentTrack) -> None:
     one = cut.tracked()
     assert set(one.words) == {"c_turn"}
     assert len(one) < len(cut.words)
@@ -46,7 +46,7 @@ def test_a_cut_out_action_is_tracked_with_what_lies_around_it(cut: Acted) -> Non
 
 
 def test_only_the_beginning_is_filmed_and_a_slower_camera_has_fewer_frames(
-    recording: Acted,
+    recording: AgentTrack,
 ) -> None:
     usual, slower = recording.tracked(), recording.tracked(15.0)
     assert usual.track.times_ns[-1] == pytest.approx(1.5e9, abs=4e7)
@@ -56,7 +56,7 @@ def test_only_the_beginning_is_filmed_and_a_slower_camera_has_fewer_frames(
 
 
 def test_what_was_measured_is_not_measured_again(
-    cut: Acted, monkeypatch: pytest.MonkeyPatch
+    cut: AgentTrack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "act", None)
     again = acted([CUT], PoseEstimator.load("fish"))[0]
@@ -71,7 +71,7 @@ def test_a_slower_camera_sees_the_frames_nearest_to_its_times() -> None:
     np.testing.assert_array_equal(rows, by_hand)
 
 
-def test_an_hour_is_an_hour_of_frames(recording: Acted) -> None:
+def test_an_hour_is_an_hour_of_frames(recording: AgentTrack) -> None:
     told = one_hour(load_action_model("mouse"), recording.tracked(), hour_s=60.0)
     usual = np.median(np.diff(recording.seen.times_ns)) * 1e-9
     assert told["frames"] == round(60.0 / usual)

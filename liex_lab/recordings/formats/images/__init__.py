@@ -1,3 +1,4 @@
-"""Folders of depth pictures and point clouds: PNG, TIFF, PGM, PCLZF, Raytrix exports, the NYU hand
-data set.
+"""Folders of depth pictures and point clouds.
+
+PNG, TIFF, PGM, PCLZF, exports of Raytrix cameras, and the NYU hand pose data set.
 """

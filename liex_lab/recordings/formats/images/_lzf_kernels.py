@@ -1,5 +1,6 @@
-"""LZF, the small codec in which PCL packs its pictures: numba kernel. Its slow twin is
-tests/oracles/lzf.py.
+"""LZF decompression (Lehmann's LibLZF), in which PCL packs its pictures: numba kernel.
+
+Its slow twin is tests/oracles/lzf.py.
 """
 
 from __future__ import annotations
@@ -9,12 +10,18 @@ from numba import njit
 
 @njit(cache=True)
 def unpack_lzf(packed, out):
-    """Fill `out` (n,) uint8 from `packed` (m,) uint8; the bytes written, or -1 where the data make
-    no sense.
+    """Decompress LZF data.
 
     A byte below 32 is followed by that many literal bytes and one more. Any other byte begins a
     copy from what is out already: its upper 3 bits are the length less 2 (7: the next byte adds to
     it), its lower 5 bits and the next byte the distance less 1.
+
+    Args:
+        packed: (m,) uint8.
+        out: (n,) uint8, written.
+
+    Returns:
+        How many bytes were written; -1 where the data make no sense.
     """
     at = 0
     done = 0

@@ -1,5 +1,7 @@
-"""A folder of depth pictures (PNG, TIFF, PGM or PCLZF), with a camera.toml and time stamps beside
-them.
+"""Folder of depth pictures (PNG, TIFF, PGM or PCLZF) with a camera.toml and time stamps.
+
+Pictures are read in natural order. Times come from a stamp file, or else from the names of the
+pictures, or else from a stated constant rate.
 """
 
 from __future__ import annotations
@@ -40,14 +42,27 @@ class Pictures:
     def __init__(
         self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]
     ) -> None:
-        """decode: stored values of one picture -> depth (H, W) float32 mm."""
+        """Take a stack of pictures.
+
+        Args:
+            stack: the stored pictures.
+            decode: stored values of one picture to depth (H, W) float32 mm.
+            problems: the recording's sentences, appended to when a damaged picture is met.
+        """
         self.stack = stack
         self.problems = problems
         self._decode = decode
         self._bad = {i for i, whole in enumerate(stack.whole) if not whole}
 
     def read(self, index: int) -> Depth:
-        """Depth (H, W) float32 mm of one picture."""
+        """Depth of one picture.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            (H, W) float32 mm, 0 where unread.
+        """
         stored = self.stack.read(index)
         if stored is not None:
             return self._decode(stored)
@@ -61,8 +76,17 @@ class Pictures:
 
 
 def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
-    """The kind of the depth pictures of a folder, and they in natural order: frame_2 before
-    frame_10.
+    """The depth pictures of a folder, in natural order: frame_2 before frame_10.
+
+    Args:
+        folder: where they are.
+        pattern: which names to take, as in "*_depth.png".
+
+    Returns:
+        Their kind, a key of `KINDS`, and their paths.
+
+    Raises:
+        RecordingError: there are none, or they are of several kinds or of 8 bits.
     """
     inside = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     chosen = [
@@ -92,7 +116,14 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sorts digits by their value and the rest by its letters."""
+    """Key that sorts digits in a name by their value and the rest by its letters.
+
+    Args:
+        name: name of a file.
+
+    Returns:
+        The key, for `sorted`.
+    """
     return [
         (0, int(part), "") if part.isascii() and part.isdigit() else (1, 0, part)
         for part in re.findall(r"[0-9]+|[^0-9]+", name)
@@ -102,7 +133,21 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def open_images(
     path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
 ) -> Recording:
-    """A folder of pictures, or one picture or stack, as a recording."""
+    """Open a folder of pictures, or one picture or stack, as a recording.
+
+    Args:
+        path: the folder or file.
+        camera: comes before a camera.toml.
+        fps: frame rate, Hz; used only where there are no time stamps, and before that of a
+            camera.toml.
+        progress: told how many pictures were looked at.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: there is no depth, or the camera or the times are not known.
+    """
     folder = path if path.is_dir() else path.parent
     told = CameraFile.read(folder / CAMERA_FILE)
     kind, files = list_pictures(path, told.pattern) if path.is_dir() else (_kind(path), [path])
@@ -116,8 +161,13 @@ def open_images(
 class Folder:
     """Pictures and all that is needed to make a recording of them.
 
-    path: what was asked for, a folder or one file; told: what its camera.toml says; decode: stored
-    values -> depth (H, W) float32 mm; beside: further files that say how to read the pictures.
+    Attributes:
+        path: what was asked for, a folder or one file.
+        files: the files of the pictures.
+        told: what the folder's camera.toml says.
+        stack: the stored pictures.
+        decode: stored values to depth (H, W) float32 mm.
+        beside: further files that say how to read the pictures.
     """
 
     path: Path
@@ -128,7 +178,19 @@ class Folder:
     beside: Sequence[Path] = ()
 
     def recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
-        """The recording, with its camera and times; the stack is closed where that fails."""
+        """The recording, with its camera and times; the stack is closed where that fails.
+
+        Args:
+            format: name of the format, for `Recording.format`.
+            camera: comes before the camera.toml.
+            fps: frame rate, Hz; used only where there are no time stamps.
+
+        Returns:
+            The recording.
+
+        Raises:
+            RecordingError: the camera or the times are not known, or all depths are negative.
+        """
         try:
             return self._recording(format, camera, fps)
         except BaseException:
@@ -229,7 +291,20 @@ def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
 
 
 def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: Progress) -> Stack:
-    """The pictures of one kind, a key of `KINDS`."""
+    """The pictures of one kind.
+
+    Args:
+        kind: a key of `KINDS`.
+        files: the pictures, in order.
+        camera_file: what the folder's camera.toml says, for encoding and byte_order.
+        progress: told how many were looked at.
+
+    Returns:
+        The pictures as a stack.
+
+    Raises:
+        RecordingError: they cannot be read, or the stated encoding does not fit their kind.
+    """
     if kind == "PNG":
         from liex_lab.recordings.formats.images.png import open_pngs
 

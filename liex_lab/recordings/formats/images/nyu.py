@@ -1,5 +1,6 @@
-"""The NYU hand pose data set: depth in the green and blue of colour PNGs, and the joints of its
-joint_data.mat.
+"""The NYU hand pose data set (Tompson et al. 2014): depth in colour PNGs, joints in joint_data.mat.
+
+Depth is 256 green + blue, mm. The set holds no times; its cameras ran at 30 frames/s.
 """
 
 from __future__ import annotations
@@ -35,8 +36,11 @@ _NOMINAL_HZ = 30.0  # the data set holds no times; its cameras ran at this rate
 class NyuJoints:
     """Ground truth of one view, in the order of its pictures, which are numbered from 1.
 
-    names (J,): as in the file; uvd (N, J, 3): u, v pixels, depth mm; xyz (N, J, 3): mm in our
-    camera frame (x right, y down, z away), so its y is the file's with the sign turned.
+    Attributes:
+        names: (J,) names of the joints, as in the file.
+        uvd: (N, J, 3) u, v px and depth mm.
+        xyz: (N, J, 3) mm, camera frame (x right, y down, z away), so its y is the file's with the
+            sign turned.
     """
 
     names: tuple[str, ...]
@@ -45,7 +49,15 @@ class NyuJoints:
 
 
 def looks_like_nyu(folder: Path, names: list[str]) -> bool:
-    """Whether a folder's files are those of the NYU data set: so named, and in colour."""
+    """Whether files are those of the NYU data set: so named, and 8-bit colour PNG.
+
+    Args:
+        folder: where they are.
+        names: names of the files in it.
+
+    Returns:
+        True where one of the first eight so named is in colour.
+    """
     for name in [name for name in names if _NAME.fullmatch(name)][:_N_ASKED]:
         with (folder / name).open("rb") as file:
             if file.read(26)[24:] == b"\x08\x02":
@@ -60,7 +72,21 @@ def open_nyu(
     progress: Progress = silent,
     view: int = VIEW,
 ) -> Recording:
-    """A folder of `depth_K_NNNNNNN.png` (K is the view), or one such picture, as a recording."""
+    """Open a folder of `depth_K_NNNNNNN.png` (K is the view), or one such picture, as a recording.
+
+    Args:
+        path: the folder or picture.
+        camera: comes before a camera.toml and the data set's own intrinsics.
+        fps: frame rate, Hz, where there is no stamp file; None for that of a camera.toml, or 30.
+        progress: told how many pictures were looked at.
+        view: which of the three cameras, 1 to 3.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: there are no such pictures, or they are damaged.
+    """
     folder = path if path.is_dir() else path.parent
     told = CameraFile.read(folder / CAMERA_FILE)
     files = _pictures(folder, view) if path.is_dir() else [path]
@@ -77,7 +103,18 @@ def open_nyu(
 
 
 def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
-    """The numbers, from 1, of the pictures that `open_nyu` reads, in its order."""
+    """Numbers, from 1, of the pictures that `open_nyu` reads, in its order.
+
+    Args:
+        folder: where they are.
+        view: which of the three cameras, 1 to 3.
+
+    Returns:
+        (N,) numbers out of the names.
+
+    Raises:
+        RecordingError: there are no such pictures.
+    """
     return [int(path.stem.split("_")[2]) for path in _pictures(folder, view)]
 
 
@@ -94,8 +131,19 @@ def _pictures(folder: Path, view: int) -> list[Path]:
 
 
 def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
-    """The joints in a folder's joint_data.mat, of one view. Row i belongs to the picture with
-    number i + 1.
+    """Joints of one view out of a joint_data.mat.
+
+    Row i belongs to the picture with number i + 1.
+
+    Args:
+        folder: the folder that holds joint_data.mat, or the file itself.
+        view: which of the three cameras, 1 to 3.
+
+    Returns:
+        The joints of all frames.
+
+    Raises:
+        RecordingError: there is no such file, or it does not hold 36 joints to a frame.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError

@@ -1,5 +1,7 @@
-"""The labels of the NYU hand data: fourteen points of a hand in pixels and mm, and where they lie
-on our skeleton.
+"""Labels of the NYU hand pose data set (Tompson et al. 2014): the usual 14 of its 36 joints.
+
+Each labelled point is a weighted mean of the joints of our hand skeleton; hand poses are fitted to
+the points by least squares (Levenberg-Marquardt on the manifold, `fit_poses`).
 """
 
 from __future__ import annotations
@@ -66,7 +68,14 @@ _START_BEND = 0.3  # rad: a straight finger does not know which way to bend
 
 
 def points_of_joints(skeleton: Skeleton) -> Array:
-    """Weights (14, J) that make the fourteen points of a hand's joints: `weights @ joints`."""
+    """Weights that make the fourteen labelled points of a hand's joints.
+
+    Args:
+        skeleton: the hand's skeleton, J joints.
+
+    Returns:
+        (14, J) weights: `weights @ joints` are the points.
+    """
     weights = np.zeros((len(POINTS), skeleton.n_joints))
     for row, parts in enumerate(POINTS.values()):
         for name, share in parts.items():
@@ -75,15 +84,25 @@ def points_of_joints(skeleton: Skeleton) -> Array:
 
 
 def uvd_to_mm(uvd: ArrayLike) -> Array:
-    """Points (..., 3) mm in the camera frame of pixels and depths (..., 3): u, v px, d mm."""
+    """Points in the camera frame of pixels and depths, by the pinhole `NYU_CAMERA`.
+
+    Args:
+        uvd: (..., 3) u, v px and depth mm.
+
+    Returns:
+        (..., 3) mm, camera frame.
+    """
     values = np.asarray(uvd, float)
     return NYU_CAMERA.unproject(values[..., :2], values[..., 2])
 
 
 @dataclass(frozen=True)
 class NyuReference:
-    """The true points (n, 14, 3) mm, camera frame, of the NYU test frames, and what methods have
-    answered.
+    """True points of the NYU test frames, and what methods have answered.
+
+    Attributes:
+        truth: (n, 14, 3) mm, camera frame.
+        answers: (n, 14, 3) mm, camera frame, by name of the method.
     """
 
     truth: Array
@@ -91,8 +110,16 @@ class NyuReference:
 
     @staticmethod
     def load(folder: str | Path) -> NyuReference:
-        """From the folder that holds nyu_test_14joints.npz, or else the data set's own
-        joint_data.mat, which holds no answers. Raises LiexError.
+        """Load the reference from its file, or else from the data set's own.
+
+        Args:
+            folder: holds nyu_test_14joints.npz, or else joint_data.mat, which holds no answers.
+
+        Returns:
+            The reference.
+
+        Raises:
+            LiexError: the folder has neither file, or the file is damaged or labels other points.
         """
         path = Path(folder) / REFERENCE_FILE
         if not path.is_file() and (Path(folder) / JOINT_FILE).is_file():
@@ -126,7 +153,18 @@ class NyuReference:
 
 
 def fit_hands(skeleton: Skeleton, points: Array) -> Fit:
-    """Hand poses (n) in the frame of the labelled points (n, 14, 3) mm."""
+    """Fit hand poses to labelled points.
+
+    The search begins with the palm at its point, pointing away from the wrist, and with fingers
+    bent by 0.3 rad, for a straight finger does not know which way to bend.
+
+    Args:
+        skeleton: the hand's skeleton.
+        points: (n, 14, 3) labelled points, mm, in the order of `POINTS`.
+
+    Returns:
+        n poses in the frame of the points, and how well they fit.
+    """
     palm = points[:, PALM]
     wrists = points[:, [_LITTLE_WRIST, _THUMB_WRIST]]
     forward = _unit(palm - wrists.mean(axis=1))

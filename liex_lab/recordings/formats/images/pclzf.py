@@ -1,6 +1,4 @@
-"""PCL's own pictures: `.pclzf`, 16-bit depth packed with LZF, and the intrinsics in the XML beside
-each.
-"""
+"""PCL's `.pclzf` pictures: 16-bit depth packed with LZF, intrinsics in the XML beside each."""
 
 from __future__ import annotations
 
@@ -46,7 +44,18 @@ class _Header(NamedTuple):
 
 
 def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
-    """Look at the header and the length of every file."""
+    """Open PCLZF pictures: the header and the length of every file are checked, none is decoded.
+
+    Args:
+        files: the pictures, in order.
+        progress: told how many were looked at.
+
+    Returns:
+        The pictures as a stack.
+
+    Raises:
+        RecordingError: none is whole, one holds colour, or their sizes differ.
+    """
     return open_files(files, "PCLZF", _look, _decode, progress)
 
 
@@ -80,11 +89,17 @@ def _decode(path: Path) -> NDArray[np.uint16] | None:
 
 
 def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
-    """Intrinsics (fx, fy, cx, cy, pixels) and unit_mm of a picture's XML; None where there is none
-    that tells them.
+    """Intrinsics and unit in the XML beside a picture.
 
     PCL writes `frame_T.xml` beside `frame_T_depth.pclzf`, with two elements at the top, <rgb> and
     <depth>, which is why it is no XML until something stands around them.
+
+    Args:
+        picture: the .pclzf file.
+
+    Returns:
+        fx, fy, cx, cy (px) and unit_mm (mm per stored step) by name; None where there is no XML
+        that states them.
     """
     path = picture.with_name(
         picture.name.removesuffix(picture.suffix).removesuffix("_depth") + ".xml"

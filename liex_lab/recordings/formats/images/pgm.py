@@ -1,5 +1,7 @@
-"""PGM pictures (P5, 16 bits), in the byte order of the standard or in the one that some programs
-write.
+"""PGM pictures (Netpbm P5, 16 bits), in the byte order of the standard or in the reverse one.
+
+Netpbm has the high byte first; some programs write the low byte first. The order in which
+neighbouring pixels are at least twice as alike tells: depth is smooth, and its low byte is not.
 """
 
 from __future__ import annotations
@@ -39,10 +41,19 @@ class _Header(NamedTuple):
 
 
 def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = None) -> FileStack:
-    """Look at the header and the length of every file.
+    """Open PGM pictures: the header and the length of every file are checked, and none is decoded.
 
-    byte_order: "big", as the format's definition has it, or "little"; None: big, unless most
-    pictures are plainly the other way round, which is told.
+    Args:
+        files: the pictures, in order.
+        progress: told how many were looked at.
+        byte_order: "big", as the format's definition has it, or "little"; None for big, unless most
+            pictures are plainly the other way round, which `problems` then say.
+
+    Returns:
+        The pictures as a stack.
+
+    Raises:
+        RecordingError: none is whole, one is no depth, or their sizes differ.
     """
     stack = open_files(
         files, "PGM", _look, partial(_decode, dtype=_DTYPES[byte_order or "big"]), progress

@@ -1,4 +1,8 @@
-"""PNG pictures: what the header says, whether the file is whole, and its pixels."""
+"""PNG pictures: 16-bit grey or 8-bit colour, with size, completeness and chunk CRCs checked.
+
+OpenCV decodes the pixels, after all CRCs agree: it would find damage too, but write about it into
+the terminal.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +41,15 @@ _COLOURS = {
 
 
 def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | None:
-    """Pixels (H, W) uint16 of a 16-bit grey PNG, or (H, W, 3) uint8 (blue, green, red) of an 8-bit
-    colour one.
+    """Pixels of a PNG.
 
-    None where it does not decode to that.
+    Args:
+        data: (m,) uint8 bytes of the file.
+        colour: 8-bit colour is expected instead of 16-bit grey.
+
+    Returns:
+        (H, W) uint16, or with colour (H, W, 3) uint8 (blue, green, red); None where it does not
+        decode to that.
     """
     import cv2
 
@@ -72,8 +81,18 @@ def _sums_agree(data: NDArray[np.uint8]) -> bool:
 
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:
-    """Look at the head and the tail of every file, without decoding any. colour: 8-bit colour is
-    expected.
+    """Open PNG pictures: the head and the tail of every file are checked, and none is decoded.
+
+    Args:
+        files: the pictures, in order.
+        progress: told how many were looked at.
+        colour: 8-bit colour is expected instead of 16-bit grey.
+
+    Returns:
+        The pictures as a stack.
+
+    Raises:
+        RecordingError: none is whole, one is of another kind, or their sizes differ.
     """
     return open_files(
         files, "PNG", partial(_look, colour=colour), partial(_decode, colour=colour), progress
@@ -103,8 +122,18 @@ def _look(path: Path, colour: bool) -> Look:
 
 
 def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] | None:
-    """Width and height that a 16-bit grey (or 8-bit colour) PNG states in its first bytes; None
-    where cut off.
+    """Width and height that a PNG states in its header.
+
+    Args:
+        head: the first bytes of the file; 26 are needed.
+        where: the file, for the sentence.
+        colour: 8-bit colour is expected instead of 16-bit grey.
+
+    Returns:
+        (width, height), px; None where the header is cut off.
+
+    Raises:
+        RecordingError: it is no PNG, its header makes no sense, or it is of another kind.
     """
     if not head.startswith(_SIGNATURE[: len(head)]):
         raise RecordingError(

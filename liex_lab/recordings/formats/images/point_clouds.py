@@ -1,5 +1,6 @@
-"""Point clouds as XYZ text or PLY, and the depth pictures that a pinhole camera would see
-of them.
+"""Point clouds (XYZ text, PLY) as depth pictures: projection into a pinhole camera with a z-buffer.
+
+u = floor(fx x / z + cx + 1/2), v likewise; the nearest point of a pixel counts.
 """
 
 from __future__ import annotations
@@ -57,12 +58,32 @@ def open_clouds(
     to_camera: Callable[[Points], Points],
     progress: Progress,
 ) -> FileStack:
-    """Clouds as pictures (H, W) float64 mm, 0 = unread. to_camera: a file's points (n, 3) -> mm in
-    the camera frame.
+    """Open point clouds, one to a file, as pictures of a camera.
+
+    Args:
+        files: the clouds, in order.
+        camera: the camera that sees them.
+        columns: of x, y, z in a text file, from 0.
+        to_camera: a file's points (n, 3) in its own units to mm in the camera frame.
+        progress: told how many were looked at.
+
+    Returns:
+        Pictures (H, W) float64 mm, 0 = unread, as a stack.
+
+    Raises:
+        RecordingError: none of the files is whole.
     """
     size = (camera.width, camera.height)
 
     def decode(path: Path) -> NDArray[Any] | None:
+        """Depth of one cloud.
+
+        Args:
+            path: its file.
+
+        Returns:
+            (H, W) mm; None where it is damaged.
+        """
         points = read_points(path, columns)
         return None if points is None else see(to_camera(points), camera)
 
@@ -70,8 +91,15 @@ def open_clouds(
 
 
 def see(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
-    """Depth (H, W) mm of points (n, 3) mm in the camera frame: the nearest in every pixel, 0 where
-    there is none.
+    """Depth that a camera sees of points: the nearest in every pixel.
+
+    Args:
+        p_camera: (n, 3) mm, camera frame; points that are not finite or behind the lens are left
+            out.
+        camera: the camera.
+
+    Returns:
+        (H, W) float64 mm, 0 where there is none.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         p_camera = p_camera[np.isfinite(p_camera).all(axis=1) & (p_camera[:, 2] > 0)]
@@ -84,8 +112,14 @@ def see(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
 
 
 def read_points(path: Path, columns: tuple[int, int, int]) -> Points | None:
-    """Points (n, 3) of a file, in its own units; None where it is damaged. columns: of x, y, z in a
-    text.
+    """Points of a file, in its own units.
+
+    Args:
+        path: a .ply file, or a text with one point to a line.
+        columns: of x, y, z in a text, from 0.
+
+    Returns:
+        (n, 3); None where the file is damaged.
     """
     try:
         return _read_ply(path) if path.suffix.lower() == PLY else _read_text(path, columns)
@@ -134,8 +168,14 @@ def _read_text(path: Path, columns: tuple[int, int, int]) -> Points:
 
 
 class _PlyHeader(NamedTuple):
-    """order: of bytes, empty for text; n: vertices; fields: (name, type) of each; row_bytes: of
-    one, at least.
+    """What the header of a PLY file says of its vertices.
+
+    Attributes:
+        order: of bytes, "<" or ">"; empty for text.
+        n: how many vertices.
+        fields: (name, NumPy type) of each number of a vertex.
+        start: where they begin in the file, bytes.
+        row_bytes: size of one vertex, bytes; for text, the least that it can be.
     """
 
     order: str

@@ -1,5 +1,9 @@
-"""Exports of Raytrix light-field cameras: depth maps and point clouds, read through a profile that
-is named.
+"""Exports of Raytrix light-field (plenoptic) cameras: depth maps and point clouds.
+
+The vendor documents little of what the numbers mean, so a profile is named in raytrix.toml and
+checked against the first picture (type, sign, working distance). Without a camera.toml,
+
+    f_px = focal_mm / (pitch_mm * resolution_divisor).
 """
 
 from __future__ import annotations
@@ -37,7 +41,21 @@ _CALIBRATION = "RayCalibData"
 def open_raytrix(
     folder: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
 ) -> Recording:
-    """A folder of exported depth maps or point clouds with its raytrix.toml, as a recording."""
+    """Open a folder of exported depth maps or point clouds with its raytrix.toml as a recording.
+
+    Args:
+        folder: where the exports are.
+        camera: comes before a camera.toml and the profile's lens.
+        fps: frame rate, Hz; used only where there are no time stamps.
+        progress: told how many files were looked at.
+
+    Returns:
+        The recording, with the profile in its metadata.
+
+    Raises:
+        RecordingError: the profile does not fit the exports, depth is virtual and no calibration is
+            stated, or the camera or the times are not known.
+    """
     path = folder / PROFILE_FILE
     profile = read_profile(path)
     told = CameraFile.read(folder / CAMERA_FILE)
@@ -67,8 +85,14 @@ def open_raytrix(
 
 
 def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
-    """Whether a folder's files are named like exports, are point clouds, or hold the vendor's
-    calibration.
+    """Whether files are exports: so named, point clouds, or with the vendor's calibration.
+
+    Args:
+        folder: where they are.
+        names: names of the files in it.
+
+    Returns:
+        True where one of them is.
     """
     if any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE):
         return True
@@ -81,7 +105,14 @@ def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
 
 
 def no_profile_error(folder: Path) -> RecordingError:
-    """The sentence for a folder of exports without a raytrix.toml."""
+    """The error for a folder of exports without a raytrix.toml.
+
+    Args:
+        folder: the folder.
+
+    Returns:
+        The error, to be raised.
+    """
     listed = ", ".join(shipped_profiles())
     return RecordingError(
         f"{folder} holds exports of a Raytrix camera, whose numbers mean depth in several ways; "
@@ -169,10 +200,26 @@ def _open_clouds(
 
 
 def profile_points(profile: Profile) -> Callable[[_clouds.Points], _clouds.Points]:
-    """The function that carries a file's points (n, 3) into the camera frame, mm."""
+    """The function that carries a file's points into the camera frame.
+
+    Args:
+        profile: for units, signs, offset and invalid values.
+
+    Returns:
+        A function from points (n, 3) in the file's units to (n, 3) mm, camera frame; NaN where z is
+        invalid.
+    """
     scale = profile.unit_mm * np.array([1.0, -1.0 if profile.up else 1.0, float(profile.sign)])
 
     def to_camera(points: _clouds.Points) -> _clouds.Points:
+        """Points in the camera frame.
+
+        Args:
+            points: (n, 3) in the file's units.
+
+        Returns:
+            (n, 3) mm; all three NaN where z is invalid.
+        """
         p_camera = points * scale
         for value in profile.invalid:
             p_camera[points[:, 2] == value] = np.nan
@@ -184,10 +231,15 @@ def profile_points(profile: Profile) -> Callable[[_clouds.Points], _clouds.Point
 
 @dataclass(frozen=True)
 class RayCalibration:
-    """What the vendor's calibration file holds: the grid of micro-lenses, in pixels, and ranges of
-    virtual depth.
+    """The vendor's calibration: the grid of micro-lenses and the ranges of virtual depth.
 
     It has no focal length and no metric scale, so it does not turn virtual depth into millimetres.
+
+    Attributes:
+        diameter_px: diameter of a micro-lens, px.
+        rotation_rad: rotation of the grid, rad.
+        tcp: total covering plane, in virtual depth.
+        depth_ranges: (least, greatest) virtual depth of each type of micro-lens.
     """
 
     diameter_px: float
@@ -197,7 +249,17 @@ class RayCalibration:
 
 
 def read_ray_calibration(path: Path) -> RayCalibration:
-    """The `RayCalibData` of an XML file."""
+    """The `RayCalibData` of an XML file.
+
+    Args:
+        path: the XML file.
+
+    Returns:
+        What it holds.
+
+    Raises:
+        RecordingError: it is no such calibration.
+    """
     with path.open("rb") as file:
         text = file.read(_CALIBRATION_BYTES)
     try:

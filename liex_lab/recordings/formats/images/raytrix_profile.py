@@ -1,5 +1,8 @@
-"""raytrix.toml: which profile a folder of exports is read through, and what about it is
-different.
+"""The raytrix.toml format: which profile a folder of Raytrix exports is read through.
+
+depth_mm = sign * unit_mm * stored + offset_mm. Virtual depth v goes through the thin lens law
+first: the image lies b = lens_to_grid + v * grid_to_sensor behind the main lens, and the object a =
+b f / (b - f) in front of it. `raw` values are 1 - 1 / v.
 """
 
 from __future__ import annotations
@@ -25,12 +28,31 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Profile(BaseModel):
-    """How the stored numbers of an export mean millimetres; the keys are explained in
-    raytrix_profiles.toml.
+    """How the stored numbers of an export mean millimetres.
 
-    focal_mm, pitch_mm: of the main lens and of the sensor's pixels, from which the intrinsics
-    follow where no camera.toml states them; lens_f_mm, lens_to_grid_mm, grid_to_sensor_mm: what
-    turns virtual depth into millimetres.
+    The keys are explained in raytrix_profiles.toml.
+
+    Attributes:
+        name: name of the profile, or of the file that states it.
+        pattern: which files of the folder.
+        kind: metric (depth maps), virtual (relative depth) or points (point clouds).
+        stored: type of the stored values, float32 or uint16.
+        unit_mm: mm per stored step.
+        offset_mm: added after scaling, mm.
+        sign: -1 where object space lies on the negative side of the file's z axis.
+        invalid: stored values that mean "no reading" (of points: z).
+        valid_mm: nearest and farthest depth after conversion, mm; what is outside is unread.
+        resolution_divisor: the sensor's pixels per pixel of the exported picture.
+        evidence: how it is known that the profile is right; begins with "confirmed" once measured.
+        virtual: v for virtual depth itself, raw for 1 - 1 / v.
+        up: True where y points up in the file.
+        columns: of x, y, z in a text file, from 0.
+        focal_mm: focal length of the main lens, mm, from which the intrinsics follow where no
+            camera.toml states them.
+        pitch_mm: pitch of the sensor's pixels, mm; also for the intrinsics.
+        lens_f_mm: focal length of the main lens, mm, to turn virtual depth into mm.
+        lens_to_grid_mm: distance from the main lens to the micro-lens grid, mm.
+        grid_to_sensor_mm: distance from the grid to the sensor, mm.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -77,9 +99,7 @@ class Profile(BaseModel):
 
     @property
     def lens(self) -> tuple[float, float, float] | None:
-        """f, distance from lens to micro-lens grid and from grid to sensor, mm, where all are
-        stated.
-        """
+        """(f, lens to micro-lens grid, grid to sensor), mm, where all are stated; else None."""
         numbers = (self.lens_f_mm, self.lens_to_grid_mm, self.grid_to_sensor_mm)
         return None if None in numbers else numbers  # type: ignore[return-value]
 
@@ -91,8 +111,13 @@ class Profile(BaseModel):
         }
 
     def read(self, stored: NDArray[Any]) -> NDArray[np.float64]:
-        """Signed mm (H, W) of stored values, NaN where they are invalid, before `valid_mm` is
-        looked at.
+        """Signed distance of stored values, before `valid_mm` is looked at.
+
+        Args:
+            stored: (H, W) float32 or uint16, as the file holds them.
+
+        Returns:
+            (H, W) mm, NaN where they are invalid.
         """
         with np.errstate(
             invalid="ignore"
@@ -106,8 +131,10 @@ class Profile(BaseModel):
         return self.sign * self.unit_mm * values + self.offset_mm
 
     def _from_virtual(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance from the main lens, mm: the image lies v micro-lens gaps behind the grid, and
-        the thin lens law.
+        """Distance a from the main lens, mm, by the thin lens law 1/f = 1/a + 1/b.
+
+        The image lies b = lens_to_grid + v * grid_to_sensor behind the lens, v micro-lens gaps
+        behind the grid. NaN where b <= f, for there is no real image then.
         """
         assert self.lens is not None
         f, to_grid, gap = self.lens
@@ -117,11 +144,25 @@ class Profile(BaseModel):
         return behind * f / (behind - f)
 
     def decode(self, stored: NDArray[Any]) -> Depth:
-        """Stored values -> depth (H, W) float32 mm, 0 = unread."""
+        """Depth of stored values.
+
+        Args:
+            stored: (H, W) float32 or uint16, as the file holds them.
+
+        Returns:
+            (H, W) float32 mm, 0 = unread.
+        """
         return self.within(self.read(stored))
 
     def within(self, depth_mm: NDArray[Any]) -> Depth:
-        """Depth mm with what lies outside `valid_mm` taken as unread."""
+        """Depth with what lies outside `valid_mm` taken as unread.
+
+        Args:
+            depth_mm: (H, W) mm, NaN or 0 where unread.
+
+        Returns:
+            (H, W) float32 mm, 0 = unread.
+        """
         good = (depth_mm >= self.valid_mm[0]) & (depth_mm <= self.valid_mm[1])
         return np.where(good & (depth_mm > 0), depth_mm, 0.0).astype(np.float32)
 
@@ -132,7 +173,18 @@ def shipped_profiles() -> dict[str, dict[str, Any]]:
 
 
 def read_profile(path: Path) -> Profile:
-    """The profile that a raytrix.toml names or states in full."""
+    """The profile that a raytrix.toml names or states in full.
+
+    Args:
+        path: the raytrix.toml.
+
+    Returns:
+        The profile; keys stated in the file count before those of the named profile.
+
+    Raises:
+        RecordingError: the file is no TOML, names no known profile, or the value of a key cannot
+            be.
+    """
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -1,5 +1,7 @@
-"""Pictures of one size in order, as stored: what a stack of any kind promises, and one made of
-single files.
+"""Interface of a stack of stored pictures of one size, and its form with one picture to a file.
+
+Files are first looked at (header, length) without decoding any; damaged ones stay in their place
+and read as None.
 """
 
 from __future__ import annotations
@@ -20,22 +22,21 @@ Size = tuple[int, int]  # width, height, pixels
 
 
 class Stack(Protocol):
-    """Pictures of one size, in order; `read` gives stored values (H, W), or None where a picture is
-    cut or damaged.
-    """
+    """Pictures of one size, in order, as the files hold them."""
 
     @property
     def width(self) -> int:
-        """Pixels in a row."""
+        """Columns of a picture, px."""
 
     @property
     def height(self) -> int:
-        """Rows in a picture."""
+        """Rows of a picture, px."""
 
     @property
     def whole(self) -> list[bool]:
-        """Which pictures are not cut short or damaged, as far as that shows without
-        decoding them.
+        """(n,) True for pictures that are not cut short or damaged.
+
+        As far as that shows without decoding them.
         """
 
     @property
@@ -49,20 +50,35 @@ class Stack(Protocol):
     def __len__(self) -> int: ...
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values (H, W), or (H, W, 3) of colour pictures; None where the picture is cut or
-        damaged.
+        """Stored values of one picture.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            (H, W), or (H, W, 3) of colour pictures; None where the picture is cut or damaged.
         """
 
     def label(self, index: int) -> str:
-        """The file of a picture, for a sentence."""
+        """Name of a picture, for a sentence.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            The file, and where in it.
+        """
 
     def close(self) -> None:
         """Let go of open files."""
 
 
 class Look(NamedTuple):
-    """What a file says before its picture is decoded. size: None where it is cut or damaged; why:
-    what else it is.
+    """What a file says before its picture is decoded.
+
+    Attributes:
+        size: (width, height), px; None where it is cut or damaged.
+        why: the error that says what else it is; None where it is of its kind.
     """
 
     size: Size | None
@@ -74,7 +90,16 @@ DAMAGED = Look(None)
 
 @dataclass(frozen=True)
 class FileStack:
-    """A picture per file; `decode` gives the stored values of a file, None where it is damaged."""
+    """A stack with one picture to a file.
+
+    Attributes:
+        files: the pictures, in order.
+        width: columns of a picture, px.
+        height: rows of a picture, px.
+        whole: (n,) True for pictures that are not cut short or damaged.
+        decode: gives the stored values of a file; None where it is damaged.
+        problems: sentences about the files as a whole.
+    """
 
     files: list[Path]
     width: int
@@ -92,7 +117,14 @@ class FileStack:
         return not all(self.whole)
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values (H, W); None where the picture is cut or damaged."""
+        """Stored values of one picture.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            (H, W), or (H, W, 3) of colour pictures; None where the picture is cut or damaged.
+        """
         picture = self.decode(self.files[index]) if self.whole[index] else None
         return (
             picture
@@ -101,11 +133,18 @@ class FileStack:
         )
 
     def label(self, index: int) -> str:
-        """The file of a picture, for a sentence."""
+        """Name of a picture's file, for a sentence.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            The file's name.
+        """
         return self.files[index].name
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, for no file is held open."""
 
 
 def open_files(
@@ -115,8 +154,20 @@ def open_files(
     decode: Callable[[Path], NDArray[Any] | None],
     progress: Progress,
 ) -> FileStack:
-    """Look at every file without decoding any; `look` raises for a picture that is whole but no
-    depth.
+    """Open pictures, one to a file: every file is looked at and none is decoded.
+
+    Args:
+        files: the pictures, in order.
+        kind: their kind, for sentences, such as "PNG".
+        look: reads a file's header; raises for a picture that is whole but no depth.
+        decode: gives the stored values of a file; None where it is damaged.
+        progress: told how many were looked at.
+
+    Returns:
+        The pictures as a stack.
+
+    Raises:
+        RecordingError: none is whole, or their sizes differ.
     """
     looks = []
     for number, path in enumerate(files, start=1):
@@ -137,7 +188,15 @@ def open_files(
 
 
 def none_whole_error(files: list[Path], kind: str) -> RecordingError:
-    """The sentence for pictures none of which can be read."""
+    """The error for pictures none of which can be read.
+
+    Args:
+        files: the pictures.
+        kind: their kind, such as "PNG".
+
+    Returns:
+        The error, to be raised.
+    """
     return RecordingError(
         f"none of the {len(files)} {kind} pictures in {files[0].parent} is whole; copy them again"
         if len(files) > 1
@@ -146,7 +205,15 @@ def none_whole_error(files: list[Path], kind: str) -> RecordingError:
 
 
 def something_else(path: Path, kind: str) -> Look:
-    """A file whose first bytes are not those of its kind."""
+    """The finding that a file's first bytes are not those of its kind.
+
+    Args:
+        path: the file.
+        kind: what its name says it is, such as "PNG".
+
+    Returns:
+        A look without a size, and with the error.
+    """
     return Look(
         None,
         RecordingError(
@@ -157,12 +224,29 @@ def something_else(path: Path, kind: str) -> Look:
 
 
 def too_large(size: Size) -> bool:
-    """Whether a stated size is beyond any depth camera, and so no size."""
+    """Whether a stated size is beyond any depth camera (2^24 px), and so no size.
+
+    Args:
+        size: (width, height), px.
+
+    Returns:
+        True where it is too large.
+    """
     return size[0] * size[1] > MAX_PIXELS
 
 
 def not_depth_error(where: str, found: str, width: int, height: int) -> RecordingError:
-    """The sentence for a picture that cannot hold depth."""
+    """The error for a picture that cannot hold depth.
+
+    Args:
+        where: the file.
+        found: what it holds, such as "8-bit grey".
+        width: its columns, px.
+        height: its rows, px.
+
+    Returns:
+        The error, to be raised.
+    """
     article = "an" if found.startswith(("8", "11", "18")) else "a"
     return RecordingError(
         f"expected 16-bit depth, got {article} {found} image of {width} x {height} pixels "
@@ -173,7 +257,14 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
 
 
 def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
-    """The sentence for pictures of several sizes in one recording."""
+    """The error for pictures of several sizes in one recording.
+
+    Args:
+        pictures: (name, width, height) of one picture of each size.
+
+    Returns:
+        The error, to be raised.
+    """
     (one, w, h), (other, v, g) = pictures[:2]
     return RecordingError(
         f"all pictures of a recording have one size, but {one} has {w} x {h} pixels and {other} "

@@ -1,4 +1,9 @@
-"""16-bit or float32 TIFF pictures, one to a file or many."""
+"""TIFF pictures, 16-bit or float32 grey, one to a file or many, BigTIFF and ImageJ stacks included.
+
+Uncompressed pixels in one piece are read straight from their offset; other pages go through
+tifffile, and codecs that it leaves to another package (LZW) through OpenCV. A stack ends at its
+first bad page, for what follows cannot be told from noise.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +34,14 @@ _SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 class _Page(NamedTuple):
-    """One picture: its page, and where its pixels lie when they are plain bytes in one piece (else
-    offset -1).
+    """One picture.
+
+    Attributes:
+        path: its file.
+        page: its page in the file.
+        offset: where its pixels lie when they are plain bytes in one piece, else -1.
+        dtype: of the pixels, with byte order.
+        whole: True where it is not cut short.
     """
 
     path: Path
@@ -42,8 +53,13 @@ class _Page(NamedTuple):
 
 @dataclass
 class TiffStack:
-    """TIFF pictures of one size, in order; whole: which of them are not cut short. One file is open
-    at a time.
+    """TIFF pictures of one size, in order; a `Stack` with one file open at a time.
+
+    Attributes:
+        pages: the pictures.
+        width: columns of a picture, px.
+        height: rows of a picture, px.
+        problems: sentences about stacks that are cut short.
     """
 
     pages: list[_Page]
@@ -59,7 +75,7 @@ class TiffStack:
 
     @property
     def whole(self) -> list[bool]:
-        """Which pictures are not cut short."""
+        """(n,) True for pictures that are not cut short."""
         return [page.whole for page in self.pages]
 
     @property
@@ -68,7 +84,14 @@ class TiffStack:
         return bool(self.problems) or not all(self.whole)
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values (H, W) uint16 or float32; None where the picture is cut or damaged."""
+        """Stored values of one picture.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            (H, W) uint16 or float32; None where the picture is cut or damaged.
+        """
         page = self.pages[index]
         if not page.whole:
             return None
@@ -95,7 +118,14 @@ class TiffStack:
             return _decode_with_opencv(page)
 
     def label(self, index: int) -> str:
-        """The file and page of a picture, for a sentence."""
+        """Name of a picture, for a sentence.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            Its page and file.
+        """
         page = self.pages[index]
         return f"page {page.page} of {page.path.name}"
 
@@ -120,7 +150,18 @@ def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
 
 
 def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
-    """List every page and check that its bytes are there, without decoding any."""
+    """Open TIFF pictures: every page is listed and its bytes must be there; none is decoded.
+
+    Args:
+        files: the files, in order, of one page or many.
+        progress: told how many files were looked at.
+
+    Returns:
+        The pictures as a stack.
+
+    Raises:
+        RecordingError: none is whole, one is no depth, or their sizes differ.
+    """
     pages: list[_Page] = []
     problems: list[str] = []
     sizes: dict[tuple[int, int], str] = {}

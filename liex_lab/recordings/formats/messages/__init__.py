@@ -1,1 +1,1 @@
-"""Logs of messages: MCAP and ROS bags, in Foxglove's and ROS's schemas."""
+"""Logs of time-stamped messages on topics: MCAP and ROS bags, in Foxglove's and ROS's schemas."""

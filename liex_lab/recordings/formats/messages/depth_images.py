@@ -1,5 +1,7 @@
-"""Pictures and point clouds out of messages, as depth: the decoders that MCAP files and ROS bags
-share.
+"""Decoders of pictures and point clouds in messages to depth, shared by MCAP files and ROS bags.
+
+Raw 16UC1, mono16 and 32FC1 (m); PNG; ROS's compressedDepth as PNG or RVL, where quantised depth is
+z = a / (q - b) m; point clouds, in rows or splatted with a z-buffer: u = fx x / z + cx.
 """
 
 from __future__ import annotations
@@ -41,8 +43,14 @@ _PNG_HEAD = 26
 
 
 def picture_size(message: DepthMessage) -> tuple[int, int] | None:
-    """Width and height of a depth picture; None for a picture of another kind, and (0, 0) for
-    points without rows.
+    """Size of a depth picture, without decoding it.
+
+    Args:
+        message: a picture or a point cloud.
+
+    Returns:
+        Width and height, px; (0, 0) for points without rows; None for a picture of another kind, or
+        of more than 2^24 pixels (clouds: 2^22 points).
     """
     if isinstance(message, PointCloud):
         known = {"x", "y", "z"} <= set(
@@ -89,10 +97,18 @@ def decode(
     scale: float,
     unread: Sequence[float] = (0.0,),
 ) -> Depth | None:
-    """Depth (H, W) float32 mm of the camera's size; None where the message holds no such picture.
+    """Depth of a message.
 
-    step_mm: millimetres in a step of 16-bit depth; scale: what a camera.toml multiplies all depth
-    by, and unread what it calls unread.
+    Args:
+        message: a picture or a point cloud.
+        camera: the camera of the recording, whose size pictures must have; loose points are
+            projected by it.
+        step_mm: mm in a step of 16-bit depth.
+        scale: what a camera.toml multiplies all depth by.
+        unread: what a camera.toml calls unread, as stored (for clouds: mm).
+
+    Returns:
+        (H, W) float32 mm of the camera's size; None where the message holds no such picture.
     """
     if picture_size(message) not in ((camera.width, camera.height), (0, 0)):
         return None

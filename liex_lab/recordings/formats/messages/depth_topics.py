@@ -1,4 +1,10 @@
-"""Which topic of a file of messages holds the depth, through which lens it was seen, and when."""
+"""Selection of the depth topic in an MCAP file or ROS bag, with its calibration and its clock.
+
+One walk over the file finds the topics whose first message is depth, and the first calibration of
+every topic that has one. The calibration of the same frame_id is taken, nearest by topic name; a
+rectified topic takes P instead of K. Stamps are the sensor's, or the times of logging where
+pictures have none.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +60,16 @@ _FACTS = ("subject_id", "session_start_time")
 
 @dataclass
 class _Topic:
-    """The depth messages of one topic, in file order, and what its first one says. size: (0, 0) for
-    loose points.
+    """The depth messages of one topic, in file order, and what its first one says.
+
+    Attributes:
+        channel: topic, schema and encoding.
+        parse: turns the bytes of a message into depth.
+        frame_id: name of the camera's frame.
+        size: width and height, px; (0, 0) for loose points.
+        log_ns: (n,) times of logging, ns.
+        stamp_ns: (n,) stamps of the sensor, ns.
+        places: (3 n,) chunk, offset and length of each message.
     """
 
     channel: Channel
@@ -68,11 +82,19 @@ class _Topic:
 
     @property
     def name(self) -> str:
-        """The topic."""
+        """Name of the topic."""
         return self.channel.topic
 
     def add(self, message: Envelope, stamp_ns: int) -> None:
-        """Note a message."""
+        """Note a message.
+
+        Args:
+            message: the message as it was met.
+            stamp_ns: its stamp, ns.
+
+        Raises:
+            DamagedMessage: one of its times is beyond the year 2116.
+        """
         if max(message.log_time_ns, abs(stamp_ns)) >= _LIMIT_NS:
             raise DamagedMessage("a message's time cannot be")
         self.log_ns.append(message.log_time_ns)
@@ -80,8 +102,10 @@ class _Topic:
         self.places.extend(message.place)
 
     def forget(self, chunk: int) -> None:
-        """Forget the messages of this chunk and those after it: they are at the end, and will be
-        met again.
+        """Forget the messages of a chunk and of those after it, for they will be met again.
+
+        Args:
+            chunk: number of the chunk; these messages are at the end.
         """
         while self.places and self.places[-3] >= chunk:
             del self.places[-3:], self.log_ns[-1], self.stamp_ns[-1]
@@ -89,8 +113,13 @@ class _Topic:
 
 @dataclass
 class _Found:
-    """What a file holds. calibrations and units: by topic; parsers: None of channels that are of no
-    use.
+    """What a file holds, as far as it was walked.
+
+    Attributes:
+        parsers: by channel; None of channels that are of no use.
+        depths: the depth topics by channel.
+        calibrations: the first calibration by topic.
+        units: the unit of depth by topic.
     """
 
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
@@ -124,8 +153,13 @@ class _Frames:
         self._lock = Lock()
 
     def read(self, number: int) -> Depth:
-        """Depth (H, W) float32 mm of one picture; one that is damaged or of another size is wholly
-        unread.
+        """Depth of one picture; one that is damaged or of another size is wholly unread.
+
+        Args:
+            number: index of the picture, in order of logging.
+
+        Returns:
+            (H, W) float32 mm, 0 where unread.
         """
         with self._lock:
             data = self._file.read(Place(*self._places[number].tolist()))
@@ -153,7 +187,23 @@ class _Frames:
 def open_topic(
     file: MessageFile, kind: str, camera: Lens | None, topic: str | None, progress: Progress
 ) -> Recording:
-    """One depth topic of an open file as a recording, which closes the file."""
+    """Open one depth topic of a file of messages as a recording.
+
+    The recording closes the file; it is closed, too, where opening fails.
+
+    Args:
+        file: the open MCAP file or ROS bag.
+        kind: name of the format, for `Recording.format`.
+        camera: comes before whatever the files state.
+        topic: name of the depth topic; None for the only one.
+        progress: told how far the walk over the file is.
+
+    Returns:
+        The recording; it can be read on where the file grows (MCAP).
+
+    Raises:
+        RecordingError: there is no depth topic, several to choose from, or the camera is not known.
+    """
     try:
         return _open(file, kind, camera, topic, progress, _Found())
     except BaseException:

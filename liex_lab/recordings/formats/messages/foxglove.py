@@ -1,4 +1,7 @@
-"""Foxglove's messages that hold depth, in protobuf and in JSON."""
+"""Parsers of Foxglove's schemas that hold depth, in protobuf and in JSON.
+
+RawImage, CompressedImage, PointCloud and CameraCalibration; in JSON, bytes are base64.
+"""
 
 from __future__ import annotations
 
@@ -82,8 +85,9 @@ _JSON_NAMES = {"seconds": "sec", "nanos": "nsec"}  # protobuf's name: JSON's
 
 
 class _Json:
-    """A JSON object whose keys are attributes, as protobuf's messages have them; what is missing is
-    empty.
+    """A JSON object whose keys are attributes, as protobuf's messages have them.
+
+    What is missing is empty, or 0.
     """
 
     _TEXTS = ("frame_id", "encoding", "format", "distortion_model", "name")
@@ -126,7 +130,15 @@ _PROTOBUF: dict[str, Any] = {
 
 
 def parser(schema: str, encoding: str) -> Parser | None:
-    """What reads this kind of message; None where there is nothing for it."""
+    """The function that reads messages of a schema.
+
+    Args:
+        schema: its name, such as "foxglove.RawImage".
+        encoding: "protobuf" or "json".
+
+    Returns:
+        The parser, which raises `DamagedMessage`; None where there is none.
+    """
     if schema in _READ and encoding == "protobuf":
         return partial(_from_protobuf, schema)
     if schema in _READ and encoding == "json":

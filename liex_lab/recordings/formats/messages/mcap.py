@@ -1,5 +1,8 @@
-"""MCAP recordings: depth in Foxglove's messages (protobuf or JSON) or in ROS's, packed or not,
-whole or cut.
+"""MCAP recordings, whole, cut or still growing: depth in Foxglove's or ROS's messages.
+
+Records (opcode, u64 length, content) are walked in file order; messages lie in chunks (none, zstd,
+lz4), which threads unpack ahead where the summary at the file's end says where they are. Schemas
+and channels are learnt from the summary too, in case the first ones are damaged.
 """
 
 from __future__ import annotations
@@ -72,8 +75,20 @@ def open_mcap(
     progress: Progress = silent,
     topic: str | None = None,
 ) -> Recording:
-    """One depth topic of an MCAP file as a recording. `fps` is not needed: every message has its
-    time.
+    """Open one depth topic of an MCAP file as a recording.
+
+    Args:
+        path: the .mcap file.
+        camera: comes before whatever the files state.
+        fps: not needed, for every message has its time.
+        progress: told how far the walk over the file is.
+        topic: name of the depth topic; None for the only one.
+
+    Returns:
+        The recording, which reads on where the file grows (`Recording.grown`).
+
+    Raises:
+        RecordingError: the file is no MCAP file, or holds no depth that can be chosen.
     """
     file = path.open("rb")
     if file.read(len(MAGIC)) != MAGIC:
@@ -88,6 +103,12 @@ class McapFile(MessageFile):
     """An open MCAP file."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Take an open file; nothing is read yet.
+
+        Args:
+            path: where the file is.
+            file: the open file.
+        """
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
@@ -101,7 +122,11 @@ class McapFile(MessageFile):
         )  # behind the last whole record: where, chunks until there, `whole`
 
     def go_on(self) -> int | None:
-        """See `MessageFile`."""
+        """Make ready for a walk over what was written behind the last whole record since.
+
+        Returns:
+            How many chunks the walks before are sure of; None where the file became shorter.
+        """
         size = self.path.stat().st_size
         if size < self.size:
             return None
@@ -111,8 +136,16 @@ class McapFile(MessageFile):
         return n_chunks
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
-        """Every whole message of the wanted channels, in file order; a second walk begins where the
-        first was sure.
+        """Every whole message of the wanted channels, in file order.
+
+        A second walk begins where the first was sure.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: told how many MB were walked over.
+
+        Yields:
+            The messages.
         """
         self._learn_ending()
         with ThreadPoolExecutor(_THREADS) as unpackers:

@@ -1,5 +1,7 @@
-"""Depth pictures and calibrations as the bytes of a message: Foxglove's in protobuf, or ROS 2's in
-CDR.
+"""Serialisation of depth pictures and calibrations: Foxglove schemas in protobuf, ROS 2 in CDR.
+
+CDR is written by hand, little endian and aligned to the size of each number, because only three
+messages are needed (sensor_msgs/msg/Image, CompressedImage, CameraInfo).
 """
 
 from __future__ import annotations
@@ -19,7 +21,13 @@ _SECOND = 10**9
 
 
 class Schema(NamedTuple):
-    """A message's definition, as an MCAP file holds it."""
+    """Definition of a message, as an MCAP file holds it.
+
+    Attributes:
+        name: full name of the message's type.
+        encoding: of the definition, "protobuf" or "ros2msg".
+        data: the definition.
+    """
 
     name: str
     encoding: str
@@ -27,8 +35,14 @@ class Schema(NamedTuple):
 
 
 class Messages(ABC):
-    """A kind of messages. profile and encoding: MCAP's names for it; raw, packed, lens: the
-    definitions.
+    """Interface of a family of message types for depth.
+
+    Attributes:
+        profile: MCAP's name of the profile; empty for none.
+        encoding: MCAP's name of the messages' encoding.
+        raw: schema of an unpacked picture.
+        packed: schema of a packed picture.
+        lens: schema of a calibration.
     """
 
     profile: str
@@ -39,15 +53,41 @@ class Messages(ABC):
 
     @abstractmethod
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
-        """Pixels of a picture of (width, height), row by row without padding."""
+        """Message of an unpacked picture.
+
+        Args:
+            time_ns: its stamp, ns.
+            size: (width, height), px.
+            encoding: of its pixels, "16UC1" or "32FC1".
+            data: the pixels, little endian, row by row without padding.
+
+        Returns:
+            The bytes of the message.
+        """
 
     @abstractmethod
     def packed_picture(self, time_ns: int, png: bytes) -> bytes:
-        """A 16-bit PNG."""
+        """Message of a PNG picture.
+
+        Args:
+            time_ns: its stamp, ns.
+            png: a 16-bit PNG file.
+
+        Returns:
+            The bytes of the message.
+        """
 
     @abstractmethod
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
-        """The camera of the pictures."""
+        """Message of the camera of the pictures.
+
+        Args:
+            time_ns: its stamp, ns.
+            camera: the camera; its distortion is stated in ROS's terms.
+
+        Returns:
+            The bytes of the message.
+        """
 
 
 def _matrices(camera: Camera) -> tuple[list[float], list[float], list[float]]:
@@ -69,7 +109,7 @@ def _distortion(camera: Camera) -> tuple[str, list[float]]:
 
 
 class FoxgloveMessages(Messages):
-    """foxglove.RawImage, CompressedImage and CameraCalibration."""
+    """foxglove.RawImage, CompressedImage and CameraCalibration, in protobuf."""
 
     profile = ""
     encoding = "protobuf"
@@ -87,7 +127,17 @@ class FoxgloveMessages(Messages):
         )
 
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
-        """Pixels of a picture of (width, height), row by row without padding."""
+        """foxglove.RawImage of an unpacked picture.
+
+        Args:
+            time_ns: its stamp, ns.
+            size: (width, height), px.
+            encoding: of its pixels, "16UC1" or "32FC1".
+            data: the pixels, little endian, row by row without padding.
+
+        Returns:
+            The bytes of the message.
+        """
         width, height = size
         return _stamped(
             self._raw(
@@ -97,11 +147,27 @@ class FoxgloveMessages(Messages):
         )
 
     def packed_picture(self, time_ns: int, png: bytes) -> bytes:
-        """A 16-bit PNG."""
+        """foxglove.CompressedImage of a PNG picture.
+
+        Args:
+            time_ns: its stamp, ns.
+            png: a 16-bit PNG file.
+
+        Returns:
+            The bytes of the message.
+        """
         return _stamped(self._packed(format="png", data=png), time_ns)
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
-        """The camera of the pictures."""
+        """foxglove.CameraCalibration of the camera of the pictures.
+
+        Args:
+            time_ns: its stamp, ns.
+            camera: the camera; its distortion is stated in ROS's terms.
+
+        Returns:
+            The bytes of the message.
+        """
         k, r, p = _matrices(camera)
         model, d = _distortion(camera)
         lens = self._lens(
@@ -174,7 +240,7 @@ def _ros_schema(name: str, *parts: str) -> Schema:
 
 
 class RosMessages(Messages):
-    """sensor_msgs/msg/Image, CompressedImage and CameraInfo."""
+    """sensor_msgs/msg/Image, CompressedImage and CameraInfo of ROS 2, in CDR."""
 
     profile = "ros2"
     encoding = "cdr"
@@ -185,7 +251,20 @@ class RosMessages(Messages):
     )
 
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
-        """Pixels of a picture of (width, height), row by row without padding."""
+        """sensor_msgs/msg/Image of an unpacked picture.
+
+        Args:
+            time_ns: its stamp, ns; its seconds fit into 32 bits.
+            size: (width, height), px.
+            encoding: of its pixels, "16UC1" or "32FC1".
+            data: the pixels, little endian, row by row without padding.
+
+        Returns:
+            The bytes of the message.
+
+        Raises:
+            RecordingError: the time is beyond 2038.
+        """
         width, height = size
         out = _Cdr(time_ns)
         out.whole(height, width)
@@ -195,14 +274,36 @@ class RosMessages(Messages):
         return bytes(out.content) + data
 
     def packed_picture(self, time_ns: int, png: bytes) -> bytes:
-        """A 16-bit PNG."""
+        """sensor_msgs/msg/CompressedImage of a PNG picture.
+
+        Args:
+            time_ns: its stamp, ns; its seconds fit into 32 bits.
+            png: a 16-bit PNG file.
+
+        Returns:
+            The bytes of the message.
+
+        Raises:
+            RecordingError: the time is beyond 2038.
+        """
         out = _Cdr(time_ns)
         out.text("16UC1; png compressed ")
         out.whole(len(png))
         return bytes(out.content) + png
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
-        """The camera of the pictures."""
+        """sensor_msgs/msg/CameraInfo of the camera of the pictures.
+
+        Args:
+            time_ns: its stamp, ns; its seconds fit into 32 bits.
+            camera: the camera; its distortion is stated in ROS's terms.
+
+        Returns:
+            The bytes of the message.
+
+        Raises:
+            RecordingError: the time is beyond 2038.
+        """
         out = _Cdr(time_ns)
         out.whole(camera.height, camera.width)
         model, d = _distortion(camera)
@@ -217,10 +318,9 @@ class RosMessages(Messages):
 
 
 class _Cdr:
-    """ROS 2's layout: little endian, numbers at multiples of their size, which count from behind
-    the first four bytes.
+    """CDR, ROS 2's layout: little endian, each number at a multiple of its size.
 
-    It begins with a header.
+    Positions count from behind the first four bytes. It begins with a std_msgs/Header.
     """
 
     def __init__(self, time_ns: int) -> None:

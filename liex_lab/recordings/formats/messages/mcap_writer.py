@@ -1,4 +1,7 @@
-"""Depth written as MCAP: in zstd chunks, stamped in nanoseconds, with the calibration beside it."""
+"""Writer of depth as MCAP: zstd chunks, stamps in ns, the calibration beside the pictures.
+
+Every picture closes its chunk (128 KiB), so that one frame is unpacked to read one frame.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,10 @@ _CHUNK_BYTES = (
 
 
 class McapDepthWriter(RecordingWriter):
-    """Whole millimetres are 16UC1; from the first frame on that is something else, depth is 32FC1
-    in metres.
+    """Writer of one depth topic and its calibration topic.
 
-    `mcap`'s own writer: Foxglove's goes on without a word when the disk is full.
+    Whole millimetres are 16UC1; from the first frame on that is something else, depth is 32FC1 in
+    metres. It uses `mcap`'s own writer: Foxglove's goes on without a word when the disk is full.
     """
 
     def __init__(
@@ -43,8 +46,14 @@ class McapDepthWriter(RecordingWriter):
         packing: Literal["raw", "png"] = "raw",
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        """messages: Foxglove's in protobuf, or ROS 2's; packing: of a picture within its chunk;
-        metadata: kept too.
+        """Open the file and register schemas and channels.
+
+        Args:
+            path: the .mcap file.
+            camera: the camera of the frames.
+            messages: "foxglove" for Foxglove's schemas in protobuf, "ros" for ROS 2's.
+            packing: "raw" or "png", of a picture within its chunk.
+            metadata: facts of the recording, kept as text in a metadata record.
         """
         super().__init__(path, camera)
         self._packing = packing
@@ -67,8 +76,16 @@ class McapDepthWriter(RecordingWriter):
         return self._writer.register_channel(topic, self._messages.encoding, number)
 
     def add(self, frame: DepthFrame) -> None:
-        """Write a picture, and about once a second the calibration, so that a viewer may start
-        anywhere.
+        """Write a picture, and about once a second the calibration.
+
+        The calibration is repeated so that a viewer may start anywhere.
+
+        Args:
+            frame: the frame, depth (H, W) float32 mm.
+
+        Raises:
+            RecordingError: (png) its depth is not in whole mm of 16 bits, or (ros) its time is
+                beyond 2038.
         """
         time_ns = frame.time_ns
         if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
@@ -99,7 +116,7 @@ class McapDepthWriter(RecordingWriter):
         return self._messages.raw_picture(frame.time_ns, size, encoding, data)
 
     def finish(self) -> None:
-        """Write the index."""
+        """Write the index, and note in what unit depth was kept."""
         self._writer.finish()
         if self._float:
             self.notes.append("depth is not in whole millimetres and was written as 32-bit metres")

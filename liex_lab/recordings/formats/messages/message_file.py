@@ -1,7 +1,7 @@
-"""Files of messages on named topics: what MCAP files and ROS bags have in common.
+"""Files of messages on named topics, with packed chunks: what MCAP files and ROS bags share.
 
 A file is walked once from its beginning to its end, which needs no index and so reads cut files
-too; afterwards every message is fetched from its place.
+too; afterwards every message is fetched from its position.
 """
 
 from __future__ import annotations
@@ -23,8 +23,12 @@ _LARGEST_CHUNK = 1 << 27
 
 
 class Place(NamedTuple):
-    """Where a message's data lies: in the file, or (chunk >= 0) in the unpacked bytes of a
-    chunk.
+    """Where a message's data lies.
+
+    Attributes:
+        chunk: number of the chunk in whose unpacked bytes it lies; -1 for the file itself.
+        offset: where it begins there, bytes.
+        length: its length, bytes.
     """
 
     chunk: int
@@ -33,8 +37,12 @@ class Place(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """What is on a topic. schema: the message's type, as in sensor_msgs/Image; encoding: protobuf,
-    json, ros1, cdr.
+    """What is on a topic.
+
+    Attributes:
+        topic: name of the topic.
+        schema: type of its messages, as in sensor_msgs/Image.
+        encoding: protobuf, json, ros1 or cdr.
     """
 
     topic: str
@@ -43,7 +51,14 @@ class Channel(NamedTuple):
 
 
 class Envelope(NamedTuple):
-    """A message as it is met on the walk."""
+    """A message as it is met on the walk.
+
+    Attributes:
+        channel: topic, schema and encoding.
+        log_time_ns: time of logging, ns.
+        place: where its data lies, to fetch it again.
+        data: its bytes.
+    """
 
     channel: Channel
     log_time_ns: int
@@ -52,10 +67,15 @@ class Envelope(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Messages packed together. offset, length: of the packed bytes in the file; size: unpacked;
-    crc: 0 for none.
+    """Messages packed together.
 
-    cut: the file ends before the chunk does.
+    Attributes:
+        offset: where the packed bytes begin in the file.
+        length: how many packed bytes there are.
+        packing: their compression: none, zstd, lz4 or bz2.
+        size: unpacked size, bytes.
+        crc: CRC-32 of the unpacked bytes; 0 for none.
+        cut: True where the file ends before the chunk does.
     """
 
     offset: int
@@ -67,17 +87,30 @@ class Chunk(NamedTuple):
 
 
 class DamagedChunk(Exception):
-    """A chunk that does not unpack to what was packed."""
+    """A chunk does not unpack to what was packed."""
 
 
 class MessageFile(ABC):
     """An open file of messages.
 
-    whole: the file ends as it should and nothing in it was found damaged; channels: all that were
-    met; notes: facts that the file states about itself.
+    Attributes:
+        path: where the file is.
+        file: the open file.
+        size: its size, bytes.
+        whole: True while it ends as it should and nothing in it was found damaged.
+        channels: all channels that were met.
+        notes: facts that the file states about itself.
+        chunks: all chunks that were met, in file order.
+        starts: where the records of chunks begin, as the file's own index says, in order.
     """
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Take an open file; nothing is read yet.
+
+        Args:
+            path: where the file is.
+            file: the open file.
+        """
         self.path = path
         self.file = file
         self.size = path.stat().st_size
@@ -92,24 +125,49 @@ class MessageFile(ABC):
 
     @abstractmethod
     def walk(self, wanted: Callable[[Channel], bool], progress: Progress) -> Iterator[Envelope]:
-        """Every whole message of the wanted channels, in file order."""
+        """Every whole message of the wanted channels, in file order.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: told how far the walk is.
+
+        Yields:
+            The messages.
+        """
 
     def go_on(self) -> int | None:
-        """Make ready for a walk over what was written behind the last whole record since; returns
-        how many chunks the walks before are sure of, None where the file has to be opened anew.
+        """Make ready for a walk over what was written behind the last whole record since.
+
+        Returns:
+            How many chunks the walks before are sure of; None where the file has to be opened anew.
         """
         return None
 
     def resume(self, at: int) -> int:
-        """Where to go on behind a record at `at` that is damaged: at the next chunk that is known,
-        or the end.
+        """Where to go on behind a damaged record: at the next chunk that is known, or the end.
+
+        Args:
+            at: position of the record, bytes.
+
+        Returns:
+            Position to read on from, bytes; `whole` is False afterwards.
         """
         self.whole = False
         n = bisect_right(self.starts, at)
         return self.starts[n] if n < len(self.starts) else self.size
 
     def read(self, place: Place) -> memoryview:
-        """The data of one message."""
+        """The data of one message.
+
+        Args:
+            place: where it lies.
+
+        Returns:
+            Its bytes.
+
+        Raises:
+            RecordingError: its chunk cannot be unpacked any more.
+        """
         if place.chunk >= 0:
             try:
                 return self.unpack(place.chunk)[place.offset : place.offset + place.length]
@@ -121,7 +179,17 @@ class MessageFile(ABC):
         return memoryview(self.file.read(place.length))
 
     def unpack(self, number: int) -> memoryview:
-        """The unpacked bytes of a chunk; the last one is kept, for neighbouring frames share it."""
+        """The unpacked bytes of a chunk; the last one is kept, for neighbouring frames share it.
+
+        Args:
+            number: index into `chunks`.
+
+        Returns:
+            The bytes.
+
+        Raises:
+            DamagedChunk: it states a size that cannot be, or does not unpack to what was packed.
+        """
         if self._last_chunk[0] != number:
             chunk = self.chunks[number]
             if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
@@ -138,8 +206,19 @@ class MessageFile(ABC):
 
 
 def unpacked(packed: bytes, chunk: Chunk) -> bytes:
-    """A chunk's bytes. Of one that is cut, as many as there are: what lies before the cut is as it
-    was written.
+    """The bytes of a chunk, checked against its size and CRC-32.
+
+    Of one that is cut, as many as there are: what lies before the cut is as it was written.
+
+    Args:
+        packed: its packed bytes.
+        chunk: what the file says of it.
+
+    Returns:
+        The unpacked bytes.
+
+    Raises:
+        DamagedChunk: it does not unpack to what was packed, or its compression is not known.
     """
     try:
         data = _inflate(packed, chunk.packing, chunk.size)
@@ -178,7 +257,15 @@ def _inflate(packed: bytes, packing: str, size: int) -> bytes:
 
 
 def printable(text: str, length: int = 80) -> str:
-    """A name out of a file, fit for a sentence: a damaged one may hold anything."""
+    """A name out of a file, fit for a sentence: a damaged one may hold anything.
+
+    Args:
+        text: the name.
+        length: how many characters are kept.
+
+    Returns:
+        The name with ? for what cannot be printed, and ... where it was longer.
+    """
     return "".join(c if c.isprintable() else "?" for c in text[:length]) + (
         "..." if len(text) > length else ""
     )

@@ -1,4 +1,8 @@
-"""Messages that hold depth or say something about it, in one form whatever they were packed as."""
+"""Common form of the messages that hold depth or describe it, whatever they were packed as.
+
+Schemas: foxglove.RawImage, CompressedImage, PointCloud and CameraCalibration; sensor_msgs/Image,
+CompressedImage, PointCloud2 and CameraInfo; std_msgs/Float32 for RealSense's depth unit.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +17,28 @@ PICTURE_SCHEMAS = (
 )
 CLOUD_SCHEMAS = ("foxglove.PointCloud", "sensor_msgs/PointCloud2")
 CALIBRATION_SCHEMAS = ("foxglove.CameraCalibration", "sensor_msgs/CameraInfo")
-UNIT_TOPIC = (
-    "/option/Depth Units/value"  # where the RealSense program writes the metres of a stored step
-)
+# where the RealSense program writes the metres of a stored step
+UNIT_TOPIC = "/option/Depth Units/value"
 UNIT_SCHEMA = "std_msgs/Float32"
 
 
 class DamagedMessage(ValueError):
-    """A message that is not what its schema says."""
+    """A message is not what its schema says."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawPicture:
-    """Pixels as they are. encoding: 16UC1, mono16, 32FC1, ...; step: bytes from one row to the
-    next.
+    """An unpacked picture.
+
+    Attributes:
+        stamp_ns: stamp of the sensor, ns.
+        frame_id: name of the camera's frame.
+        width: columns, px.
+        height: rows, px.
+        encoding: of the pixels, 16UC1, mono16, 32FC1, ...
+        step: bytes from one row to the next; 0 for no padding.
+        big_endian: True where the high byte comes first.
+        data: the pixels, row by row.
     """
 
     stamp_ns: int
@@ -41,7 +53,14 @@ class RawPicture:
 
 @dataclass(frozen=True, slots=True)
 class PackedPicture:
-    """A packed picture. packing: png, or as ROS writes it, '16UC1; compressedDepth rvl'."""
+    """A packed picture.
+
+    Attributes:
+        stamp_ns: stamp of the sensor, ns.
+        frame_id: name of the camera's frame.
+        packing: png, or as ROS writes it, '16UC1; compressedDepth rvl'.
+        data: the packed bytes.
+    """
 
     stamp_ns: int
     frame_id: str
@@ -51,11 +70,19 @@ class PackedPicture:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """Points in metres. width, height: of the picture they lie in, row by row; height 1: they lie
-    anyhow.
+    """Points in metres, in rows like a picture or loose.
 
-    columns: where within a point x, y and z lie, and NumPy's name of their type; pose: position (3)
-    m and quaternion x, y, z, w of the cloud's own frame, None where the points are in the camera's.
+    Attributes:
+        stamp_ns: stamp of the sensor, ns.
+        frame_id: name of the points' frame.
+        width: columns of the picture that they lie in, row by row.
+        height: its rows; 1 for loose points.
+        columns: by name (x, y, z), the offset within a point, bytes, and NumPy's name of the type.
+        point_step: bytes from one point to the next.
+        row_step: bytes from one row to the next.
+        data: the points.
+        pose: position (3) m and quaternion x, y, z, w of the cloud's own frame; None where the
+            points are in the camera frame.
     """
 
     stamp_ns: int
@@ -71,8 +98,16 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A camera's lens. k: row-major 3 x 3; d: distortion; p: row-major 3 x 4, of the rectified
-    picture; or empty.
+    """Intrinsics of a camera, as ROS and Foxglove state them.
+
+    Attributes:
+        frame_id: name of the camera's frame.
+        width: columns of its pictures, px.
+        height: rows of its pictures, px.
+        model: ROS's name of the distortion model.
+        d: distortion coefficients.
+        k: (9,) camera matrix 3 x 3, row by row.
+        p: (12,) projection matrix 3 x 4 of the rectified picture, row by row; or empty.
     """
 
     frame_id: str
@@ -86,7 +121,11 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class DepthUnit:
-    """Metres in one stored step of the depth pictures."""
+    """Unit of stored depth, as the RealSense program writes it.
+
+    Attributes:
+        metres: m in one stored step of the depth pictures.
+    """
 
     metres: float
 

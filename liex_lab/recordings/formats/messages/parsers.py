@@ -1,4 +1,7 @@
-"""Which parser turns a channel's messages into ours."""
+"""Choice of the parser of a channel's messages, by schema and encoding.
+
+Foxglove's schemas go to `foxglove` (protobuf, JSON), ROS's to `ros` (ROS 1, CDR).
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,25 @@ from liex_lab.recordings.formats.messages.messages import (
 
 
 def plain_schema(channel: Channel) -> str:
-    """A schema's name without the 'msg' that ROS 2 puts into it."""
+    """Name of a schema without the 'msg' that ROS 2 puts into it.
+
+    Args:
+        channel: topic, schema and encoding.
+
+    Returns:
+        The name, such as "sensor_msgs/Image".
+    """
     return channel.schema.replace("/msg/", "/")
 
 
 def parser_of(channel: Channel) -> Parser | None:
-    """What turns this channel's messages into ours; None for messages that say nothing
-    about depth.
+    """The function that turns a channel's messages into ours.
+
+    Args:
+        channel: topic, schema and encoding.
+
+    Returns:
+        The parser; None for messages that say nothing about depth.
     """
     schema = plain_schema(channel)
     if schema == UNIT_SCHEMA and not channel.topic.endswith(UNIT_TOPIC):

@@ -1,9 +1,8 @@
-"""The few `sensor_msgs` that hold depth, as ROS 1 and ROS 2 (CDR) lay them out, read without
-copying the pixels.
+"""Parsers of the `sensor_msgs` that hold depth, in ROS 1 serialisation and ROS 2 CDR.
 
-Their definitions have been the same for as long as there are recordings, so they are written down
-here; both systems order the fields alike and differ in alignment, in the header and in the zero at
-a string's end.
+The pixels are not copied. The definitions have been the same for as long as there are recordings,
+so they are written down here; both systems order the fields alike and differ in alignment, in the
+header and in the zero at a string's end.
 """
 
 from __future__ import annotations
@@ -82,8 +81,9 @@ class _Fields:
 
 
 class _CdrFields(_Fields):
-    """The same in ROS 2: four bytes that tell the byte order, numbers aligned, strings with a zero,
-    no counter.
+    """The same in ROS 2 (CDR): byte order in the first four bytes, numbers aligned to their size.
+
+    Strings end in a zero, and headers have no counter.
     """
 
     origin = 4
@@ -97,6 +97,7 @@ class _CdrFields(_Fields):
         self.order = "<" if data[1] else ">"
 
     def header(self) -> tuple[int, str]:
+        """The stamp, ns, and the frame's name of a std_msgs/Header without the counter."""
         return self.whole("i") * 10**9 + self.whole(), self.text()  # seconds have a sign here
 
 
@@ -165,7 +166,15 @@ _LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
 
 
 def parser(schema: str, encoding: str) -> Parser | None:
-    """What reads this kind of message; None where there is nothing for it."""
+    """The function that reads messages of a schema.
+
+    Args:
+        schema: its name without "msg", such as "sensor_msgs/Image".
+        encoding: "ros1" or "cdr".
+
+    Returns:
+        The parser, which raises `DamagedMessage`; None where there is none.
+    """
     layout = _LAYOUTS.get(encoding)
     if layout is None or schema not in _PARSERS:
         return None

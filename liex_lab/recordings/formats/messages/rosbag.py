@@ -1,9 +1,8 @@
-"""ROS bags: `.bag` files of ROS 1 (and of the RealSense programs) and `.db3` files of ROS 2, whole
-or cut.
+"""ROS bags, whole or cut: ROS 1 `.bag` (format 2.0, also RealSense's) and ROS 2 `.db3` (SQLite).
 
 A `.bag` is walked from its beginning and needs no index, which is written last and so is missing
 exactly where a recording broke off; `rosbags`, the library that the tests compare with, refuses
-such files.
+such files. A record is a header of named fields and data; a chunk packs records (none, bz2, lz4).
 """
 
 from __future__ import annotations
@@ -51,8 +50,20 @@ def open_bag(
     progress: Progress = silent,
     topic: str | None = None,
 ) -> Recording:
-    """One depth topic of a ROS bag as a recording. `fps` is not needed: every message has
-    its time.
+    """Open one depth topic of a ROS bag as a recording.
+
+    Args:
+        path: the .bag or .db3 file.
+        camera: comes before whatever the files state.
+        fps: not needed, for every message has its time.
+        progress: told how far the walk over the file is.
+        topic: name of the depth topic; None for the only one.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: the file is no such bag, is encrypted, or holds no depth that can be chosen.
     """
     file = path.open("rb")
     magic = file.read(len(_SQLITE))
@@ -75,11 +86,28 @@ class BagFile(MessageFile):
     """An open ROS 1 bag, version 2.0: records, each with a header of named fields and data."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Take an open file; nothing is read yet.
+
+        Args:
+            path: where the file is.
+            file: the open file.
+        """
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
-        """Every whole message of the wanted channels, in file order."""
+        """Every whole message of the wanted channels, in file order.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: told how many MB were walked over.
+
+        Yields:
+            The messages.
+
+        Raises:
+            RecordingError: the bag is encrypted.
+        """
         at = len(_VERSION)
         indexed = False
         while at + _U32.size <= self.size:
@@ -218,6 +246,12 @@ class Db3File(MessageFile):
     """An open ROS 2 bag in SQLite: a table of topics and a table of messages."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Open the data base, read-only.
+
+        Args:
+            path: where the file is.
+            file: the open file.
+        """
         super().__init__(path, file)
         # opened by several threads, of which one reads at a time; immutable: no lock file is made
         # beside it
@@ -225,7 +259,15 @@ class Db3File(MessageFile):
         self._base = sqlite3.connect(uri, uri=True, check_same_thread=False)
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
-        """Every message of the wanted channels, in the order in which they were stored."""
+        """Every message of the wanted channels, in the order in which they were stored.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: told how many messages were walked over.
+
+        Yields:
+            The messages, up to the first that is damaged.
+        """
         try:
             rows = self._base.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
@@ -250,13 +292,20 @@ class Db3File(MessageFile):
         return memoryview(row[0])
 
     def read(self, place: Place) -> memoryview:
-        """The data of one message."""
+        """The data of one message.
+
+        Args:
+            place: its `offset` is the message's id in the table.
+
+        Returns:
+            The bytes; none where it is damaged, for no message is empty.
+        """
         try:
             return self._fetch(place.offset)
         except (sqlite3.Error, TypeError):
             return memoryview(b"")  # no message is empty: a damaged one
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the data base and the file."""
         self._base.close()
         super().close()

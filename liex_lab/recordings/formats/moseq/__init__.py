@@ -1,1 +1,1 @@
-"""MoSeq sessions: raw, video or archive, with their metadata; Azure Kinect's own files."""
+"""MoSeq sessions (raw depth.dat, depth video or archive) with metadata; Azure Kinect files."""

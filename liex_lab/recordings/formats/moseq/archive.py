@@ -1,5 +1,8 @@
-"""A session out of a .tar.gz: streamed once, and every byte that a cut archive still holds
-is kept.
+"""Streaming extraction of a session from .tar or .tar.gz that keeps every byte a cut archive holds.
+
+The archive is decompressed once, in order (DEFLATE has no random access). Where gzip data are
+damaged, smaller and smaller pieces are tried until the last good byte has come out; the tar walk is
+then fed zeros, and each file is written only as far as its bytes are real.
 """
 
 from __future__ import annotations
@@ -29,8 +32,12 @@ _GZIP_MAGIC = b"\x1f\x8b"
 
 @dataclass(frozen=True)
 class Unpacked:
-    """What came out of an archive. files: by plain names; seen: all names; cut: the archive is cut
-    or damaged.
+    """What came out of an archive.
+
+    Attributes:
+        files: where the wanted files were written, by their plain names.
+        seen: plain names of all files in the archive.
+        cut: True where the archive is cut or damaged.
     """
 
     files: dict[str, Path]
@@ -61,7 +68,7 @@ class _Patient:
         self.whole = not self._zipped  # it ended where it should
 
     def read(self, n: int) -> bytes:
-        """Exactly n bytes."""
+        """Exactly n bytes, zeros where the archive has broken off."""
         while len(self._buffer) < n and not self.ended:
             self._fill()
         block = bytes(self._buffer[:n])
@@ -73,8 +80,9 @@ class _Patient:
         return block + bytes(n - len(block))
 
     def finish(self) -> None:
-        """Read to the end: a tar is over before the gzip around it is, and only gzip's end tells
-        that it is whole.
+        """Read to the end.
+
+        A tar is over before the gzip around it is, and only gzip's end tells that it is whole.
         """
         while not self.ended:
             self._buffer.clear()
@@ -132,7 +140,20 @@ class _Patient:
 
 
 def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progress) -> Unpacked:
-    """Write the wanted members of a .tar or .tar.gz into `folder`, by their plain names."""
+    """Write the wanted members of a .tar or .tar.gz into a folder, by their plain names.
+
+    Args:
+        archive: the .tar, .tar.gz or .tgz file.
+        wanted: plain names of the members to write.
+        folder: where they are written.
+        progress: told how many MB were unpacked.
+
+    Returns:
+        The files written, all names met, and whether the archive is cut.
+
+    Raises:
+        RecordingError: nothing can be unpacked, a wanted name occurs twice, or the disk is full.
+    """
     files: dict[str, Path] = {}
     seen: set[str] = set()
     cut = False
@@ -191,7 +212,11 @@ def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Pati
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder of unpacked files; files that are gone already are none of our concern."""
+    """Remove a folder of unpacked files; files that are gone already do not matter.
+
+    Args:
+        folder: the folder; it has no folders in it, and need not exist.
+    """
     for name in os.listdir(folder) if folder.is_dir() else []:
         (folder / name).unlink(missing_ok=True)
     if folder.is_dir():

@@ -1,8 +1,11 @@
-"""The depth camera of an Azure Kinect (and the Orbbec Femto, its successor): from its factory
-calibration, or typical.
+"""Pinhole camera of an Azure Kinect depth mode, from its factory calibration or typical.
 
-The factory states normalised numbers of the whole sensor; a depth mode shows a part of it, perhaps
-binned two by two.
+The Orbbec Femto, its successor, has the same modes. The factory states normalised intrinsics of the
+whole sensor; a depth mode is a crop of it, perhaps binned two by two:
+
+    fx_px = fx side,    cx_px = cx side - left - 1/2.
+
+Distortion is Brown-Conrady with eight coefficients (ROS: rational_polynomial).
 """
 
 from __future__ import annotations
@@ -16,8 +19,15 @@ from liex_lab.optics.camera import Camera, Distortion
 
 
 class Mode(NamedTuple):
-    """A depth mode: size of its pictures, pixels; side of the sensor once binned; the picture's
-    corner on it.
+    """A depth mode.
+
+    Attributes:
+        name: its name in the Azure Kinect sensor SDK.
+        width: columns of its pictures, px.
+        height: rows of its pictures, px.
+        side: side of the sensor once binned, px.
+        left: column of the picture's corner on it, px.
+        top: row of the picture's corner on it, px.
     """
 
     name: str
@@ -44,8 +54,11 @@ _DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth
 
 
 class FactoryLens(NamedTuple):
-    """What a calibration says. shares: cx, cy, fx, fy of the sensor; distortion: k1 k2 p1 p2 k3 k4
-    k5 k6.
+    """What a factory calibration says of the depth camera.
+
+    Attributes:
+        shares: cx, cy, fx, fy as shares of the sensor's side.
+        distortion: k1 k2 p1 p2 k3 k4 k5 k6.
     """
 
     shares: tuple[float, float, float, float]
@@ -53,13 +66,26 @@ class FactoryLens(NamedTuple):
 
 
 def mode_of(width: int, height: int) -> Mode | None:
-    """The depth mode with pictures of this size."""
+    """The depth mode with pictures of a given size.
+
+    Args:
+        width: columns, px.
+        height: rows, px.
+
+    Returns:
+        The mode; None where there is none.
+    """
     return next((mode for mode in MODES if (mode.width, mode.height) == (width, height)), None)
 
 
 def read_calibration(data: bytes) -> FactoryLens | None:
-    """The depth camera in the JSON that recorders attach to their files; None where it does not
-    tell one.
+    """The depth camera in the calibration (JSON) that recorders attach to their files.
+
+    Args:
+        data: the JSON, perhaps with zeros at its end.
+
+    Returns:
+        The lens; None where the data do not state one.
     """
     try:
         cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
@@ -78,8 +104,17 @@ def read_calibration(data: bytes) -> FactoryLens | None:
 
 
 def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
-    """The camera of a depth mode; pixel (0, 0) is the centre of the top-left pixel, hence
-    the half.
+    """The camera of a depth mode, in pixels of its pictures.
+
+    Pixel (0, 0) is the centre of the top-left pixel, hence the half that is taken off.
+
+    Args:
+        mode: the depth mode.
+        lens: the factory's calibration; None for typical numbers, which differ by about 1 % from
+            unit to unit.
+
+    Returns:
+        The camera, with distortion where lens is given.
     """
     cx, cy, fx, fy = _TYPICAL if lens is None else lens.shares
     facts: dict[str, Any] = {

@@ -1,4 +1,8 @@
-"""What lies beside the depth in a MoSeq session: metadata.json and the time stamps."""
+"""Metadata of a MoSeq session: metadata.json, depth_ts.txt (ms) and timestamps.csv (s).
+
+SubjectName, SessionName, StartTime, DepthResolution and IsLittleEndian are read; the camera is told
+from any of several keys, for programs that record for MoSeq have no common one.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +47,13 @@ _PLAUSIBLE_HZ = (0.5, 2000.0)
 class Metadata:
     """What metadata.json says.
 
-    size: (width, height), None when unstated; dtype: of the stored depths; camera: `AZURE`,
-    `KINECT`, `OTHER` or None when it does not say, and camera_name: its words; facts: for
-    `Recording.metadata`; problems: sentences.
+    Attributes:
+        size: (width, height), px; None when unstated.
+        dtype: of the stored depths, "<u2" or ">u2".
+        camera: `AZURE`, `KINECT`, `OTHER`, or None when it does not say.
+        camera_name: the camera in the file's own words; empty when unstated.
+        facts: for `Recording.metadata`.
+        problems: sentences about what was not used.
     """
 
     size: tuple[int, int] | None
@@ -60,8 +68,17 @@ _NOTHING = Metadata(None, "<u2", None, "", {}, [])
 
 
 def read_metadata(path: Path | None, cut: bool) -> Metadata:
-    """What metadata.json tells; it is often missing, and then there is nothing to say. cut: its
-    archive is.
+    """Parse metadata.json, which is often missing.
+
+    Args:
+        path: the file; None where there is none, and then nothing is stated.
+        cut: True where its archive is cut; a broken file is then left out instead of refused.
+
+    Returns:
+        What it says.
+
+    Raises:
+        RecordingError: the file is no JSON object, or its DepthResolution cannot be.
     """
     if path is None:
         return _NOTHING
@@ -129,10 +146,22 @@ def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
 
 
 def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple[str, Times] | None:
-    """The file of time stamps and what it holds; None where there is none.
+    """Read the file of time stamps beside the depth.
 
     depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a
-    column in another unit.
+    column in another unit. Of a cut archive, half a number at the end is dropped, from the file
+    too.
+
+    Args:
+        files: the session's files by name.
+        cut: True where their archive is cut.
+        problems: sentences, appended to where the stamps are missing or give an unlikely rate.
+
+    Returns:
+        Name of the file and its (n,) int64 stamps, ns; None where there are none.
+
+    Raises:
+        RecordingError: a line has no number where a stamp was expected.
     """
     name = next((name for name in STAMPS if name in files), None)
     if name is None:

@@ -1,5 +1,8 @@
-"""MoSeq sessions: depth.dat, depth.avi or depth.mkv with stamps and metadata, in a folder or in a
-.tar.gz.
+"""Reader of MoSeq sessions: depth.dat, depth.avi or depth.mkv with stamps and metadata.
+
+A session is a folder or a .tar.gz. depth.dat is raw uint16, frame after frame, without a header.
+The camera is stated, or from the factory's calibration in the video, or typical of a Kinect v2 or
+an Azure Kinect; stamps lie beside the depth, or are the video's own, or follow a constant rate.
 """
 
 from __future__ import annotations
@@ -57,6 +60,15 @@ class RawFrames:
 
     Not a memory map: mapped pages count as the process's memory, and a long session would look like
     a leak.
+
+    Attributes:
+        path: the file.
+        width: columns of a frame, px.
+        height: rows of a frame, px.
+        dtype: of the stored values, "<u2" or ">u2".
+        n: how many whole frames there are.
+        truncated: True where the file ends in the middle of a frame, or its archive is cut.
+        problems: sentences about the file.
     """
 
     path: Path
@@ -76,11 +88,21 @@ class RawFrames:
 
     @property
     def whole(self) -> list[bool]:
-        """Only whole frames are counted."""
+        """True for each frame, (n,), for only whole frames are counted."""
         return [True] * self.n
 
     def read(self, index: int) -> NDArray[Any]:
-        """Stored values (H, W) of one frame."""
+        """Stored values of one frame.
+
+        Args:
+            index: number of the frame.
+
+        Returns:
+            (H, W) 16-bit integers.
+
+        Raises:
+            RecordingError: the file became shorter.
+        """
         n_bytes = 2 * self.width * self.height
         with self._lock:
             self._file.seek(index * n_bytes)
@@ -92,7 +114,14 @@ class RawFrames:
         return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
 
     def label(self, index: int) -> str:
-        """The frame, for a sentence."""
+        """Name of a frame, for a sentence.
+
+        Args:
+            index: number of the frame.
+
+        Returns:
+            The frame and the file.
+        """
         return f"frame {index} of {self.path.name}"
 
     def close(self) -> None:
@@ -103,8 +132,21 @@ class RawFrames:
 def open_moseq(
     path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
 ) -> Recording:
-    """A MoSeq session: its folder, its depth.dat, a depth video, or the archive around all
-    of it.
+    """Open a MoSeq session: its folder, depth.dat, a depth video, or the archive around them.
+
+    An archive is unpacked into a temporary folder, which is removed when the recording is closed.
+
+    Args:
+        path: the folder or file.
+        camera: comes before whatever the files state.
+        fps: frame rate, Hz; used only where there are no time stamps.
+        progress: told how far unpacking and indexing are.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: there is no whole frame, or the camera is not known.
     """
     names = (*STAMPS, METADATA, CAMERA_FILE)
     if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
@@ -180,7 +222,16 @@ class _Session:
         self.stamps = read_stamps(found.files, found.cut, self.problems)
 
     def open(self, name: str, sources: list[Path], folder: Path | None = None) -> Recording:
-        """The recording. folder: of unpacked files, removed on closing."""
+        """The recording.
+
+        Args:
+            name: its name.
+            sources: the input's files.
+            folder: of unpacked files, removed on closing; None where nothing was unpacked.
+
+        Returns:
+            The recording.
+        """
         stack, track = self._open_depth()
 
         def close() -> None:

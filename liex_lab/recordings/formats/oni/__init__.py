@@ -1,1 +1,1 @@
-"""PrimeSense's `.oni`, read and written."""
+"""PrimeSense and OpenNI `.oni` recordings, read and written: records, index, 16z depth codec."""

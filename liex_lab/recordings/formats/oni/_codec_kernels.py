@@ -1,4 +1,4 @@
-"""The 16z code of PrimeSense recordings: steps between neighbouring pixels, in half bytes.
+"""The 16z depth codec of PrimeSense recordings: delta and run-length coding in half bytes (numba).
 
 A stream begins with a whole number (u16) and goes on with bytes. 0xE1 to 0xEE: 2 to 28 pixels like
 the last one (0xEF: 30); 0xFF: a wide step follows; any other byte is two steps down, each counted
@@ -23,8 +23,15 @@ _LONGEST_RUN = 15  # pairs
 
 @njit(cache=True, nogil=True)
 def _unpack(stream, table, out):
-    """Fill out (n,) with table[number] for each number of the stream; False where they do not fit
-    one another.
+    """Decode a stream into table[number] for each of its numbers.
+
+    Args:
+        stream: (m,) uint8.
+        table: (k,) float32 mm, the depth of each number.
+        out: (n,) float32 mm, written.
+
+    Returns:
+        False where the stream and the number of pixels or the table do not fit one another.
     """
     n_bytes = len(stream)
     n_pixels = len(out)
@@ -80,8 +87,14 @@ def _unpack(stream, table, out):
 
 @njit(cache=True, nogil=True)
 def _pack(numbers, out):
-    """Encode numbers (n,) into out (3 n + 2,); how many bytes were used, 0 where a number is too
-    large for the code.
+    """Encode numbers; the inverse of `_unpack`.
+
+    Args:
+        numbers: (n,) uint16, depths or indices into a table.
+        out: (3 n + 2,) uint8, written.
+
+    Returns:
+        How many bytes were used; 0 where a number is too large for the code.
     """
     value = np.int64(numbers[0])
     out[0] = value & 0xFF
@@ -126,8 +139,7 @@ def _pack(numbers, out):
         else:
             return 0
     # the run was there before the half that waits for its other half: OpenNI2 has them the wrong
-    # way round, and so
-    # loses the last pixels of a frame
+    # way round, and so loses the last pixels of a frame
     if run:
         out[at] = _RUN + run
         at += 1
@@ -139,10 +151,16 @@ def _pack(numbers, out):
 
 @njit(cache=True, nogil=True)
 def _tabulate(pixels, rank, table, numbers):
-    """The depths that occur, sorted, into table; each pixel's place among them into numbers (n,);
-    how many there are.
+    """The depths that occur, sorted, and each pixel's index among them.
 
-    rank (65536,): zeros, and zeros again afterwards.
+    Args:
+        pixels: (n,) uint16 stored depths.
+        rank: (65536,) uint16 zeros, and zeros again afterwards.
+        table: (65536,) uint16, written: the depths that occur, ascending.
+        numbers: (n,) uint16, written: index of each pixel's depth in the table.
+
+    Returns:
+        How many depths occur.
     """
     for pixel in pixels:
         rank[pixel] = 1
@@ -162,11 +180,16 @@ def _tabulate(pixels, rank, table, numbers):
 def unpack_16z(
     payload: NDArray[np.uint8], meaning: NDArray[np.float32], n_pixels: int, embedded_table: bool
 ) -> NDArray[np.float32] | None:
-    """A packed frame as depth (n_pixels,); None where it is damaged or has another number of
-    pixels.
+    """Decode a packed frame as depth.
 
-    meaning (65536,): the depth, mm, that each stored value stands for; embedded_table: `16zT` and
-    not `16zP`.
+    Args:
+        payload: (m,) uint8 bytes of the frame, a table before them for `16zT`.
+        meaning: (65536,) float32 mm, the depth that each stored value stands for.
+        n_pixels: how many pixels the frame has.
+        embedded_table: True for `16zT`, False for `16zP`.
+
+    Returns:
+        (n_pixels,) float32 mm; None where it is damaged or has another number of pixels.
     """
     table = meaning
     if embedded_table:
@@ -181,8 +204,14 @@ def unpack_16z(
 
 
 def pack_16z(pixels: NDArray[np.uint16], embedded_table: bool) -> bytes | None:
-    """Pixels (n,) as `16zT` (with embedded_table) or `16zP`; None where depths are too many or too
-    large for it.
+    """Encode pixels as one frame.
+
+    Args:
+        pixels: (n,) uint16 stored depths.
+        embedded_table: True for `16zT`, False for `16zP`.
+
+    Returns:
+        The bytes; None where depths are too many or too large for the code.
     """
     if not embedded_table:
         stream = np.empty(WORST_BYTES_A_PIXEL * pixels.size + 2, np.uint8)

@@ -1,5 +1,7 @@
-"""What is in an .oni file: its depth nodes, how each looked at the scene, and where its
-frames lie.
+"""Index of an .oni file: its depth nodes, the stated picture format, and where each frame lies.
+
+A file of up to 1 GiB is indexed by walking over its records, which shows what is whole; a larger
+one by its seek tables, where they can be believed, because a walk takes minutes on a slow disk.
 """
 
 from __future__ import annotations
@@ -45,17 +47,22 @@ _MANY = 100
 _MILLIMETRES = 100  # the pixel format that holds where none is stated
 
 # A file of an hour has several GB, and looking at each of its records takes minutes on a slow disk:
-# there the seek
-# table is believed where it can be. Everywhere else the records themselves say what is whole.
+# there the seek table is believed where it can be. Everywhere else the records themselves say what
+# is whole.
 SCAN_UP_TO_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
 class Look:
-    """How frames were taken. width, height: of the full picture; part: x, y, width, height of what
-    was recorded of it.
+    """Picture format of frames: full size, recorded part, mirroring and unit.
 
-    pixel_format: OpenNI's number for the unit; fps: as stated, not as it was.
+    Attributes:
+        width: columns of the full picture, px.
+        height: rows of the full picture, px.
+        part: x, y, width, height of what was recorded of it, px.
+        mirrored: True where left and right are exchanged.
+        pixel_format: OpenNI's number for the unit (100: 1 mm, 101: 0.1 mm).
+        fps: frame rate as stated, not as it was, Hz.
     """
 
     width: int
@@ -67,18 +74,25 @@ class Look:
 
     @property
     def picture(self) -> tuple[int, int, int]:
-        """What may not change within a recording: size and unit."""
+        """What may not change within a recording: width, height and unit."""
         return self.width, self.height, self.pixel_format
 
 
 @dataclass
 class DepthNode:
-    """A depth camera of the file. One entry for each of its frames: time, place and size of its
-    payload, its look.
+    """A depth camera of the file, with one entry for each of its frames.
 
-    A size of -1 is not known yet: then the place is that of the record. looks: each with its number
-    in `look_of`, None where a picture size was never stated; n_stated: frames by the node's own
-    count.
+    Attributes:
+        name: name of the node, such as "Depth".
+        codec: four bytes, `NONE`, `16zT` or `16zP`.
+        n_stated: number of frames by the node's own count; None where not stated.
+        seek_table: position of its seek table in the file; 0 for none.
+        properties: the property values that hold now, by name.
+        times_us: (n,) time of each frame, µs.
+        places: (n,) position of each payload, or of the record where the size is -1, bytes.
+        sizes: (n,) size of each payload, bytes; -1 while it is not known.
+        look_of: (n,) number of each frame's picture format in `looks`.
+        looks: the picture formats with their numbers; None is one whose size was never stated.
     """
 
     name: str
@@ -97,13 +111,24 @@ class DepthNode:
         return len(self.places)
 
     def state(self, name: str, value: bytes) -> None:
-        """Take a property, which holds from here on."""
+        """Take a property, which holds from here on.
+
+        Args:
+            name: its name.
+            value: its bytes.
+        """
         self.properties[name] = value
         if name in _OF_LOOK:
             self._look_now = None
 
     def add(self, time_us: int, place: int, size: int) -> None:
-        """Note a frame."""
+        """Note a frame.
+
+        Args:
+            time_us: its time, µs.
+            place: position of its payload, or of its record where size is -1, bytes.
+            size: size of its payload, bytes; -1 where it is not known.
+        """
         if self._look_now is None:
             self._look_now = self.looks.setdefault(self._look(), len(self.looks))
         self.times_us.append(time_us)
@@ -112,12 +137,27 @@ class DepthNode:
         self.look_of.append(self._look_now)
 
     def number(self, name: str) -> int | None:
-        """An integer property; None where it is not stated."""
+        """An integer property.
+
+        Args:
+            name: its name.
+
+        Returns:
+            Its value; None where it is not stated.
+        """
         value = self.properties.get(name)
         return int.from_bytes(value[:8], "little") if value else None
 
     def numbers(self, name: str, layout: str) -> tuple[Any, ...] | None:
-        """A property of several numbers; None where it is not stated or has another size."""
+        """A property of several numbers.
+
+        Args:
+            name: its name.
+            layout: the numbers, as `struct` writes their layout.
+
+        Returns:
+            The numbers; None where it is not stated or has another size.
+        """
         value = self.properties.get(name, b"")
         return struct.unpack(layout, value) if len(value) == struct.calcsize(layout) else None
 
@@ -140,13 +180,25 @@ class DepthNode:
 
 @dataclass
 class OniIndex:
-    """depth: the depth nodes by their number; others: what else is in the file, by name."""
+    """The nodes of a file.
+
+    Attributes:
+        depth: the depth nodes by their number.
+        others: names of what else is in the file (at most 100).
+    """
 
     depth: dict[int, DepthNode] = field(default_factory=dict)
     others: set[str] = field(default_factory=set)
 
     def take(self, record: Record) -> bool:
-        """Note what a record says; False where it makes no sense."""
+        """Note what a record says.
+
+        Args:
+            record: a record of the file, in file order.
+
+        Returns:
+            False where it makes no sense.
+        """
         try:
             if record.kind in NODES:
                 name, kind, codec, n_frames, seek_table = parse_node(record)
@@ -167,7 +219,15 @@ class OniIndex:
 
 
 def index_file(file: OniFile, progress: Progress) -> OniIndex:
-    """The index of a file; `file.whole` says afterwards whether anything was damaged."""
+    """Index a file; its `whole` says afterwards whether anything was damaged.
+
+    Args:
+        file: the open file.
+        progress: told how many MB were walked over.
+
+    Returns:
+        The depth nodes with the positions of their frames.
+    """
     if file.size > SCAN_UP_TO_BYTES:
         index = _by_seek_tables(file, progress)
         if index is not None:

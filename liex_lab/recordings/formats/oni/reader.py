@@ -1,5 +1,8 @@
-"""PrimeSense and OpenNI recordings (.oni): depth as 16-bit numbers, raw or in either of OpenNI's
-two 16z codes.
+"""Reader of PrimeSense and OpenNI recordings (.oni): 16-bit depth, raw or in OpenNI's 16z codecs.
+
+Intrinsics come from the caller, a camera.toml, a property of our own, or the stated field of view:
+f = (n / 2) / tan(fov / 2), with the optical axis at half the size, as OpenNI has it. Mirrored
+pictures are turned back, and a cropped one is put into its full picture.
 """
 
 from __future__ import annotations
@@ -56,8 +59,14 @@ class OniFrames:
     def __init__(
         self, file: OniFile, node: DepthNode, look: Look, how: CameraFile, problems: list[str]
     ) -> None:
-        """look: what frames must agree with to be of this recording; how: a camera.toml
-        beside it.
+        """Tabulate the depth of every stored value.
+
+        Args:
+            file: the open file.
+            node: the depth node with the positions of its frames.
+            look: the picture format that frames must agree with to be of this recording.
+            how: a camera.toml beside the file, for its unit_mm (a further factor) and unread.
+            problems: the recording's sentences, appended to when a damaged frame is met.
         """
         self._file = file
         self._node = node
@@ -71,8 +80,13 @@ class OniFrames:
         self._lock = Lock()
 
     def read(self, number: int) -> Depth:
-        """Depth (H, W) float32 mm of one frame; one that is damaged or of another size is wholly
-        unread.
+        """Depth of one frame; one that is damaged or of another size is wholly unread.
+
+        Args:
+            number: index of the frame in the node.
+
+        Returns:
+            (H, W) float32 mm, 0 where unread.
         """
         depth = self.decode(number)
         if depth is not None:
@@ -86,7 +100,14 @@ class OniFrames:
         return np.zeros((self._look.height, self._look.width), np.float32)
 
     def decode(self, number: int) -> Depth | None:
-        """Depth (H, W) of one frame, None where it is damaged or of another size."""
+        """Depth of one frame, without a replacement for damaged ones.
+
+        Args:
+            number: index of the frame in the node.
+
+        Returns:
+            (H, W) float32 mm, 0 where unread; None where it is damaged or of another size.
+        """
         look = self._looks[self._node.look_of[number]]
         if look is None or look.picture != self._look.picture:
             return None
@@ -128,8 +149,20 @@ class OniFrames:
 def open_oni(
     path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
 ) -> Recording:
-    """The depth of an .oni file as a recording. `fps` is used only where every frame has the same
-    time.
+    """Open the depth of an .oni file as a recording.
+
+    Args:
+        path: the .oni file.
+        camera: comes before whatever the files state.
+        fps: frame rate, Hz; used only where every frame has the same time.
+        progress: told how many MB were indexed.
+
+    Returns:
+        The recording, of the first depth node that holds frames.
+
+    Raises:
+        RecordingError: there are no depth frames, they cannot be decoded, or the camera is not
+            known.
     """
     file = OniFile.open(path)
     try:

@@ -1,5 +1,8 @@
-"""The records of an .oni file: a header and then one after the other, each with its size; sources:
-OpenNI's player.
+"""Record layer of PrimeSense's .oni container (OpenNI 2, versions 1.0.0.4 to 1.0.1.0).
+
+A file header, then one record after the other: magic, kind, node, size of header and fields, size
+of payload, and the position it undoes; little endian. Before 1.0.1.0, positions have 32 bits, then
+64. A damaged file is read on from the next record magic that fits. Source: OpenNI2's own player.
 """
 
 from __future__ import annotations
@@ -60,8 +63,14 @@ _BLOCK = 1 << 20
 
 
 class Record(NamedTuple):
-    """A record whose end is where another begins; `fields` are its first bytes after the header,
-    `size` its own.
+    """One record of the file, whose end is where another begins.
+
+    Attributes:
+        kind: its kind, such as `FRAME` or `NODE`.
+        node: number of the node it belongs to.
+        fields: the bytes between its header and its payload (at most 4096 of them).
+        payload: position of its payload in the file, bytes.
+        payload_size: size of its payload, bytes.
     """
 
     kind: int
@@ -92,8 +101,13 @@ class _Head(NamedTuple):
 
 @dataclass
 class OniFile:
-    """An open .oni file. old: positions in it have 32 bits; whole: it ends as it should and nothing
-    is damaged.
+    """An open .oni file.
+
+    Attributes:
+        file: the file, without a buffer.
+        size: its size, bytes.
+        old: True where positions in it have 32 bits.
+        whole: True where it ends as it should and nothing is damaged; known after a walk.
     """
 
     file: IO[bytes]
@@ -103,7 +117,17 @@ class OniFile:
 
     @staticmethod
     def open(path: Path) -> OniFile:
-        """Open a file that begins like .oni, of a version that is known."""
+        """Open a file that begins like .oni, of a version that is known.
+
+        Args:
+            path: the .oni file.
+
+        Returns:
+            The open file.
+
+        Raises:
+            RecordingError: it begins otherwise, or its version cannot be read.
+        """
         # without a buffer: every read is a seek, and a buffer would fetch 8 kB for each 40 bytes
         file = path.open("rb", buffering=0)
         try:
@@ -125,7 +149,15 @@ class OniFile:
         return OniFile(file, path.stat().st_size, old=version < _FIRST_WIDE)
 
     def read(self, at: int, size: int) -> bytes:
-        """The bytes at a position, fewer where the file ends."""
+        """Bytes at a position, fewer where the file ends.
+
+        Args:
+            at: position in the file, bytes.
+            size: how many bytes.
+
+        Returns:
+            At most `size` bytes.
+        """
         self.file.seek(at)
         return self.file.read(size)
 
@@ -134,6 +166,12 @@ class OniFile:
 
         A record counts only if another one, or the end of the file, begins where it ends. The last
         one of a cut file is left out.
+
+        Args:
+            progress: told how many MB were walked over.
+
+        Yields:
+            The records, first to last.
         """
         head = self._search(FILE_HEADER.size)
         ended = False
@@ -161,13 +199,20 @@ class OniFile:
         self.whole = self.whole and ended
 
     def record_at(self, at: int) -> Record | None:
-        """The record that begins at a position, if one does and it lies within the file."""
+        """The record that begins at a position.
+
+        Args:
+            at: position in the file, bytes.
+
+        Returns:
+            The record; None where none begins there, or it reaches past the end of the file.
+        """
         head = self._head(at) if FILE_HEADER.size <= at < self.size else None
         return head.record if head is not None and head.end <= self.size else None
 
     @property
     def end_at(self) -> int:
-        """Where the closing record of a whole file begins."""
+        """Position at which the closing record of a whole file begins, bytes."""
         return self.size - self._header.size
 
     @property
@@ -214,8 +259,14 @@ class OniFile:
 
 
 def parse_node(record: Record) -> tuple[str, int, bytes, int | None, int]:
-    """Name, kind, codec, number of frames (None where not stated), position of the seek table (0:
-    none) of a node.
+    """Description of a node out of its record.
+
+    Args:
+        record: a record of one of the kinds `NODES`.
+
+    Returns:
+        Its name, its kind (2: depth), its codec, its number of frames (None where not stated), and
+        the position of its seek table (0: none).
     """
     name, rest = take_text(record.fields)
     kind, codec = _NODE_FIELDS.unpack_from(rest)
@@ -229,18 +280,39 @@ def parse_node(record: Record) -> tuple[str, int, bytes, int | None, int]:
 
 
 def parse_property(record: Record) -> tuple[str, bytes]:
-    """Name and value of a property."""
+    """Name and value of a property.
+
+    Args:
+        record: a record of one of the kinds `PROPERTIES`.
+
+    Returns:
+        The name and the bytes of the value.
+    """
     name, rest = take_text(record.fields)
     (size,) = struct.unpack_from("<I", rest)
     return name, rest[4 : 4 + size]
 
 
 def text(name: str) -> bytes:
-    """A string as the file holds it: its length with the closing zero, and then its bytes."""
+    """A string as the file holds it: its length with the closing zero, and then its bytes.
+
+    Args:
+        name: the string, ASCII.
+
+    Returns:
+        The bytes.
+    """
     return struct.pack("<I", len(name) + 1) + name.encode("ascii") + b"\0"
 
 
 def take_text(fields: bytes) -> tuple[str, bytes]:
-    """A string and what follows it."""
+    """A string at the beginning of some fields, and what follows it.
+
+    Args:
+        fields: bytes that begin with a string as `text` writes it.
+
+    Returns:
+        The string and the remaining bytes.
+    """
     (size,) = struct.unpack_from("<I", fields)
     return fields[4 : 4 + size].split(b"\0")[0].decode("latin-1"), fields[4 + size :]

@@ -1,4 +1,8 @@
-"""Writing .oni files: what OpenNI's own recorder writes, so that its player opens them."""
+"""Writer of .oni files (version 1.0.1.0), as OpenNI's own recorder writes them.
+
+OpenNI2's player opens them: one depth node with the properties that it wants, frames with times in
+µs, a seek table (left out beyond 288,000 frames, which the player could not open) and an end.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +36,8 @@ _PIXEL_FORMATS = {1.0: 100, 0.1: 101}  # mm in a stored step: OpenNI's number fo
 _UNKNOWN_COUNT = 0xFFFFFFFF
 _UNKNOWN_TIME = 2**64 - 1
 _NOMINAL_FPS = 30.0
-_MOST_IN_SEEK_TABLE = (
-    288_000  # OpenNI2 cannot open a file with a longer table, but one without a table
-)
+# OpenNI2 cannot open a file with a longer table, but one without a table
+_MOST_IN_SEEK_TABLE = 288_000
 
 
 def write_oni(
@@ -49,11 +52,25 @@ def write_oni(
 ) -> Path:
     """Write a recording as .oni, frame by frame; the file has its name only when it is whole.
 
-    codec: 16zT packs best and loses nothing, 16zP holds depths up to 32,767 steps, NONE does not
-    pack; unit_mm: of a stored step, 1.0 or 0.1; exact: refuse depths that are no whole number of
-    steps instead of rounding them. Times keep the recording's own clock, rounded to microseconds.
-    The intrinsics are kept as a property of our own, and as the angles of view that other programs
-    read.
+    Times keep the recording's own clock, rounded to microseconds. The intrinsics are kept as a
+    property of our own, and as the angles of view that other programs read.
+
+    Args:
+        recording: what is written.
+        path: the .oni file; its folder must exist.
+        codec: 16zT packs best and loses nothing, 16zP holds depths up to 32,767 steps, NONE does
+            not pack.
+        unit_mm: mm of a stored step, 1.0 or 0.1.
+        exact: refuse depths that are no whole number of steps instead of rounding them.
+        overwrite: replace a file that is there.
+        progress: told how many frames were written.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        RecordingError: the file exists or cannot be written, or a depth does not fit its steps.
+        ValueError: unit_mm is neither 1.0 nor 0.1.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -85,7 +102,10 @@ def _microseconds(time_ns: int) -> int:
 
 
 class OniWriter:
-    """One depth node, written as it comes; leaving its `with` block closes the file properly."""
+    """Writer of one depth node, frame by frame.
+
+    Leaving its `with` block without an error closes the file properly.
+    """
 
     def __init__(
         self,
@@ -97,8 +117,15 @@ class OniWriter:
         *,
         exact: bool = True,
     ) -> None:
-        """rate_hz: what the file says of itself; every frame has its own time. The others are those
-        of `write_oni`.
+        """Open the file and write its header and properties.
+
+        Args:
+            path: the .oni file.
+            camera: the camera of the frames.
+            codec: see `write_oni`.
+            unit_mm: mm of a stored step, 1.0 or 0.1.
+            rate_hz: the frame rate that the file states, Hz; every frame has its own time.
+            exact: refuse depths that are no whole number of steps instead of rounding them.
         """
         self._codec = codec
         self._unit_mm = unit_mm
@@ -123,7 +150,15 @@ class OniWriter:
         self._write(records.DATA_BEGIN, struct.pack("<IQ", _UNKNOWN_COUNT, _UNKNOWN_TIME))
 
     def add(self, time_us: int, depth: Depth) -> None:
-        """Append a frame: its time in µs, and its depth (H, W) mm."""
+        """Append a frame.
+
+        Args:
+            time_us: its time, µs, not negative.
+            depth: (H, W) float32 mm, 0 where unread.
+
+        Raises:
+            RecordingError: a depth does not fit the steps, or there are too many for the codec.
+        """
         stored = self._stored(depth)
         payload = (
             stored.tobytes()
@@ -142,7 +177,7 @@ class OniWriter:
         )
 
     def close(self) -> None:
-        """Write what belongs at the end, and the counts at the beginning."""
+        """Write what belongs at the end, and the counts at the beginning, and close the file."""
         self._write(records.NODE_REMOVED, undoes=self._node_at)
         n = len(self._entries)
         last = self._entries[-1][0] if self._entries else 0
@@ -175,7 +210,7 @@ class OniWriter:
             self.abandon()
 
     def abandon(self) -> None:
-        """Let go of the file as it is."""
+        """Close the file as it is."""
         self._file.close()
 
     def _write(

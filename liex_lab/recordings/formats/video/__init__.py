@@ -1,1 +1,1 @@
-"""Depth in video containers: AVI and Matroska, FFV1 and raw pictures."""
+"""Depth in video containers: AVI and Matroska with FFV1 or uncompressed 16-bit grey pictures."""

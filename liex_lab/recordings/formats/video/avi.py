@@ -1,5 +1,6 @@
-"""Where the pictures of an AVI file lie: one walk over its chunks, which needs no index and so
-reads cut files too.
+"""Index of an AVI (RIFF) file: one walk over its chunks, which reads files without an index or cut.
+
+Times are steps of the stream's constant rate; an empty chunk stands for a dropped picture.
 """
 
 from __future__ import annotations
@@ -35,8 +36,17 @@ class _Chunk(NamedTuple):
 
 
 def index_avi(path: Path, progress: Progress) -> DepthTrack:
-    """The first video stream of an AVI file. Its times are steps of a constant rate: an AVI knows
-    no others.
+    """Find the pictures of the first video stream of an AVI file.
+
+    Args:
+        path: the .avi file.
+        progress: told how many MB were walked over.
+
+    Returns:
+        Where the pictures lie, with the times of a constant rate: an AVI knows no others.
+
+    Raises:
+        RecordingError: the file is no RIFF file.
     """
     size = path.stat().st_size
     track = DepthTrack(even=True)

@@ -1,4 +1,6 @@
-"""FFV1 pictures: PyAV's decoder, and the check sums that it does not look at. Slow twin:
+"""FFV1 decoding (RFC 9043) of 16-bit grey pictures with PyAV; the slices' CRC-32 is checked.
+
+The decoder does not look at the check sums, so damage would come out as depth. Slow twin:
 tests/oracles/ffv1.py.
 """
 
@@ -21,8 +23,10 @@ _KEY = 0x7F80
 
 @njit(cache=True)
 def crc_table():
-    """Remainders (256,) uint32 of every byte, by the polynomial of the FFV1 specification, high bit
-    first.
+    """Table of CRC-32 remainders of every byte, polynomial 0x04C11DB7, high bit first (FFV1).
+
+    Returns:
+        (256,) uint32.
     """
     table = np.empty(256, np.uint32)
     for byte in range(256):
@@ -35,11 +39,17 @@ def crc_table():
 
 @njit(cache=True)
 def slices_agree(data, table):
-    """Whether the slices of a picture, found from its last byte backwards, all agree with their
-    check sums.
+    """Whether the slices of a picture, found from its last byte backwards, agree with their CRC-32.
 
     Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the
-    whole slice's 0.
+    whole slice's CRC 0.
+
+    Args:
+        data: (m,) uint8 bytes of the picture.
+        table: (256,) uint32 of `crc_table`.
+
+    Returns:
+        True where all agree.
     """
     end = data.size
     while end > 8:
@@ -57,16 +67,28 @@ def slices_agree(data, table):
 
 
 def is_key(head: bytes) -> bool:
-    """Whether the picture that begins so can be decoded by itself."""
+    """Whether a picture can be decoded by itself: its first coded bit is 1.
+
+    Args:
+        head: its first two bytes.
+
+    Returns:
+        True for a key picture.
+    """
     return int.from_bytes(head[:2], "big") >= _KEY
 
 
 class Ffv1:
-    """A decoder of one FFV1 stream of 16-bit grey pictures: feed it pictures in order, from a key
-    picture on.
-    """
+    """Decoder of one FFV1 stream of 16-bit grey pictures, fed in order from a key picture on."""
 
     def __init__(self, width: int, height: int, private: bytes) -> None:
+        """Start the decoder.
+
+        Args:
+            width: columns of the pictures, px.
+            height: rows of the pictures, px.
+            private: the codec's own header from the container; empty for none.
+        """
         self._size = (width, height)
         self._private = private
         self._table = crc_table()
@@ -74,15 +96,20 @@ class Ffv1:
         self._codec = self.fresh()
 
     def fresh(self) -> Any:
-        """A decoder that has seen no picture."""
+        """A decoder that has been given no picture."""
         codec: Any = av.CodecContext.create("ffv1", "r")
         codec.width, codec.height = self._size
         codec.extradata = self._private or None
         return codec
 
     def decode(self, data: bytes) -> NDArray[np.uint16] | None:
-        """Stored values (H, W); None where the picture is damaged. The next one must then be a key
-        picture.
+        """Decode one picture; after a damaged one, the next must be a key picture.
+
+        Args:
+            data: the bytes of the picture.
+
+        Returns:
+            (H, W) uint16 stored values; None where it is damaged or not 16-bit grey.
         """
         agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
         self._summed = self._summed or agree  # chance agrees once in four thousand million times
@@ -102,8 +129,15 @@ class Ffv1:
 
 
 def require_depth(stream: Ffv1, keys: Iterable[bytes], where: str) -> None:
-    """Refuse a stream none of whose key pictures `keys` decodes, or which decode to something else
-    than 16-bit grey.
+    """Refuse a stream that does not decode to 16-bit grey.
+
+    Args:
+        stream: its decoder, which is not changed.
+        keys: bytes of some key pictures; the first that decodes decides.
+        where: the file, for the sentence.
+
+    Raises:
+        RecordingError: none of the keys decodes, or one is something else than 16-bit grey.
     """
     for data in keys:
         try:

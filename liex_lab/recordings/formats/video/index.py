@@ -1,4 +1,4 @@
-"""A depth track inside a video file: where its pictures lie, before any of them is decoded."""
+"""Index of a depth track in a video file: where its pictures lie, before any of them is decoded."""
 
 from __future__ import annotations
 
@@ -22,13 +22,21 @@ BITMAP_HEADER = struct.Struct(
 
 @dataclass
 class DepthTrack:
-    """What an AVI or a Matroska file tells of its depth pictures.
+    """What an AVI or a Matroska file states of its depth pictures.
 
-    codec: `FFV1`, a key of `RAW`, or the name of one that is not read; private: the codec's own
-    header; offsets, sizes (n,): bytes of every picture that lies whole in the file; times_ns (n,);
-    even: the times are steps of a constant rate, for the container knows no others; whole: the file
-    ends where it should and holds as many pictures as it says. tags, attachments (bytes by file
-    name): of the whole file; session_start: ISO 8601 where the file tells it.
+    Attributes:
+        codec: `FFV1`, a key of `RAW`, or the name of one that is not read.
+        width: columns of the pictures, px.
+        height: rows of the pictures, px.
+        private: the codec's own header.
+        offsets: (n,) positions of the pictures that lie whole in the file, bytes.
+        sizes: (n,) their sizes, bytes.
+        times_ns: (n,) their times, ns.
+        even: True where the times are steps of a constant rate, for the container knows no others.
+        whole: True where the file ends where it should and holds as many pictures as it says.
+        tags: tags of the whole file and of the track.
+        attachments: bytes of attached files by name.
+        session_start: ISO 8601 where the file states it.
     """
 
     codec: str = ""
@@ -45,7 +53,11 @@ class DepthTrack:
     session_start: str | None = None
 
     def take_bitmap_header(self, data: bytes) -> None:
-        """Size, codec and private data out of a BITMAPINFOHEADER and what follows it."""
+        """Take size, codec and private data out of a BITMAPINFOHEADER and what follows it.
+
+        Args:
+            data: the bytes of the header; too few change nothing.
+        """
         if len(data) < BITMAP_HEADER.size:
             return
         _, width, height, _, bits, code, *_ = BITMAP_HEADER.unpack_from(data)
@@ -58,8 +70,15 @@ class DepthTrack:
 
 
 def even_times(slots: list[int], scale: int, rate: int) -> NDArray[np.int64]:
-    """Stamps (n,) ns of the pictures in these slots of a constant rate of `rate` / `scale` per
-    second, exactly.
+    """Stamps of pictures in some slots of a constant rate, exactly (as fractions).
+
+    Args:
+        slots: (n,) number of each picture's slot, from 0.
+        scale: denominator of the rate.
+        rate: numerator of the rate, so that it is rate / scale per second.
+
+    Returns:
+        (n,) int64 ns.
     """
     step = Fraction(10**9 * scale, rate)
     return np.array([round(slot * step) for slot in slots], np.int64)

@@ -1,5 +1,9 @@
-"""Where the depth pictures of a Matroska file lie: one walk over its elements, which needs no
-index.
+"""Index of a Matroska (EBML) file: one walk over its elements.
+
+No cues are needed, so cut files can be read, too.
+
+A picture's time is (cluster time + block time) * timecode scale. Laced blocks, which no recorder of
+depth makes, count as damage.
 """
 
 from __future__ import annotations
@@ -88,8 +92,19 @@ class _Track:
 
 
 def index_mkv(path: Path, progress: Progress) -> DepthTrack:
-    """The depth track of a Matroska file: the one titled or tagged DEPTH, else the first of 16-bit
-    grey pictures.
+    """Find the depth track of a Matroska file and its pictures.
+
+    It is the track titled or tagged DEPTH, else the first of 16-bit grey pictures.
+
+    Args:
+        path: the .mkv file.
+        progress: told how many MB were walked over.
+
+    Returns:
+        Where its pictures lie and when they were taken.
+
+    Raises:
+        RecordingError: the file is no Matroska file, or holds no video track.
     """
     size = path.stat().st_size
     found = _Walk()
@@ -122,8 +137,14 @@ def index_mkv(path: Path, progress: Progress) -> DepthTrack:
 class _Walk:
     """What has been met so far.
 
-    pictures: offset, size, time in ticks, offset, ... by track number; tags: by (track uid or 0,
-    name).
+    Attributes:
+        tracks: the entries of the tracks.
+        pictures: offset, size, time in ticks, offset, ... by track number.
+        tags: by (track uid or 0, name).
+        attachments: bytes of attached files by name.
+        scale_ns: ns in a tick.
+        whole: True while nothing was found cut or damaged.
+        start: ISO 8601 of the recording's date, where stated.
     """
 
     def __init__(self) -> None:
@@ -137,7 +158,12 @@ class _Walk:
         self._cluster_time = 0
 
     def take(self, file: IO[bytes], element: _Element) -> None:
-        """Note one element."""
+        """Note one element.
+
+        Args:
+            file: the open file.
+            element: its id, position and size.
+        """
         if element.id in (_SIMPLE_BLOCK, _BLOCK):
             self._take_block(file, element)
         elif element.id in (_CLUSTER_TIME, _INFO, _TRACKS, _TAGS, _ATTACHMENTS):
@@ -190,7 +216,15 @@ class _Walk:
                 self.tags[uid, _text(table, 0x45A3)] = _text(table, 0x4487)
 
     def depth_track(self, path: Path) -> _Track:
-        """The track that holds the depth."""
+        """The track that holds the depth.
+
+        Args:
+            path: the file, for the sentence.
+
+        Returns:
+            The track titled or tagged DEPTH, else the first of 16-bit grey pictures, else the first
+            video.
+        """
         videos = [track for track in self.tracks if track.is_video]
         tagged = {uid for uid, name in self.tags if name == "K4A_DEPTH_TRACK"}
         titled = [track for track in videos if track.name.upper() == "DEPTH" or track.uid in tagged]

@@ -1,4 +1,8 @@
-"""Depth videos: FFV1 or raw 16-bit grey pictures in AVI or Matroska, any of them at any time."""
+"""Random access to depth videos: FFV1 or raw 16-bit grey pictures in AVI or Matroska.
+
+FFV1 pictures build on the ones before them back to the last key picture (one in twelve, usually),
+so reading in order decodes each once, and reading at random some more.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +25,25 @@ _N_ASKED = 3  # key pictures, one of which must be depth: the first may be damag
 
 
 class DepthVideo:
-    """The depth track of a video file as pictures of one size; also a `Stack`.
+    """Depth track of a video file as pictures of one size; also a `Stack`.
 
-    track: where they lie, and their times. FFV1 pictures build on the ones before them back to the
-    last key picture (one in twelve, usually), so reading in order decodes each once and reading at
-    random some more.
+    Attributes:
+        track: where the pictures lie, and their times.
+        width: columns of the pictures, px.
+        height: rows of the pictures, px.
+        problems: sentences about the file.
     """
 
     def __init__(self, path: Path, track: DepthTrack) -> None:
+        """Open the file, and find the key pictures of FFV1.
+
+        Args:
+            path: the .avi or .mkv file.
+            track: its index.
+
+        Raises:
+            RecordingError: its pictures are no 16-bit depth.
+        """
         self.track = track
         self.width = track.width
         self.height = track.height
@@ -63,7 +78,7 @@ class DepthVideo:
 
     @property
     def whole(self) -> list[bool]:
-        """Every picture that is listed lies whole in the file."""
+        """True for each picture, (n,), for those that are listed lie whole in the file."""
         return [True] * len(self)
 
     @property
@@ -72,8 +87,13 @@ class DepthVideo:
         return not self.track.whole
 
     def read(self, index: int) -> NDArray[np.uint16] | None:
-        """Stored values (H, W) uint16; None where the picture, or one that it builds on, is
-        damaged.
+        """Stored values of one picture.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            (H, W) uint16; None where the picture, or one that it builds on, is damaged.
         """
         with self._lock:
             if self._ffv1 is None:
@@ -100,7 +120,14 @@ class DepthVideo:
         return self._file.read(size if at_most is None else min(size, at_most))
 
     def label(self, index: int) -> str:
-        """The file and picture, for a sentence."""
+        """Name of a picture, for a sentence.
+
+        Args:
+            index: number of the picture.
+
+        Returns:
+            The picture and the file.
+        """
         return f"picture {index} of {self._path.name}"
 
     def close(self) -> None:
@@ -109,7 +136,18 @@ class DepthVideo:
 
 
 def open_video(path: Path, progress: Progress) -> DepthVideo:
-    """Find the depth pictures of an AVI or Matroska file."""
+    """Find the depth pictures of an AVI or Matroska file.
+
+    Args:
+        path: the file; .mkv is read as Matroska, any other as AVI.
+        progress: told how many MB were walked over.
+
+    Returns:
+        The pictures.
+
+    Raises:
+        RecordingError: there is no whole picture of 16-bit depth in FFV1 or uncompressed.
+    """
     if path.suffix.lower() == ".mkv":
         from liex_lab.recordings.formats.video.mkv import index_mkv
 
