@@ -216,7 +216,7 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
             "curve": np.arange(2),
         }
 
-    job(monkeypatch, "evaluate", evaluate_pose=evaluate_pose)
+    job(monkeypatch, "evaluation.pose", evaluate_pose=evaluate_pose)
     file = tmp_path / "numbers" / "pose.json"
     words = [
         "--animal",
@@ -242,7 +242,7 @@ def test_the_other_measures_reach_their_jobs(
 ) -> None:
     job(
         monkeypatch,
-        "speed",
+        "evaluation.speed",
         evaluate_speed=lambda animal, progress: {
             "animal": animal,
             "stages_ms": {"foreground": 0.1},
@@ -250,7 +250,7 @@ def test_the_other_measures_reach_their_jobs(
     )
     job(
         monkeypatch,
-        "evaluate",
+        "evaluation.pose",
         evaluate_sizes=lambda animal, n_frames, progress: {"n_frames": n_frames},
         evaluate_reference=lambda session, reference: {
             "session": str(session),
@@ -303,7 +303,7 @@ def test_evaluate_speed_measures_recordings_where_asked(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     numbers = {"frames_per_s_1core": {"mcap": 400.0}}
-    job(monkeypatch, "evaluate_recordings", evaluate_recordings=lambda progress: numbers)
+    job(monkeypatch, "evaluation.decoding", evaluate_recordings=lambda progress: numbers)
     file = tmp_path / "numbers.json"
     result = CliRunner().invoke(cli.app, ["evaluate", "speed", "--recordings", "--json", str(file)])
     assert result.exit_code == 0, result.output
@@ -366,7 +366,7 @@ def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch)
     ) -> Any:
         return out, variant, workers, n_images
 
-    job(monkeypatch, "train", train_model=train)
+    job(monkeypatch, "training.pose_model", train_model=train)
     result = CliRunner().invoke(cli.app, ["train", "mouse", "--variant", "paper", "--workers", "2"])
     assert result.output == f"model: {(Path('mouse.npz'), 'paper', 2, None)}\n"
     result = CliRunner().invoke(cli.app, ["train", "datasets/snake.toml", "--images", "512"])

@@ -176,7 +176,7 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
     assert why(file) == ("changed", "plan changed: behaviour.rear_height_mm = 41.0")
     file.write_text(text)
-    monkeypatch.setattr("liex_lab.pipelines.study.run.status.package_version", lambda name: "9.9")
+    monkeypatch.setattr("liex_lab.pipelines.study.status.package_version", lambda name: "9.9")
     assert why(file)[1].startswith("version changed: ")
     monkeypatch.undo()
     assert why(file) == ("done", "")
