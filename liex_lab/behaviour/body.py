@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Body:
+class BodyAxis:
     """An animal's joints by the parts they play, as indices into its skeleton.
 
     Attributes:
@@ -41,7 +41,7 @@ class Body:
         return self.spine[1:-1] or self.spine[:1]
 
     @staticmethod
-    def of(joints: Sequence[str]) -> Body:
+    def of(joints: Sequence[str]) -> BodyAxis:
         """The parts by name or along the chain, which begins at the head or at the rump.
 
         A chain that begins at a head is that of an animal that swims; any other begins at the rump.
@@ -57,7 +57,7 @@ class Body:
         n = len(joints)
         if names[0] == "head":
             half = tuple(range(n // 2 + 1))
-            return Body(names, True, tuple(range(n)), (min(max(n // 4, 1), n - 1), 0), half)
+            return BodyAxis(names, True, tuple(range(n)), (min(max(n // 4, 1), n - 1), 0), half)
         at = {name: k for k, name in enumerate(names)}
         rump, neck, nose = (
             at.get(name, place)
@@ -69,4 +69,4 @@ class Body:
             else (0,)
         )
         trunk = tuple(k for k in range(n) if k != nose) or (nose,)
-        return Body(names, False, spine, (rump, neck), trunk)
+        return BodyAxis(names, False, spine, (rump, neck), trunk)

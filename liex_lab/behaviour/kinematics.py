@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import Body
+from liex_lab.behaviour.body import BodyAxis
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
@@ -157,7 +157,7 @@ def kinematics(
         known.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
-    body = Body.of(joints.names)
+    body = BodyAxis.of(joints.names)
     shape, heights = _frame_by_frame(body, joints, room)
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
@@ -180,7 +180,7 @@ def kinematics(
     return to_pandas(kinematics_columns(body.swims), block, copy=False)
 
 
-def _frame_by_frame(body: Body, joints: Joints, room: Room) -> tuple[Shape, dict[str, Array]]:
+def _frame_by_frame(body: BodyAxis, joints: Joints, room: Room) -> tuple[Shape, dict[str, Array]]:
     """What each frame tells by itself, and of an animal that stands its heights, block by block."""
     shape = Shape.empty(joints.n_frames, room)
     heights = {} if body.swims else {name: room((joints.n_frames,), float) for name in _HEIGHTS}
@@ -257,7 +257,7 @@ def _moving(
     return columns
 
 
-def _walking(body: Body, xyz: Array, sd: Array) -> dict[str, Array]:
+def _walking(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:
     """Heights of an animal that stands on the floor."""
     nose = xyz[:, body.front]
     rump = xyz[:, body.rear]

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import Body
+from liex_lab.behaviour.body import BodyAxis
 from liex_lab.runtime.memory import Room, let_go
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Posture:
         axis_sd: (n,) standard deviation of the difference of the axis' two ends, mm.
     """
 
-    body: Body
+    body: BodyAxis
     spine: Array
     spine_sd: Array
     centre: Array
@@ -45,7 +45,7 @@ class Posture:
     axis_sd: Array
 
     @staticmethod
-    def of(body: Body, xyz: Array, sd: Array) -> Posture:
+    def of(body: BodyAxis, xyz: Array, sd: Array) -> Posture:
         """The posture from all joints; errors of the joints of one frame count as one common error.
 
         Args:

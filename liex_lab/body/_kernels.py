@@ -9,35 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-
-@njit(cache=True)
-def exp_so3(w, out):
-    """Rotation of a rotation vector by Rodrigues' formula, with its series below 1e-4 rad.
-
-    Args:
-        w: (3,) rad.
-        out: (3, 3), out.
-    """
-    th2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    if th2 < 1e-8:
-        a = 1.0 - th2 / 6.0
-        b = 0.5 - th2 / 24.0
-    else:
-        th = np.sqrt(th2)
-        a = np.sin(th) / th
-        b = 2.0 * np.sin(th / 2.0) ** 2 / th2
-    x = w[0]
-    y = w[1]
-    z = w[2]
-    out[0, 0] = 1.0 - b * (y * y + z * z)
-    out[0, 1] = b * x * y - a * z
-    out[0, 2] = b * x * z + a * y
-    out[1, 0] = b * x * y + a * z
-    out[1, 1] = 1.0 - b * (x * x + z * z)
-    out[1, 2] = b * y * z - a * x
-    out[2, 0] = b * x * z - a * y
-    out[2, 1] = b * y * z + a * x
-    out[2, 2] = 1.0 - b * (x * x + y * y)
+from liex_lab.geometry._so3_kernels import exp_so3
 
 
 @njit(cache=True)
@@ -67,7 +39,7 @@ def place_joints(parents, offsets, rest, moves, rotation, translation, angles, s
         for j in range(1, n_joints):
             p = parents[j]
             if moves[j]:
-                exp_so3(angles[i, j], own)
+                exp_so3(angles[i, j, 0], angles[i, j, 1], angles[i, j, 2], own)
             for a in range(3):
                 total = 0.0
                 for k in range(3):

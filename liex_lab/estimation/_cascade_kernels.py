@@ -30,7 +30,7 @@ FRAMES = 8
 _SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these
 
 
-class Chain(NamedTuple):
+class KinematicTree(NamedTuple):
     """A kinematic tree.
 
     Attributes:
@@ -66,7 +66,7 @@ class Trees(NamedTuple):
     widths: Any
 
 
-class Tuning(NamedTuple):
+class CascadeSettings(NamedTuple):
     """The method's numbers for the cascade.
 
     Attributes:

@@ -18,8 +18,8 @@ import numpy as np
 from numba import njit, prange
 
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_camera
+from liex_lab.geometry._so3_kernels import exp_so3
 
-LOOK = 17
 N_SCALARS = 11
 # a threshold is an integer: logarithms and sines are scaled up to resolve a few thousandths
 _LOG_UNIT = 500.0
@@ -102,35 +102,6 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
 
 
 @njit(cache=True)
-def so3_exp(wx, wy, wz, out):
-    """Rotation matrix of a rotation vector (Rodrigues), the scalar twin of `geometry.so3.exp`.
-
-    Args:
-        wx: x component, rad.
-        wy: y component, rad.
-        wz: z component, rad.
-        out: (3, 3), filled.
-    """
-    th2 = wx * wx + wy * wy + wz * wz
-    if th2 < 1e-8:
-        a = 1.0 - th2 / 6.0
-        b = 0.5 - th2 / 24.0
-    else:
-        th = np.sqrt(th2)
-        a = np.sin(th) / th
-        b = 2.0 * np.sin(th / 2.0) ** 2 / th2
-    out[0, 0] = 1.0 - b * (wy * wy + wz * wz)
-    out[0, 1] = b * wx * wy - a * wz
-    out[0, 2] = b * wx * wz + a * wy
-    out[1, 0] = b * wx * wy + a * wz
-    out[1, 1] = 1.0 - b * (wx * wx + wz * wz)
-    out[1, 2] = b * wy * wz - a * wx
-    out[2, 0] = b * wx * wz - a * wy
-    out[2, 1] = b * wy * wz + a * wx
-    out[2, 2] = 1.0 - b * (wx * wx + wy * wy)
-
-
-@njit(cache=True)
 def turn(rotation, wx, wy, wz):
     """Rotate a frame about its own axes: rotation <- rotation exp(w), for corrections are local.
 
@@ -141,7 +112,7 @@ def turn(rotation, wx, wy, wz):
         wz: z component, rad.
     """
     step = np.empty((3, 3))
-    so3_exp(wx, wy, wz, step)
+    exp_so3(wx, wy, wz, step)
     for i in range(3):
         a = rotation[i, 0]
         b = rotation[i, 1]

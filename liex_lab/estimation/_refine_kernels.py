@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.estimation._feature_kernels import so3_exp
 from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
+from liex_lab.geometry._cholesky_kernels import cholesky, substitute
+from liex_lab.geometry._so3_kernels import exp_so3
 
 _STRIDE = 4  # every so many crop pixels a reading pulls
 _ROOT = 7  # twist of the base and log of the scale come before the angles
@@ -27,7 +28,7 @@ _MOST_GROWTH = 0.1
 _MOST_TURN = 0.5
 
 
-class Tree(NamedTuple):
+class AngleTree(NamedTuple):
     """A kinematic tree with its free angles.
 
     Attributes:
@@ -49,7 +50,7 @@ class Tree(NamedTuple):
     turns: Any
 
 
-class Wishes(NamedTuple):
+class ResidualWeights(NamedTuple):
     """Weights of the residuals.
 
     Attributes:
@@ -136,7 +137,7 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
             rotations[0, i, k] = root_rotation[i, k]
     for j in range(1, tree.parents.size):
         p = tree.parents[j]
-        so3_exp(angles[j, 0], angles[j, 1], angles[j, 2], turn)
+        exp_so3(angles[j, 0], angles[j, 1], angles[j, 2], turn)
         for i in range(3):
             for k in range(3):
                 local[i, k] = 0.0
@@ -290,29 +291,12 @@ def _solve(curvature, gradient, step):
 
     Returns False where it is not definite.
     """
-    n = gradient.size
-    for i in range(n):
-        for k in range(i + 1):
-            total = curvature[i, k]
-            for m in range(k):
-                total -= curvature[i, m] * curvature[k, m]
-            if i == k:
-                if total <= 1e-12:
-                    return False
-                curvature[i, i] = np.sqrt(total)
-            else:
-                curvature[i, k] = total / curvature[k, k]
-    for i in range(n):
-        total = -gradient[i]
-        for m in range(i):
-            total -= curvature[i, m] * step[m]
-        step[i] = total / curvature[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
-        for m in range(i + 1, n):
-            total -= curvature[m, i] * step[m]
-        step[i] = total / curvature[i, i]
-    return True
+    definite = cholesky(curvature, curvature, 1e-12)
+    for i in range(gradient.size):
+        step[i] = -gradient[i]
+    if definite:
+        substitute(curvature, step)
+    return definite
 
 
 @njit(cache=True)
@@ -399,7 +383,7 @@ def _hold(tree, prior, moved, growth, turned, gradient, curvature):
 def _go(step, tree, root_rotation, root_position, angles, scale):
     """Take a step (P,) in place, angles and scale limited; returns the new scale."""
     turn = np.empty((3, 3))
-    so3_exp(step[0], step[1], step[2], turn)
+    exp_so3(step[0], step[1], step[2], turn)
     for i in range(3):
         x = root_rotation[i, 0]
         y = root_rotation[i, 1]

@@ -30,7 +30,7 @@ _APART_MM = 8.0
 _STRIDE = 6  # every so many crop pixels a reading is looked at
 
 
-class Body(NamedTuple):
+class SphereModel(NamedTuple):
     """The sphere model that poses are compared with the height map by, see `body.spheres.Spheres`.
 
     It may have no spheres.

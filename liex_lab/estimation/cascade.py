@@ -325,13 +325,13 @@ class Cascade:
         return turn * method.joint_lever_mm, keep
 
 
-def body_of(balls: Spheres) -> explaining.Body:
+def body_of(balls: Spheres) -> explaining.SphereModel:
     """The body's spheres as the kernels want them.
 
     Args:
         balls: the sphere model of the body.
     """
-    return explaining.Body(
+    return explaining.SphereModel(
         balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius
     )
 

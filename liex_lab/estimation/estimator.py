@@ -27,7 +27,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError
 from liex_lab.estimation import _cascade_kernels as kernels
-from liex_lab.estimation._residual_kernels import Body
+from liex_lab.estimation._residual_kernels import SphereModel
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.forest_correction import corrected
 from liex_lab.estimation.head_tail import HeadTailClassifier, both_ways
@@ -217,18 +217,18 @@ class PoseEstimator:
         return _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
 
     @cached_property
-    def _chain(self) -> kernels.Chain:
+    def _chain(self) -> kernels.KinematicTree:
         """The kinematic tree as the kernels want it."""
         s = self.skeleton
-        return kernels.Chain(
+        return kernels.KinematicTree(
             s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None])
         )
 
-    def _tuning(self, n_starts: int) -> kernels.Tuning:
+    def _tuning(self, n_starts: int) -> kernels.CascadeSettings:
         """The method's numbers as the kernels want them."""
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
-        return kernels.Tuning(
+        return kernels.CascadeSettings(
             method.rounds_of(0),
             method.rounds,
             method.reaches(self.skeleton.n_joints),
@@ -238,10 +238,10 @@ class PoseEstimator:
         )
 
     @cached_property
-    def _body(self) -> Body:
+    def _body(self) -> SphereModel:
         """The sphere model that candidates are compared with; empty unless the method asks."""
         if not self.model.method.explains:
-            return Body(
+            return SphereModel(
                 1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0)
             )
         return body_of(self.model.cascade.balls)

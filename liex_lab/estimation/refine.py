@@ -51,8 +51,8 @@ class Refiner:
     """
 
     skeleton: Skeleton
-    tree: kernels.Tree
-    body: explaining.Body
+    tree: kernels.AngleTree
+    body: explaining.SphereModel
 
     @staticmethod
     def of(skeleton: Skeleton, balls: Spheres) -> Refiner:
@@ -78,7 +78,7 @@ class Refiner:
             row[: len(some)] = some
         return Refiner(
             s,
-            kernels.Tree(s.parents, s.offsets, s.rest, free, limits, moves, turns),
+            kernels.AngleTree(s.parents, s.offsets, s.rest, free, limits, moves, turns),
             body_of(balls),
         )
 
@@ -102,7 +102,7 @@ class Refiner:
         position = pose.root.translation.copy()
         angles = pose.angles.copy()
         scale = pose.scale.copy()
-        wishes = kernels.Wishes(
+        wishes = kernels.ResidualWeights(
             _ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2])
         )
         kernels.refine_all(

@@ -103,7 +103,7 @@ class RidgeCorrection:
         # are
         return RidgeCorrection(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
-    def settle(self, pose: Pose, images: ImageSet, size: float) -> Settled:
+    def settle(self, pose: Pose, images: ImageSet, size: float) -> CorrectedRidge:
         """Correct poses, and estimate the animal's size from each of them.
 
         Args:
@@ -124,7 +124,7 @@ class RidgeCorrection:
         length = skeleton.length * size
         moved = joints + length * told[:, -2, None, None] * tangents(joints)
         moved[..., 2] += length * told[:, :-2]
-        return Settled(
+        return CorrectedRidge(
             Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]),
             told[:, -1],
             far_end_seen(seen),
@@ -132,7 +132,7 @@ class RidgeCorrection:
 
 
 @dataclass(frozen=True)
-class Settled:
+class CorrectedRidge:
     """Corrected poses and what each tells about the animal's size.
 
     Attributes:

@@ -11,7 +11,8 @@ smoothed:
 All scalar coordinates of a group share one covariance (2, 2) of value and velocity, so only gains
 are computed per frame, and every coordinate is moved by them. Positions (3) have one coupled state
 of six. Rotations use the left-invariant error log(R^T R') on SO(3), with the body's own angular
-velocity. In the code `fade` is τ, `drive` and `q` the process variance, `keep` is a, and `go` is g.
+velocity. In the code `tau` is τ, `process_variance` and `q` the process variance, `decay` is a, and
+`gain_dt` is g.
 """
 
 from __future__ import annotations
@@ -19,28 +20,31 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from liex_lab.body._kernels import exp_so3
+from liex_lab.geometry._cholesky_kernels import cholesky, substitute
+from liex_lab.geometry._so3_kernels import exp_so3, log_so3
 
 
 @njit(cache=True)
-def steps(times, fade, keep, go):
+def steps(times, tau, decay, gain_dt):
     """Fill the decay a and the velocity's gain times dt, g, of the step that leads to each frame.
 
     Args:
         times: (n,) s.
-        fade: decay time τ, s.
-        keep: (n,) output, a = exp(-dt / τ); 1 at the first frame.
-        go: (n,) output, g = τ (1 - a), s; 0 at the first frame.
+        tau: decay time τ, s.
+        decay: (n,) output, a = exp(-dt / τ); 1 at the first frame.
+        gain_dt: (n,) output, g = τ (1 - a), s; 0 at the first frame.
     """
-    keep[0] = 1.0
-    go[0] = 0.0
+    decay[0] = 1.0
+    gain_dt[0] = 0.0
     for t in range(1, times.size):
-        keep[t] = np.exp(-(times[t] - times[t - 1]) / fade)
-        go[t] = fade * (1.0 - keep[t])
+        decay[t] = np.exp(-(times[t] - times[t - 1]) / tau)
+        gain_dt[t] = tau * (1.0 - decay[t])
 
 
 @njit(cache=True)
-def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted, smoothed):
+def gains(
+    times, r, q, tau, start, decay, gain_dt, kalman_gain, rts_gain, filtered, predicted, smoothed
+):
     """Fill Kalman gains, RTS gains and covariances of one scalar coordinate over n frames.
 
     The prior at `start` is the measurement, with the velocity's stationary variance q τ / 2.
@@ -49,45 +53,45 @@ def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted
         times: (n,) s.
         r: (n,) measurement variance, infinite where nothing was measured.
         q: process variance, the density of the noise on the velocity.
-        fade: decay time τ, s.
+        tau: decay time τ, s.
         start: index of the first frame that was measured; frames before it are not filled.
-        keep: (n,) output, the decay a of each step.
-        go: (n,) output, g of each step, s.
-        forward: (n, 2) output, Kalman gain of value and velocity.
-        back: (n, 2, 2) output, RTS gain; not filled at the last frame.
+        decay: (n,) output, the decay a of each step.
+        gain_dt: (n,) output, g of each step, s.
+        kalman_gain: (n, 2) output, Kalman gain of value and velocity.
+        rts_gain: (n, 2, 2) output, RTS gain; not filled at the last frame.
         filtered: (n, 2, 2) output, covariance after each measurement.
         predicted: (n, 2, 2) output, covariance before it.
         smoothed: (n, 2, 2) output, covariance given all measurements.
     """
     n = times.size
     p = np.empty((2, 2))
-    steps(times, fade, keep, go)
+    steps(times, tau, decay, gain_dt)
     for t in range(start, n):
         if t == start:
             p[0, 0] = r[t]
             p[0, 1] = 0.0
             p[1, 0] = 0.0
-            p[1, 1] = 0.5 * q * fade
+            p[1, 1] = 0.5 * q * tau
             predicted[t] = p
-            forward[t, 0] = 1.0
-            forward[t, 1] = 0.0
+            kalman_gain[t, 0] = 1.0
+            kalman_gain[t, 1] = 0.0
         else:
-            k = keep[t]
-            g = go[t]
+            k = decay[t]
+            g = gain_dt[t]
             a = p[0, 0]
             b = p[0, 1]
             c = p[1, 1]
-            p[0, 0] = a + 2 * g * b + g * g * c + q * _way(times[t] - times[t - 1], fade)
+            p[0, 0] = a + 2 * g * b + g * g * c + q * _value_variance(times[t] - times[t - 1], tau)
             p[0, 1] = k * (b + g * c) + q * 0.5 * g * g
-            p[1, 1] = k * k * c + q * 0.5 * fade * (1 - k * k)
+            p[1, 1] = k * k * c + q * 0.5 * tau * (1 - k * k)
             p[1, 0] = p[0, 1]
             predicted[t] = p
             s = p[0, 0] + r[t]
-            forward[t, 0] = p[0, 0] / s
-            forward[t, 1] = p[0, 1] / s
+            kalman_gain[t, 0] = p[0, 0] / s
+            kalman_gain[t, 1] = p[0, 1] / s
             if np.isfinite(r[t]):
-                k0 = forward[t, 0]
-                k1 = forward[t, 1]
+                k0 = kalman_gain[t, 0]
+                k1 = kalman_gain[t, 1]
                 p[1, 1] -= k1 * p[0, 1]
                 p[0, 1] = (1 - k0) * p[0, 1]
                 p[0, 0] = (1 - k0) * p[0, 0]
@@ -95,8 +99,8 @@ def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted
         filtered[t] = p
     smoothed[n - 1] = filtered[n - 1]
     for t in range(n - 2, start - 1, -1):
-        k = keep[t + 1]
-        g = go[t + 1]
+        k = decay[t + 1]
+        g = gain_dt[t + 1]
         f = filtered[t]
         m = predicted[t + 1]
         det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
@@ -105,35 +109,35 @@ def gains(times, r, q, fade, start, keep, go, forward, back, filtered, predicted
         u01 = k * f[0, 1]
         u10 = f[1, 0] + g * f[1, 1]
         u11 = k * f[1, 1]
-        back[t, 0, 0] = (u00 * m[1, 1] - u01 * m[1, 0]) / det
-        back[t, 0, 1] = (u01 * m[0, 0] - u00 * m[0, 1]) / det
-        back[t, 1, 0] = (u10 * m[1, 1] - u11 * m[1, 0]) / det
-        back[t, 1, 1] = (u11 * m[0, 0] - u10 * m[0, 1]) / det
-        smoothed[t] = f + back[t] @ (smoothed[t + 1] - m) @ back[t].T
+        rts_gain[t, 0, 0] = (u00 * m[1, 1] - u01 * m[1, 0]) / det
+        rts_gain[t, 0, 1] = (u01 * m[0, 0] - u00 * m[0, 1]) / det
+        rts_gain[t, 1, 0] = (u10 * m[1, 1] - u11 * m[1, 0]) / det
+        rts_gain[t, 1, 1] = (u11 * m[0, 0] - u10 * m[0, 1]) / det
+        smoothed[t] = f + rts_gain[t] @ (smoothed[t + 1] - m) @ rts_gain[t].T
 
 
 @njit(cache=True)
-def _way(dt, fade):
+def _value_variance(dt, tau):
     """Q11 / q, s^3: process variance of the value after dt s; a series for small dt / τ."""
-    x = dt / fade
+    x = dt / tau
     if x < 1e-2:  # the differences below lose their digits
         return dt**3 * (1.0 / 3.0 - x / 4.0 + 7.0 * x * x / 60.0)
     a = np.exp(-x)
-    return fade**2 * (dt - 2.0 * fade * (1.0 - a) + 0.5 * fade * (1.0 - a * a))
+    return tau**2 * (dt - 2.0 * tau * (1.0 - a) + 0.5 * tau * (1.0 - a * a))
 
 
 @njit(cache=True)
-def run_vector(y, known, start, keep, go, forward, back, out, rate):
+def smooth_values(y, known, start, decay, gain_dt, kalman_gain, rts_gain, out, rate):
     """Filter and smooth one scalar coordinate with the gains of `gains`.
 
     Args:
         y: (n,) measured values; not read where `known` is False.
         known: (n,) bool, measured.
         start: index of the first measured frame; `out` is constant before it.
-        keep: (n,) decay of each step.
-        go: (n,) g of each step, s.
-        forward: (n, 2) Kalman gains.
-        back: (n, 2, 2) RTS gains.
+        decay: (n,) decay of each step.
+        gain_dt: (n,) g of each step, s.
+        kalman_gain: (n, 2) Kalman gains.
+        rts_gain: (n, 2, 2) RTS gains.
         out: (n,) output, smoothed values.
         rate: (n,) output, smoothed velocities per second, from `start` on.
     """
@@ -141,23 +145,23 @@ def run_vector(y, known, start, keep, go, forward, back, out, rate):
     out[start] = y[start]
     rate[start] = 0.0
     for t in range(start + 1, n):
-        out[t] = out[t - 1] + go[t] * rate[t - 1]
-        rate[t] = keep[t] * rate[t - 1]
+        out[t] = out[t - 1] + gain_dt[t] * rate[t - 1]
+        rate[t] = decay[t] * rate[t - 1]
         if known[t]:
             off = y[t] - out[t]
-            out[t] += forward[t, 0] * off
-            rate[t] += forward[t, 1] * off
+            out[t] += kalman_gain[t, 0] * off
+            rate[t] += kalman_gain[t, 1] * off
     for t in range(n - 2, start - 1, -1):
-        d0 = out[t + 1] - (out[t] + go[t + 1] * rate[t])
-        d1 = rate[t + 1] - keep[t + 1] * rate[t]
-        out[t] += back[t, 0, 0] * d0 + back[t, 0, 1] * d1
-        rate[t] += back[t, 1, 0] * d0 + back[t, 1, 1] * d1
+        d0 = out[t + 1] - (out[t] + gain_dt[t + 1] * rate[t])
+        d1 = rate[t + 1] - decay[t + 1] * rate[t]
+        out[t] += rts_gain[t, 0, 0] * d0 + rts_gain[t, 0, 1] * d1
+        rate[t] += rts_gain[t, 1, 0] * d0 + rts_gain[t, 1, 1] * d1
     for t in range(start):
         out[t] = out[start]
 
 
 @njit(cache=True)
-def run_place(times, y, r, known, start, drive, fade, out, spread):
+def smooth_positions(times, y, r, known, start, process_variance, tau, out, spread):
     """Filter and smooth positions with full measurement covariances; the state is (6,).
 
     Products are loops: matrices so small are not for BLAS.
@@ -168,8 +172,8 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
         r: (n, 3, 3) their covariances, mm^2.
         known: (n,) bool, measured.
         start: index of the first measured frame; `out` and `spread` are constant before it.
-        drive: (3,) process variance along each axis, mm^2/s^3.
-        fade: decay time τ, s.
+        process_variance: (3,) process variance along each axis, mm^2/s^3.
+        tau: decay time τ, s.
         out: (n, 3) output, smoothed positions, mm.
         spread: (n, 3, 3) output, their covariances, mm^2.
     """
@@ -183,14 +187,22 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
     inverse = np.zeros((6, 6))
     work = np.zeros((6, 6))
     for k in range(3):
-        m[start, 3 + k, 3 + k] = 0.5 * drive[k] * fade
+        m[start, 3 + k, 3 + k] = 0.5 * process_variance[k] * tau
         for i in range(3):
             m[start, i, k] = 1e3 * r[start, i, k]
     for k in range(3):
         ahead[start, k] = y[start, k]
     for t in range(start, n):
         if t > start:
-            _go_on(state[t - 1], p[t - 1], times[t] - times[t - 1], drive, fade, ahead[t], m[t])
+            _predict(
+                state[t - 1],
+                p[t - 1],
+                times[t] - times[t - 1],
+                process_variance,
+                tau,
+                ahead[t],
+                m[t],
+            )
         state[t] = ahead[t]
         p[t] = m[t]
         if not known[t]:
@@ -214,65 +226,69 @@ def run_place(times, y, r, known, start, drive, fade, out, spread):
         for i in range(6):
             for j in range(i):
                 p[t, j, i] = p[t, i, j]
-    _way_back(times, fade, start, state, p, ahead, m)
+    _rts_pass(times, tau, start, state, p, ahead, m)
     for t in range(n):
         out[t] = state[max(t, start), :3]
         spread[t] = p[max(t, start), :3, :3]
 
 
 @njit(cache=True)
-def _go_on(state, p, dt, drive, fade, ahead, m):
+def _predict(state, p, dt, process_variance, tau, ahead, m):
     """Kalman prediction: fill ahead (6,) and m (6, 6) from a state and its covariance."""
-    keep = np.exp(-dt / fade)
-    go = fade * (1.0 - keep)
-    way = _way(dt, fade)
+    decay = np.exp(-dt / tau)
+    gain_dt = tau * (1.0 - decay)
+    way = _value_variance(dt, tau)
     for k in range(3):
-        ahead[k] = state[k] + go * state[3 + k]
-        ahead[3 + k] = keep * state[3 + k]
+        ahead[k] = state[k] + gain_dt * state[3 + k]
+        ahead[3 + k] = decay * state[3 + k]
         for i in range(3):
-            m[i, k] = p[i, k] + go * (p[3 + i, k] + p[i, 3 + k]) + go * go * p[3 + i, 3 + k]
-            m[i, 3 + k] = keep * (p[i, 3 + k] + go * p[3 + i, 3 + k])
+            m[i, k] = (
+                p[i, k]
+                + gain_dt * (p[3 + i, k] + p[i, 3 + k])
+                + gain_dt * gain_dt * p[3 + i, 3 + k]
+            )
+            m[i, 3 + k] = decay * (p[i, 3 + k] + gain_dt * p[3 + i, 3 + k])
             m[3 + k, i] = m[i, 3 + k]
-            m[3 + i, 3 + k] = keep * keep * p[3 + i, 3 + k]
+            m[3 + i, 3 + k] = decay * decay * p[3 + i, 3 + k]
     for k in range(3):
-        m[k, k] += drive[k] * way
-        m[k, 3 + k] += drive[k] * 0.5 * go * go
+        m[k, k] += process_variance[k] * way
+        m[k, 3 + k] += process_variance[k] * 0.5 * gain_dt * gain_dt
         m[3 + k, k] = m[k, 3 + k]
-        m[3 + k, 3 + k] += drive[k] * 0.5 * fade * (1.0 - keep * keep)
+        m[3 + k, 3 + k] += process_variance[k] * 0.5 * tau * (1.0 - decay * decay)
 
 
 @njit(cache=True)
-def _way_back(times, fade, start, state, p, ahead, m):
+def _rts_pass(times, tau, start, state, p, ahead, m):
     """Rauch-Tung-Striebel pass, in place, over states (n, 6) and covariances (n, 6, 6)."""
     inverse = np.zeros((6, 6))
     work = np.zeros((6, 6))
     forth = np.zeros((6, 6))
-    back = np.zeros((6, 6))
+    rts_gain = np.zeros((6, 6))
     change = np.zeros((6, 6))
     for t in range(times.size - 2, start - 1, -1):
-        keep = np.exp(-(times[t + 1] - times[t]) / fade)
-        go = fade * (1.0 - keep)
+        decay = np.exp(-(times[t + 1] - times[t]) / tau)
+        gain_dt = tau * (1.0 - decay)
         for i in range(6):
             for k in range(3):
-                forth[i, k] = p[t, i, k] + go * p[t, i, 3 + k]
-                forth[i, 3 + k] = keep * p[t, i, 3 + k]
+                forth[i, k] = p[t, i, k] + gain_dt * p[t, i, 3 + k]
+                forth[i, 3 + k] = decay * p[t, i, 3 + k]
         _invert(m[t + 1], inverse, work)
-        _times(forth, inverse, back)
+        _multiply(forth, inverse, rts_gain)
         for i in range(6):
             for k in range(6):
-                state[t, i] += back[i, k] * (state[t + 1, k] - ahead[t + 1, k])
+                state[t, i] += rts_gain[i, k] * (state[t + 1, k] - ahead[t + 1, k])
                 change[i, k] = p[t + 1, i, k] - m[t + 1, i, k]
-        _times(back, change, work)
+        _multiply(rts_gain, change, work)
         for i in range(6):
             for k in range(6):
                 total = 0.0
                 for j in range(6):
-                    total += work[i, j] * back[k, j]
+                    total += work[i, j] * rts_gain[k, j]
                 p[t, i, k] += total
 
 
 @njit(cache=True)
-def _times(a, b, out):
+def _multiply(a, b, out):
     """Out = a b, all (6, 6)."""
     for i in range(6):
         for k in range(6):
@@ -287,80 +303,18 @@ def _invert(a, out, work):
     """Out = the inverse of a symmetric positive definite matrix (k, k), by its Cholesky factor in
     `work`.
     """
-    n = a.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            total = a[i, j]
-            for k in range(j):
-                total -= work[i, k] * work[j, k]
-            work[i, j] = np.sqrt(max(total, 1e-300)) if i == j else total / work[j, j]
-    for c in range(n):
-        for i in range(n):
-            total = 1.0 if i == c else 0.0
-            for k in range(i):
-                total -= work[i, k] * out[k, c]
-            out[i, c] = total / work[i, i]
-        for i in range(n - 1, -1, -1):
-            total = out[i, c]
-            for k in range(i + 1, n):
-                total -= work[k, i] * out[k, c]
-            out[i, c] = total / work[i, i]
-
-
-@njit(cache=True)
-def log_so3(r, out):
-    """Logarithm of SO(3), through the quaternion's largest component, so that it is exact up to π.
-
-    Args:
-        r: (3, 3) rotation.
-        out: (3,) output, rotation vector, rad.
-    """
-    q = np.empty(4)
-    d0 = r[0, 0]
-    d1 = r[1, 1]
-    d2 = r[2, 2]
-    squares = np.array([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2])
-    wx = r[2, 1] - r[1, 2]
-    wy = r[0, 2] - r[2, 0]
-    wz = r[1, 0] - r[0, 1]
-    xy = r[0, 1] + r[1, 0]
-    xz = r[0, 2] + r[2, 0]
-    yz = r[1, 2] + r[2, 1]
-    pivot = int(np.argmax(squares))
-    if pivot == 0:
-        q[0] = squares[0]
-        q[1] = wx
-        q[2] = wy
-        q[3] = wz
-    elif pivot == 1:
-        q[0] = wx
-        q[1] = squares[1]
-        q[2] = xy
-        q[3] = xz
-    elif pivot == 2:
-        q[0] = wy
-        q[1] = xy
-        q[2] = squares[2]
-        q[3] = yz
-    else:
-        q[0] = wz
-        q[1] = xz
-        q[2] = yz
-        q[3] = squares[3]
-    if q[0] < 0.0:
-        q = -q
-    length = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    whole = np.sqrt(q[0] ** 2 + length**2)
-    factor = 2.0 / whole if length < 1e-9 * whole else 2.0 * np.arctan2(length, q[0]) / length
-    for k in range(3):
-        out[k] = factor * q[1 + k]
+    cholesky(a, work, 1e-300)
+    out[:] = 0.0
+    for c in range(a.shape[0]):
+        out[c, c] = 1.0
+        substitute(work, out[:, c])
 
 
 @njit(cache=True)
 def _moved(r, w, out):
     """Out = r exp(w)."""
     step = np.empty((3, 3))
-    exp_so3(w, step)
+    exp_so3(w[0], w[1], w[2], step)
     for i in range(3):
         for k in range(3):
             out[i, k] = r[i, 0] * step[0, k] + r[i, 1] * step[1, k] + r[i, 2] * step[2, k]
@@ -377,8 +331,8 @@ def _between(a, b, out):
 
 
 @njit(cache=True)
-def run_rotations(y, known, start, keep, go, forward, back, out, rate):
-    """Filter and smooth rotations by the left-invariant error: `run_vector` on SO(3).
+def smooth_rotations(y, known, start, decay, gain_dt, kalman_gain, rts_gain, out, rate):
+    """Filter and smooth rotations by the left-invariant error: `smooth_values` on SO(3).
 
     The velocity is the body's own angular velocity, rad/s, and the error a rotation vector on the
     right, R' = R exp(w). Each axis of the body has its own gains.
@@ -387,10 +341,10 @@ def run_rotations(y, known, start, keep, go, forward, back, out, rate):
         y: (n, 3, 3) measured rotations.
         known: (n,) bool, measured.
         start: index of the first measured frame; `out` is constant before it.
-        keep: (3, n) decay of each step.
-        go: (3, n) g of each step, s.
-        forward: (3, n, 2) Kalman gains.
-        back: (3, n, 2, 2) RTS gains.
+        decay: (3, n) decay of each step.
+        gain_dt: (3, n) g of each step, s.
+        kalman_gain: (3, n, 2) Kalman gains.
+        rts_gain: (3, n, 2, 2) RTS gains.
         out: (n, 3, 3) output, smoothed rotations.
         rate: (n, 3) output, smoothed angular velocities, rad/s.
     """
@@ -402,28 +356,28 @@ def run_rotations(y, known, start, keep, go, forward, back, out, rate):
     rate[start] = 0.0
     for t in range(start + 1, n):
         for k in range(3):
-            w[k] = go[k, t] * rate[t - 1, k]
-            rate[t, k] = keep[k, t] * rate[t - 1, k]
+            w[k] = gain_dt[k, t] * rate[t - 1, k]
+            rate[t, k] = decay[k, t] * rate[t - 1, k]
         _moved(out[t - 1], w, ahead)
         out[t] = ahead
         if known[t]:
             _between(ahead, y[t], off)
             for k in range(3):
-                w[k] = forward[k, t, 0] * off[k]
-                rate[t, k] += forward[k, t, 1] * off[k]
+                w[k] = kalman_gain[k, t, 0] * off[k]
+                rate[t, k] += kalman_gain[k, t, 1] * off[k]
             _moved(ahead, w, out[t])
     here = np.empty((3, 3))
     expected = np.empty((3, 3))
     for t in range(n - 2, start - 1, -1):
         for k in range(3):
-            w[k] = go[k, t + 1] * rate[t, k]
+            w[k] = gain_dt[k, t + 1] * rate[t, k]
         here[:] = out[t]
         _moved(here, w, expected)
         _between(expected, out[t + 1], off)
         for k in range(3):
-            faster = rate[t + 1, k] - keep[k, t + 1] * rate[t, k]
-            w[k] = back[k, t, 0, 0] * off[k] + back[k, t, 0, 1] * faster
-            rate[t, k] += back[k, t, 1, 0] * off[k] + back[k, t, 1, 1] * faster
+            faster = rate[t + 1, k] - decay[k, t + 1] * rate[t, k]
+            w[k] = rts_gain[k, t, 0, 0] * off[k] + rts_gain[k, t, 0, 1] * faster
+            rate[t, k] += rts_gain[k, t, 1, 0] * off[k] + rts_gain[k, t, 1, 1] * faster
         _moved(here, w, out[t])
     for t in range(start):
         out[t] = out[start]

@@ -5,8 +5,8 @@ at the mean joint distance δ_t from the curve, in predicted errors, gets the we
 (ν + δ_t^2), by which its measurement variance is divided (EM for the t distribution, Lange et al.
 1989), and is left out where δ_t is beyond the gate. Positions are those of the joints' middle, with
 an error ellipsoid aligned with the animal; the root is put where the middle requires it. In the
-code `freedom` is ν, `reject` the gate and `lasting` the correlated share, whose square is left out
-of the variance.
+code `degrees_of_freedom` is ν, `gate` the gate and `correlated_share` the correlated share, whose
+square is left out of the variance.
 """
 
 from __future__ import annotations
@@ -18,12 +18,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body._kernels import place_joints
-from liex_lab.tracking._kalman_kernels import gains, run_place, run_rotations, run_vector
+from liex_lab.tracking._kalman_kernels import (
+    gains,
+    smooth_positions,
+    smooth_rotations,
+    smooth_values,
+)
 
 _PASSES = 4
 
 
-class Body(NamedTuple):
+class KinematicTree(NamedTuple):
     """A skeleton for the kernels, see `place_joints`.
 
     Attributes:
@@ -49,26 +54,26 @@ class Moves(NamedTuple):
     """A `Motion` for the kernels; rows are (error, process variance, decay time).
 
     Attributes:
-        place_error: (3,) along the animal, to its side, up; over the predicted mean joint error.
-        place_drive: (3,) process variance along the arena's axes, lengths^2/s^3.
-        place_fade: decay time of the middle's velocity, s.
+        position_error: (3,) along the animal, to its side, up; over the predicted mean joint error.
+        position_variance: (3,) process variance along the arena's axes, lengths^2/s^3.
+        position_decay_s: decay time of the middle's velocity, s.
         turn: (3, 3) a row for each axis of the base's rotation.
         bend: (3, 3) a row for each axis of the joint angles.
         size: (3,) of the log scale.
-        freedom: degrees of freedom ν of the errors' t distribution.
-        reject: gate, predicted errors.
-        lasting: correlated share of an error.
+        degrees_of_freedom: degrees of freedom ν of the errors' t distribution.
+        gate: gate, predicted errors.
+        correlated_share: correlated share of an error.
     """
 
-    place_error: NDArray[np.float64]
-    place_drive: NDArray[np.float64]
-    place_fade: float
+    position_error: NDArray[np.float64]
+    position_variance: NDArray[np.float64]
+    position_decay_s: float
     turn: NDArray[np.float64]
     bend: NDArray[np.float64]
     size: NDArray[np.float64]
-    freedom: float
-    reject: float
-    lasting: float
+    degrees_of_freedom: float
+    gate: float
+    correlated_share: float
 
 
 class Poses(NamedTuple):
@@ -147,8 +152,10 @@ def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
                             apart += (seen.joints[t, j, k] - made.joints[t, j, k]) ** 2
                         off += np.sqrt(apart) / n_joints
                     off /= error[t]
-                    weight[t] = (moves.freedom + 1.0) / (moves.freedom + off * off)
-                    used[t] = off <= moves.reject
+                    weight[t] = (moves.degrees_of_freedom + 1.0) / (
+                        moves.degrees_of_freedom + off * off
+                    )
+                    used[t] = off <= moves.gate
                     n_used += used[t]
             if n_used == 0:
                 used[:] = known
@@ -167,7 +174,7 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
     r = np.zeros((n, 3, 3))
     for t in range(n):
         if used[t]:
-            variance[t] = (1.0 - moves.lasting**2) * error[t] ** 2 / weight[t]
+            variance[t] = (1.0 - moves.correlated_share**2) * error[t] ** 2 / weight[t]
             for i in range(3):
                 for k in range(3):
                     for a in range(3):
@@ -175,15 +182,17 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
                             frame[t, i, a]
                             * frame[t, k, a]
                             * variance[t]
-                            * moves.place_error[a] ** 2
+                            * moves.position_error[a] ** 2
                         )
     out = np.empty((n, 3))
-    drive = moves.place_drive * body.length_mm**2
-    run_place(times, middle, r, used, start, drive, moves.place_fade, out, spread.middle)
-    keep = np.zeros((3, n))
-    go = np.zeros((3, n))
-    forward = np.zeros((3, n, 2))
-    back = np.zeros((3, n, 2, 2))
+    process_variance = moves.position_variance * body.length_mm**2
+    smooth_positions(
+        times, middle, r, used, start, process_variance, moves.position_decay_s, out, spread.middle
+    )
+    decay = np.zeros((3, n))
+    gain_dt = np.zeros((3, n))
+    kalman_gain = np.zeros((3, n, 2))
+    rts_gain = np.zeros((3, n, 2, 2))
     filtered = np.zeros((n, 2, 2))
     predicted = np.zeros((n, 2, 2))
     smoothed = np.zeros((n, 2, 2))
@@ -196,17 +205,25 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
             moves.turn[a],
             body.length_mm,
             start,
-            keep[a],
-            go[a],
-            forward[a],
-            back[a],
+            decay[a],
+            gain_dt[a],
+            kalman_gain[a],
+            rts_gain[a],
             filtered,
             predicted,
             smoothed,
             spread.turn[:, a],
         )
-    run_rotations(
-        seen.rotation, used, start, keep, go, forward, back, made.rotation, np.zeros((n, 3))
+    smooth_rotations(
+        seen.rotation,
+        used,
+        start,
+        decay,
+        gain_dt,
+        kalman_gain,
+        rts_gain,
+        made.rotation,
+        np.zeros((n, 3)),
     )
     for a in range(3):
         _gains_of(
@@ -215,10 +232,10 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
             moves.bend[a],
             body.length_mm,
             start,
-            keep[a],
-            go[a],
-            forward[a],
-            back[a],
+            decay[a],
+            gain_dt[a],
+            kalman_gain[a],
+            rts_gain[a],
             filtered,
             predicted,
             smoothed,
@@ -226,14 +243,14 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
         )
     for i in range(m):
         j, a = body.free[i]
-        run_vector(
+        smooth_values(
             seen.angles[:, j, a].copy(),
             used,
             start,
-            keep[a],
-            go[a],
-            forward[a],
-            back[a],
+            decay[a],
+            gain_dt[a],
+            kalman_gain[a],
+            rts_gain[a],
             value,
             rate,
         )
@@ -244,17 +261,25 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
         moves.size,
         body.length_mm,
         start,
-        keep[0],
-        go[0],
-        forward[0],
-        back[0],
+        decay[0],
+        gain_dt[0],
+        kalman_gain[0],
+        rts_gain[0],
         filtered,
         predicted,
         smoothed,
         rate,
     )
-    run_vector(
-        seen.log_scale, used, start, keep[0], go[0], forward[0], back[0], made.log_scale, rate
+    smooth_values(
+        seen.log_scale,
+        used,
+        start,
+        decay[0],
+        gain_dt[0],
+        kalman_gain[0],
+        rts_gain[0],
+        made.log_scale,
+        rate,
     )
     _place(body, out, made)
 
@@ -266,10 +291,10 @@ def _gains_of(
     moves,
     length,
     start,
-    keep,
-    go,
-    forward,
-    back,
+    decay,
+    gain_dt,
+    kalman_gain,
+    rts_gain,
     filtered,
     predicted,
     smoothed,
@@ -282,10 +307,10 @@ def _gains_of(
         moves[1],
         moves[2],
         start,
-        keep,
-        go,
-        forward,
-        back,
+        decay,
+        gain_dt,
+        kalman_gain,
+        rts_gain,
         filtered,
         predicted,
         smoothed,

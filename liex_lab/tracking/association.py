@@ -29,7 +29,7 @@ NONE = kernels.NONE
 
 
 @dataclass(frozen=True)
-class ChainTuning:
+class AssociationCosts:
     """Costs of a chain of hypotheses, nats; lengths are those of an animal of the reference length.
 
     Attributes:
@@ -53,7 +53,7 @@ class ChainTuning:
     tail: float
 
 
-class Chain:
+class HypothesisAssociation:
     """Associates the hypotheses of frames with one animal; frames may be added.
 
     `path` explains all frames seen so far at once (Viterbi), so a stretch that looked like one
@@ -66,7 +66,7 @@ class Chain:
         tuning: costs.
     """
 
-    def __init__(self, skeleton: Skeleton, length_mm: float, tuning: ChainTuning) -> None:
+    def __init__(self, skeleton: Skeleton, length_mm: float, tuning: AssociationCosts) -> None:
         self._length = length_mm
         self._tuning = tuning
         self._score_mm = tuning.score_mm * skeleton.relative_size

@@ -14,15 +14,27 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from liex_lab.tracking.association import ChainTuning
-from liex_lab.tracking.smoother import Motion, Wandering
+from liex_lab.tracking.association import AssociationCosts
+from liex_lab.tracking.smoother import Motion, OrnsteinUhlenbeck
 
 TUNINGS = Path(__file__).with_name("tunings.toml")
+# fields of `Motion` that have another name in the file, which other versions wrote and read
+_STORED_AS = {
+    "position_error": "place_error",
+    "position_variance": "place_drive",
+    "position_decay_s": "place_fade",
+    "degrees_of_freedom": "freedom",
+    "gate": "reject",
+    "correlated_share": "lasting",
+    "calibration": "honest",
+    "root_calibration": "honest_root",
+    "bend_calibration": "honest_bend",
+}
 _USUAL = "mouse"  # what an animal is taken for that has none of its own
 
 
 @dataclass(frozen=True)
-class Tuning:
+class TrackingParameters:
     """The parameters of one animal.
 
     Attributes:
@@ -30,12 +42,12 @@ class Tuning:
         motion: motion and error parameters of the smoother.
     """
 
-    chain: ChainTuning
+    chain: AssociationCosts
     motion: Motion
 
     @staticmethod
     @cache
-    def of(name: str) -> Tuning:
+    def of(name: str) -> TrackingParameters:
         """The parameters of an animal, the mouse's where it has none of its own.
 
         Args:
@@ -45,10 +57,10 @@ class Tuning:
             The parameters, read once per name.
         """
         known = tomllib.loads(TUNINGS.read_text(encoding="utf-8"))
-        return Tuning.from_table(known.get(name, known[_USUAL]))
+        return TrackingParameters.from_table(known.get(name, known[_USUAL]))
 
     @staticmethod
-    def from_table(table: dict[str, Any]) -> Tuning:
+    def from_table(table: dict[str, Any]) -> TrackingParameters:
         """The parameters from their TOML table.
 
         Args:
@@ -58,14 +70,21 @@ class Tuning:
         Returns:
             The parameters.
         """
-        motion = dict(table["motion"])
+        field_of = {stored: name for name, stored in _STORED_AS.items()}
+        motion = {field_of.get(key, key): value for key, value in table["motion"].items()}
         for group in ("turn", "bend"):
-            motion[group] = tuple(Wandering(*row) for row in motion[group])
-        motion["size"] = Wandering(*motion["size"])
-        for name in ("place_error", "place_drive", "stretch", "honest_root", "honest_bend"):
+            motion[group] = tuple(OrnsteinUhlenbeck(*row) for row in motion[group])
+        motion["size"] = OrnsteinUhlenbeck(*motion["size"])
+        for name in (
+            "position_error",
+            "position_variance",
+            "stretch",
+            "root_calibration",
+            "bend_calibration",
+        ):
             motion[name] = tuple(motion[name])
-        motion["honest"] = tuple((said, factor) for said, factor in motion["honest"])
-        return Tuning(ChainTuning(**table["chain"]), Motion(**motion))
+        motion["calibration"] = tuple((stated, factor) for stated, factor in motion["calibration"])
+        return TrackingParameters(AssociationCosts(**table["chain"]), Motion(**motion))
 
     def to_toml(self, name: str) -> str:
         """The parameters as TOML tables, numbers to four significant digits.
@@ -84,11 +103,11 @@ class Tuning:
         for key, value in asdict(self.motion).items():
             rows = [list(row.values()) for row in value] if key in ("turn", "bend") else value
             rows = list(value.values()) if key == "size" else rows
-            lines.append(f"{key} = {_text(rows)}")
+            lines.append(f"{_STORED_AS.get(key, key)} = {_text(rows)}")
         return "\n".join(lines) + "\n"
 
 
-def tunings_with(name: str, tuning: Tuning) -> str:
+def tunings_with(name: str, tuning: TrackingParameters) -> str:
     """The text of `tunings.toml` with an animal's tables replaced, or added to it.
 
     Args:
@@ -100,9 +119,10 @@ def tunings_with(name: str, tuning: Tuning) -> str:
     """
     text = TUNINGS.read_text(encoding="utf-8")
     head = text[: text.index("\n[")]
-    known = {animal: Tuning.from_table(table) for animal, table in tomllib.loads(text).items()} | {
-        name: tuning
-    }
+    known = {
+        animal: TrackingParameters.from_table(table)
+        for animal, table in tomllib.loads(text).items()
+    } | {name: tuning}
     return "\n".join(
         [head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())]
     )

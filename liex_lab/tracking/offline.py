@@ -28,8 +28,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Room, blocks
-from liex_lab.tracking.association import NONE, Chain
-from liex_lab.tracking.motion_model import Tuning
+from liex_lab.tracking.association import NONE, HypothesisAssociation
+from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import Curve, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -84,7 +84,7 @@ def track_whole(
     subject: Subject,
     seen: Observations,
     corrections: Sequence[Flip] = (),
-    tuning: Tuning | None = None,
+    tuning: TrackingParameters | None = None,
     room: Room = np.empty,
 ) -> Tracked:
     """The track of a recording, smoothed over all of its frames at once, and its head-tail flips.
@@ -103,8 +103,8 @@ def track_whole(
     Returns:
         The track (n rows) and the flips, those found and those of `corrections`, in order of time.
     """
-    tuning = tuning or Tuning.of(subject.skeleton.name)
-    chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
+    tuning = tuning or TrackingParameters.of(subject.skeleton.name)
+    chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
     joints = chain.joints(seen, room)
     path = chain.path(seen, joints=joints, room=room)
     doubt = chain.doubt(seen, path, joints, room)
@@ -238,7 +238,7 @@ def to_track(
     doubt: Array,
     ahead: bool = False,
     told: slice = slice(None),
-    tuning: Tuning | None = None,
+    tuning: TrackingParameters | None = None,
 ) -> Track:
     """The rows of a track that a smoothed curve gives: measured, bridged over a gap, or missing.
 
@@ -255,7 +255,7 @@ def to_track(
     Returns:
         A track of the rows `told`; NaN where nothing was measured or bridged.
     """
-    tuning = tuning or Tuning.of(subject.skeleton.name)
+    tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
     bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
     track = Track.empty(subject.skeleton, seen.times_ns[told])
@@ -264,7 +264,7 @@ def to_track(
     return track
 
 
-def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None:
+def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParameters) -> None:
     """A curve into the rows (n) of a track, whether anything was measured there or not."""
     pose = curve.pose
     motion = tuning.motion
@@ -279,9 +279,11 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: Tuning) -> None
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     )
     track.predicted_error_mm[:] = np.hypot(curve.error_mm, ERROR_PER_SD * away.mean(axis=1))
-    honest = np.array(motion.honest_root)
-    track.cov_root[:] = covariance_of_root(curve) * (honest[:, None] * honest)
-    track.sd_angles_rad[:] = (curve.sd_bend * motion.honest_bend)[:, None] * subject.skeleton.axes
+    calibration = np.array(motion.root_calibration)
+    track.cov_root[:] = covariance_of_root(curve) * (calibration[:, None] * calibration)
+    track.sd_angles_rad[:] = (curve.sd_bend * motion.bend_calibration)[
+        :, None
+    ] * subject.skeleton.axes
     track.sd_angles_rad[:, 0] = 0.0
 
 
@@ -392,11 +394,11 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     path = np.where(seen.known[:, 0], 0, NONE)
     pose = seen.pose(path)
     error = seen.along(seen.error_mm, path)
-    moves = Tuning.of(subject.skeleton.name).motion.packed
+    moves = TrackingParameters.of(subject.skeleton.name).motion.packed
     turn, bend = (
         group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend)
     )
-    middle = (moves.place_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
+    middle = (moves.position_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
     curve = Curve(pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0)
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.tracking.association import NONE, Chain
-from liex_lab.tracking.motion_model import Tuning
+from liex_lab.tracking.association import NONE, HypothesisAssociation
+from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.offline import Subject, to_track
 from liex_lab.tracking.smoother import smooth
@@ -36,12 +36,14 @@ class OnlineTracker:
         tuning: motion and association parameters; None takes the animal's own.
     """
 
-    def __init__(self, subject: Subject, lag: int = 0, tuning: Tuning | None = None) -> None:
-        tuning = tuning or Tuning.of(subject.skeleton.name)
+    def __init__(
+        self, subject: Subject, lag: int = 0, tuning: TrackingParameters | None = None
+    ) -> None:
+        tuning = tuning or TrackingParameters.of(subject.skeleton.name)
         self._subject = subject
         self._lag = lag
         self._motion = tuning.motion
-        self._chain = Chain(subject.skeleton, subject.length_mm, tuning.chain)
+        self._chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)

@@ -27,20 +27,21 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Wandering:
+class OrnsteinUhlenbeck:
     """Integrated Ornstein-Uhlenbeck parameters of one coordinate, and how single frames err in it.
 
     Attributes:
         error: standard deviation of a measurement (rad, or of the log scale) times the animal's
             length over the predicted mean joint error.
-        drive: process variance q, the density of the white noise that drives the velocity,
+        process_variance: process variance q, the density of the white noise that drives the
+            velocity,
             rad^2/s^3 (1/s^3 of the log scale).
-        fade: decay time τ, s, within which a velocity dies away by itself.
+        decay_s: decay time τ, s, within which a velocity dies away by itself.
     """
 
     error: float
-    drive: float
-    fade: float
+    process_variance: float
+    decay_s: float
 
 
 @dataclass(frozen=True)
@@ -48,64 +49,69 @@ class Motion:
     """How an animal moves and how frames err; errors are over the predicted mean joint error.
 
     Attributes:
-        place_error: standard deviation of the joints' middle along the animal, to its side, and up.
-        place_drive: process variance of the middle in the level and up, lengths^2/s^3.
-        place_fade: decay time of the middle's velocity, s.
+        position_error: standard deviation of the joints' middle along the animal, to its side, and
+            up.
+        position_variance: process variance of the middle in the level and up, lengths^2/s^3.
+        position_decay_s: decay time of the middle's velocity, s.
         turn: the base's rotation about its own x, y and z axis.
         bend: the other joints' angles about their own x, y and z axis.
         size: the logarithm of the bones' scale.
-        freedom: degrees of freedom of the t distribution of errors.
-        reject: gate, in predicted errors: a measurement farther off the curve is no measurement at
+        degrees_of_freedom: degrees of freedom of the t distribution of errors.
+        gate: gate, in predicted errors: a measurement farther off the curve is no measurement at
             all.
-        lasting: correlated share, the share of an error that neighbouring frames have in common and
+        correlated_share: correlated share, the share of an error that neighbouring frames have in
+            common and
             no smoother takes away.
-        honest: calibration factors of the error, pairs (error over length, factor) in rising order,
+        calibration: calibration factors of the error, pairs (error over length, factor) in rising
+            order,
             interpolated in the logarithm of the former: the error that is observed over the
             posterior's, beside what a wrong size does.
         stretch: what the share by which distances from the base may be off (see `Subject`) grows
             with: how far the body lies from the depth seen, over its length, and the standard
             deviation of the logarithm of the size that single frames estimate.
         usual_stretch: that share in a session of which neither is known.
-        honest_root: calibration factors of the root's rotation about (3) and position along (3) its
+        root_calibration: calibration factors of the root's rotation about (3) and position along
+            (3) its
             own axes, over what that leaves.
-        honest_bend: calibration factors of the other joints' angles about their x, y and z axis,
+        bend_calibration: calibration factors of the other joints' angles about their x, y and z
+            axis,
             likewise.
     """
 
-    place_error: tuple[float, float, float]
-    place_drive: tuple[float, float]
-    place_fade: float
-    turn: tuple[Wandering, Wandering, Wandering]
-    bend: tuple[Wandering, Wandering, Wandering]
-    size: Wandering
-    freedom: float
-    reject: float
-    lasting: float
-    honest: tuple[tuple[float, float], ...]
+    position_error: tuple[float, float, float]
+    position_variance: tuple[float, float]
+    position_decay_s: float
+    turn: tuple[OrnsteinUhlenbeck, OrnsteinUhlenbeck, OrnsteinUhlenbeck]
+    bend: tuple[OrnsteinUhlenbeck, OrnsteinUhlenbeck, OrnsteinUhlenbeck]
+    size: OrnsteinUhlenbeck
+    degrees_of_freedom: float
+    gate: float
+    correlated_share: float
+    calibration: tuple[tuple[float, float], ...]
     stretch: tuple[float, float] = (0.0, 0.0)
     usual_stretch: float = 0.0
-    honest_root: tuple[float, float, float, float, float, float] = (1.0,) * 6
-    honest_bend: tuple[float, float, float] = (1.0,) * 3
+    root_calibration: tuple[float, float, float, float, float, float] = (1.0,) * 6
+    bend_calibration: tuple[float, float, float] = (1.0,) * 3
 
     @property
     def packed(self) -> kernels.Moves:
         """The parameters as arrays for the numba kernels, level process variance twice, then up."""
 
-        def rows(*moves: Wandering) -> Array:
+        def rows(*moves: OrnsteinUhlenbeck) -> Array:
             """One row (error, drive, fade) for each of the moves given, (k, 3)."""
-            return np.array([[m.error, m.drive, m.fade] for m in moves])
+            return np.array([[m.error, m.process_variance, m.decay_s] for m in moves])
 
-        level, up = self.place_drive
+        level, up = self.position_variance
         return kernels.Moves(
-            np.array(self.place_error),
+            np.array(self.position_error),
             np.array([level, level, up]),
-            self.place_fade,
+            self.position_decay_s,
             rows(*self.turn),
             rows(*self.bend),
             rows(self.size)[0],
-            self.freedom,
-            self.reject,
-            self.lasting,
+            self.degrees_of_freedom,
+            self.gate,
+            self.correlated_share,
         )
 
 
@@ -200,7 +206,7 @@ def smooth(
     return _curve(seconds, error_mm, length_mm, motion, made, spread, used)
 
 
-def body_of(skeleton: Skeleton, length_mm: float) -> kernels.Body:
+def body_of(skeleton: Skeleton, length_mm: float) -> kernels.KinematicTree:
     """A skeleton as arrays for the numba kernels.
 
     Args:
@@ -211,7 +217,7 @@ def body_of(skeleton: Skeleton, length_mm: float) -> kernels.Body:
         The arrays, with the (m, 2) joint and axis of each free angle beyond the base.
     """
     free = np.argwhere(skeleton.axes)
-    return kernels.Body(
+    return kernels.KinematicTree(
         skeleton.parents,
         skeleton.offsets,
         skeleton.rest,
@@ -232,24 +238,26 @@ def _curve(
     used: NDArray[np.bool_],
 ) -> Curve:
     """The kernels' output as a `Curve`: posterior and correlated share, calibrated."""
-    lasting = motion.lasting * np.interp(seconds, seconds[used], error_mm[used])
+    correlated_share = motion.correlated_share * np.interp(seconds, seconds[used], error_mm[used])
     middle = np.trace(spread.middle, axis1=1, axis2=2)
-    place = np.array(motion.place_error)
+    place = np.array(motion.position_error)
     moves = motion.packed
     # of a frame's predicted error, what the middle's errors and what the bends' are of it
     relative = 0.5 * middle / (place**2).sum()
     relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2
-    cov_middle = spread.middle + (place**2).mean() * np.eye(3) * lasting[:, None, None] ** 2
+    cov_middle = (
+        spread.middle + (place**2).mean() * np.eye(3) * correlated_share[:, None, None] ** 2
+    )
     turn, bend = (
-        np.sqrt(left + (group[:, 0] * lasting[:, None] / length_mm) ** 2)
+        np.sqrt(left + (group[:, 0] * correlated_share[:, None] / length_mm) ** 2)
         for left, group in ((spread.turn, moves.turn), (spread.bend, moves.bend))
     )
     pose = Pose(SE3(made.rotation, made.place), made.angles, np.exp(made.log_scale))
-    error = np.sqrt(lasting**2 + relative)
-    honest = np.interp(
+    error = np.sqrt(correlated_share**2 + relative)
+    calibration = np.interp(
         np.log(error / length_mm),
-        *np.array([(np.log(said), factor) for said, factor in motion.honest]).T,
+        *np.array([(np.log(said), factor) for said, factor in motion.calibration]).T,
     )
-    each = honest[:, None]
+    each = calibration[:, None]
     cov_middle *= each[:, None] ** 2
-    return Curve(pose, made.joints, honest * error, cov_middle, each * turn, each * bend, used)
+    return Curve(pose, made.joints, calibration * error, cov_middle, each * turn, each * bend, used)

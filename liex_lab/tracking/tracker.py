@@ -21,7 +21,7 @@ from liex_lab.foreground.height_maps import Foreground
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.memory import Room
 from liex_lab.runtime.threads import threads
-from liex_lab.tracking.motion_model import Tuning
+from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import Subject, single_frames, track_whole
@@ -142,7 +142,7 @@ class FrameTracker:
     @property
     def stretch_sd(self) -> float:
         """Standard deviation of the share by which lengths may be off, see `Subject`."""
-        per_blur, per_spread = Tuning.of(self.estimator.skeleton.name).motion.stretch
+        per_blur, per_spread = TrackingParameters.of(self.estimator.skeleton.name).motion.stretch
         return float(np.hypot(per_blur * self.blur, per_spread * self.size_spread))
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:

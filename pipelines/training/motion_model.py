@@ -5,7 +5,8 @@ seeds, frame by frame once. Three fits follow on these observations:
 
 - If asked for, a random search (hill climbing): up to three numbers of association and motion are
   multiplied by log-normal factors, sd 0.5, and kept where the tracks come nearer to the truth.
-- Calibration factors of the joints (`honest`) at three levels of the stated error, by bisection,
+- Calibration factors of the joints (`calibration`) at three levels of the stated error, by
+  bisection,
   together with the standard deviation of the body's stretch over a grid of two coefficients, so
   that nine errors in ten lie within the 90 % interval, in all sequences and in each of them.
 - The same factors for the root's six coordinates and for the bend angles about three axes.
@@ -33,7 +34,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation.corruptions import Event
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.tracking_sequences import tracking_sequence
-from liex_lab.tracking.motion_model import Tuning, tunings_with
+from liex_lab.tracking.motion_model import TrackingParameters, tunings_with
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.offline import Subject, single_frames, stretch_of, track_whole
 from liex_lab.tracking.track import Track
@@ -57,12 +58,12 @@ _PER_BLUR = np.arange(0.0, 6.5, 0.5)
 _PER_SPREAD = np.arange(0.0, 3.5, 0.5)
 _FOUND_OTHERWISE = (
     "ceiling",
-    "lasting",
-    "honest",
+    "correlated_share",
+    "calibration",
     "stretch",
     "usual_stretch",
-    "honest_root",
-    "honest_bend",
+    "root_calibration",
+    "bend_calibration",
 )
 _CHUNK = 32
 
@@ -138,7 +139,9 @@ def train_tracking(
         for kind, usual in SEEDS.items()
         for seed in seeds or usual
     ]
-    tuning = search(measured, Tuning.of(animal), n_tries, np.random.default_rng(0), progress)
+    tuning = search(
+        measured, TrackingParameters.of(animal), n_tries, np.random.default_rng(0), progress
+    )
     tuning = honest_about_roots(measured, honest_about_joints(measured, tuning))
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
     return out
@@ -188,11 +191,11 @@ def measure(
 
 def search(
     measured: Sequence[Seen],
-    tuning: Tuning,
+    tuning: TrackingParameters,
     n_tries: int,
     rng: np.random.Generator,
     progress: Progress = silent,
-) -> Tuning:
+) -> TrackingParameters:
     """The best tuning of a random search; a step changes up to three numbers of the best so far.
 
     Args:
@@ -219,7 +222,7 @@ def search(
     return tuning
 
 
-def changed(tuning: Tuning, rng: np.random.Generator) -> Tuning:
+def changed(tuning: TrackingParameters, rng: np.random.Generator) -> TrackingParameters:
     """The same tuning with one number multiplied by a log-normal factor, sd of the logarithm 0.5.
 
     Numbers that have a fit of their own (`_FOUND_OTHERWISE`, such as the calibration factors) stay.
@@ -251,7 +254,7 @@ def _scaled(value: Any, factor: float, rng: np.random.Generator) -> Any:
     return replace(value, **{name: getattr(value, name) * factor})
 
 
-def _of_kind(measured: Sequence[Seen], kind: str, tuning: Tuning | None) -> Array:
+def _of_kind(measured: Sequence[Seen], kind: str, tuning: TrackingParameters | None) -> Array:
     """Errors over all sequences of a kind: of single frames without a tuning."""
     found = []
     for each in measured:
@@ -262,11 +265,11 @@ def _of_kind(measured: Sequence[Seen], kind: str, tuning: Tuning | None) -> Arra
     return np.concatenate(found)
 
 
-def _track(each: Seen, tuning: Tuning | None) -> Track:
+def _track(each: Seen, tuning: TrackingParameters | None) -> Track:
     return track_whole(each.subject, each.seen, (), tuning).track
 
 
-def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: Tuning) -> float:
+def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: TrackingParameters) -> float:
     """Cost of a tuning: its errors over those of single frames, in four statistics.
 
     The ratios of mean, median, 75 % and 95 % quantile are summed, those of easy sequences with a
@@ -282,7 +285,7 @@ def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: Tuning) -> 
     return total
 
 
-def with_motion(tuning: Tuning, **changes: Any) -> Tuning:
+def with_motion(tuning: TrackingParameters, **changes: Any) -> TrackingParameters:
     """The same tuning with some numbers of its motion replaced.
 
     Args:
@@ -330,7 +333,7 @@ class _Claim:
         return np.asarray(self.off / sd[..., None])
 
 
-def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
+def honest_about_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
     """The same tuning with factors and stretch by which the joints' 90 % intervals hold 90 %.
 
     Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
@@ -339,9 +342,9 @@ def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
 
     Args:
         measured: the sequences.
-        tuning: what is changed: `honest`, `stretch` and `usual_stretch` of its motion.
+        tuning: what is changed: `calibration`, `stretch` and `usual_stretch` of its motion.
     """
-    plain = with_motion(tuning, honest=((1.0, 1.0),), stretch=(0.0, 0.0), usual_stretch=0.0)
+    plain = with_motion(tuning, calibration=((1.0, 1.0),), stretch=(0.0, 0.0), usual_stretch=0.0)
     claims = [_claim(each, plain) for each in measured]
     best = (0.0, 0.0)
     least = np.inf
@@ -355,11 +358,11 @@ def honest_about_joints(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
             least = apart
     usual = float(np.median([claim.stretch_sd(*best) for claim in claims]))
     return with_motion(
-        tuning, honest=honesty(claims, best), stretch=best, usual_stretch=round(usual, 4)
+        tuning, calibration=honesty(claims, best), stretch=best, usual_stretch=round(usual, 4)
     )
 
 
-def _claim(each: Seen, plain: Tuning) -> _Claim:
+def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
     """Stated and true errors of a sequence tracked with factors of 1 and no stretch."""
     length = each.subject.length_mm
     track = _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain)
@@ -376,7 +379,8 @@ def _claim(each: Seen, plain: Tuning) -> _Claim:
 
 
 def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
-    """Calibration factors at three levels of the stated error, by bisection; see `Motion.honest`.
+    """Calibration factors at three levels of the stated error, by bisection; see
+    `Motion.calibration`.
 
     The frames are cut into `_BINS` groups of equal size by their stated error. In each the factor f
     is sought at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
@@ -409,7 +413,7 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     return tuple(knots)
 
 
-def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
+def honest_about_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
     """The same tuning with factors by which 90 % intervals of root and bends hold 90 %.
 
     The root's error is the twist log(g_est^-1 g_true), rotation and then translation in its own
@@ -417,9 +421,9 @@ def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
 
     Args:
         measured: the sequences.
-        tuning: what is changed: `honest_root` (6,) and `honest_bend` (3,) of its motion.
+        tuning: what is changed: `root_calibration` (6,) and `bend_calibration` (3,) of its motion.
     """
-    plain = with_motion(tuning, honest_root=(1.0,) * 6, honest_bend=(1.0,) * 3)
+    plain = with_motion(tuning, root_calibration=(1.0,) * 6, bend_calibration=(1.0,) * 3)
     roots = []
     bends = []
     for each in measured:
@@ -442,7 +446,7 @@ def honest_about_roots(measured: Sequence[Seen], tuning: Tuning) -> Tuning:
     bend = [
         round(_nine_in_ten(z[:, moves[:, a], a]), 3) if moves[:, a].any() else 1.0 for a in range(3)
     ]
-    return with_motion(tuning, honest_root=tuple(root), honest_bend=tuple(bend))
+    return with_motion(tuning, root_calibration=tuple(root), bend_calibration=tuple(bend))
 
 
 def _nine_in_ten(z: Array) -> float:

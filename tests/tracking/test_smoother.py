@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from liex_lab.body._kernels import exp_so3
 from liex_lab.geometry import so3
+from liex_lab.geometry._so3_kernels import exp_so3, log_so3
 from liex_lab.tracking import _kalman_kernels as kernels
 
 TIMES = np.cumsum([0.0, 0.03, 0.03, 0.1, 0.03, 0.03, 0.2, 0.03, 0.03])
@@ -31,7 +31,7 @@ def smoothed(times, y, r, q):
     """A value's smoothed curve, rates and variances by the kernels."""
     how, after = gains(times, r, q)
     out, rate = np.zeros((2, len(times)))
-    kernels.run_vector(y, np.isfinite(r), *how, out, rate)
+    kernels.smooth_values(y, np.isfinite(r), *how, out, rate)
     return out, rate, after
 
 
@@ -91,7 +91,7 @@ def test_places_that_are_measured_better_in_one_direction_agree_with_all_states_
     known = np.ones(len(TIMES), bool)
     known[[3, 6]] = False
     out, spread = np.zeros(y.shape), np.zeros(r.shape)
-    kernels.run_place(TIMES, y, r, known, 0, q, FADE, out, spread)
+    kernels.smooth_positions(TIMES, y, r, known, 0, q, FADE, out, spread)
     r[~known] = np.inf
     value, _, covariance = by_least_squares(TIMES, y, r, q)
     np.testing.assert_allclose(
@@ -108,7 +108,7 @@ def test_a_long_curve_of_places_stays_sound():
         np.tile(np.diag([0.2, 0.01, 0.1]), (n, 1, 1)),
     )
     out, spread = np.zeros(y.shape), np.zeros(r.shape)
-    kernels.run_place(
+    kernels.smooth_positions(
         0.02 * np.arange(n), y, r, np.ones(n, bool), 0, np.full(3, 1e5), 0.3, out, spread
     )
     assert np.abs(out - y).max() < 3.0
@@ -126,7 +126,7 @@ def test_rotations_about_one_axis_are_smoothed_as_their_angles_are():
     (start, keep, go, forward, back), _ = gains(TIMES, r, 5.0)
     each = [np.stack([values] * 3) for values in (keep, go, forward, back)]
     turned, rate = np.zeros(y.shape), np.zeros((len(y), 3))
-    kernels.run_rotations(y, np.isfinite(r), start, *each, turned, rate)
+    kernels.smooth_rotations(y, np.isfinite(r), start, *each, turned, rate)
     np.testing.assert_allclose(turned, so3.exp(out[:, None] * axis), atol=1e-9)
 
 
@@ -134,8 +134,8 @@ def test_rotations_about_one_axis_are_smoothed_as_their_angles_are():
 def test_the_scalar_exponential_and_logarithm_are_those_of_the_geometry(angle):
     w = angle * np.array([2.0, -1.0, 2.0]) / 3.0
     rotation, back = np.zeros((3, 3)), np.zeros(3)
-    exp_so3(w, rotation)
+    exp_so3(w[0], w[1], w[2], rotation)
     np.testing.assert_allclose(rotation, so3.exp(w), atol=1e-14)
-    kernels.log_so3(rotation, back)
+    log_so3(rotation, back)
     np.testing.assert_allclose(so3.exp(back), rotation, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(back), angle, atol=1e-7)

@@ -19,7 +19,7 @@ from liex_lab.pipelines.training.motion_model import (
 
 from liex_lab.geometry import so3
 from liex_lab.simulation.corruptions import Event
-from liex_lab.tracking.motion_model import Tuning
+from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.offline import track_whole
 from tests.tracking.stories import MOUSE, SUBJECT, noisy, told, walk
 
@@ -40,7 +40,7 @@ def measured() -> list[Seen]:
     return made
 
 
-def error(measured: list[Seen], tuning: Tuning) -> float:
+def error(measured: list[Seen], tuning: TrackingParameters) -> float:
     tracks = [track_whole(each.subject, each.seen, (), tuning).track for each in measured]
     return float(
         np.mean(
@@ -61,24 +61,24 @@ def flat(value: object) -> list[float]:
 
 
 def test_one_number_is_changed_at_a_time_and_none_of_those_that_are_found_otherwise():
-    rng, tuning = np.random.default_rng(0), Tuning.of("mouse")
+    rng, tuning = np.random.default_rng(0), TrackingParameters.of("mouse")
     for _ in range(60):
         other = changed(tuning, rng)
         before, after = flat(asdict(tuning)), flat(asdict(other))
         assert sum(a != b for a, b in zip(before, after, strict=True)) == 1
-        assert other.motion.honest == tuning.motion.honest
+        assert other.motion.calibration == tuning.motion.calibration
         assert other.chain.ceiling == tuning.chain.ceiling
 
 
 def test_a_search_mends_what_was_set_wrong(measured):
-    good = Tuning.of("mouse")
-    bad = replace(good, motion=replace(good.motion, reject=0.6))
+    good = TrackingParameters.of("mouse")
+    bad = replace(good, motion=replace(good.motion, gate=0.6))
     found = search(measured, bad, 40, np.random.default_rng(3))
     assert error(measured, found) < 0.9 * error(measured, bad)
     assert search(measured, good, 0, np.random.default_rng(3)) == good
 
 
-def covered(measured: list[Seen], tuning: Tuning) -> list[float]:
+def covered(measured: list[Seen], tuning: TrackingParameters) -> list[float]:
     """Of each sequence the share of joint coordinates within their 90 % intervals."""
     shares, (per_blur, per_spread) = [], tuning.motion.stretch
     for each in measured:
@@ -93,9 +93,11 @@ def covered(measured: list[Seen], tuning: Tuning) -> list[float]:
 
 
 def test_an_honest_track_covers_nine_in_ten(measured):
-    wrong = replace(Tuning.of("mouse").motion, honest=((0.03, 0.3),))
-    tuning = honest_about_joints(measured, Tuning(Tuning.of("mouse").chain, wrong))
-    knots = tuning.motion.honest
+    wrong = replace(TrackingParameters.of("mouse").motion, calibration=((0.03, 0.3),))
+    tuning = honest_about_joints(
+        measured, TrackingParameters(TrackingParameters.of("mouse").chain, wrong)
+    )
+    knots = tuning.motion.calibration
     assert [said for said, _ in knots] == sorted(said for said, _ in knots)
     assert 0.85 < np.mean(covered(measured, tuning)) < 0.96
 
@@ -109,9 +111,9 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
         sequences.append(
             replace(each, pose=pose, truth=truth, size_spread=0.0 if size == 1.0 else spread)
         )
-    tuning = honest_about_joints(sequences, Tuning.of("mouse"))
+    tuning = honest_about_joints(sequences, TrackingParameters.of("mouse"))
     alike = honest_about_joints(
-        [replace(each, size_spread=0.0) for each in sequences], Tuning.of("mouse")
+        [replace(each, size_spread=0.0) for each in sequences], TrackingParameters.of("mouse")
     )
     assert tuning.motion.stretch[1] > 0
     assert alike.motion.stretch == (0.0, 0.0), "what tells nothing is not used"
@@ -130,7 +132,7 @@ def test_the_table_is_the_same_on_one_thread_and_on_two(tmp_path):
 
 
 def test_roots_and_bends_are_covered_as_well(measured):
-    tuning = honest_about_roots(measured, Tuning.of("mouse"))
+    tuning = honest_about_roots(measured, TrackingParameters.of("mouse"))
     turned, placed, bent = [], [], []
     for each in measured:
         track = track_whole(each.subject, each.seen, (), tuning).track
