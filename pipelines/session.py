@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.plan import Plan
-from liex_lab.runtime.memory import Room, give_back
+from liex_lab.runtime.memory import Allocator, trim_heap
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import ahead, meanwhile
+from liex_lab.runtime.threads import in_background, prefetch
 
 from .build import (
     build_estimator,
@@ -94,7 +94,7 @@ def measure_session(
 
     started = time.perf_counter()
     with (
-        meanwhile(partial(build_estimator, plan)) as estimator,
+        in_background(partial(build_estimator, plan)) as estimator,
         build_recording(recording, plan, progress) as opened,
     ):
         folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
@@ -136,7 +136,7 @@ def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], No
     Rendered recordings are not read ahead, as rendering takes all cores.
     """
     chunks = opened.chunks(CHUNK, first)
-    yield from chunks if opened.format == "synthetic" else ahead(chunks)
+    yield from chunks if opened.format == "synthetic" else prefetch(chunks)
 
 
 def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
@@ -149,7 +149,7 @@ def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
     from liex_lab.tracking.observations import Observations
 
     whole = writer.seen(Observations)
-    writer.take(tracker.track(whole, room=writer.room), whole, tracker.subject)
+    writer.take(tracker.track(whole, allocate=writer.allocate), whole, tracker.subject)
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
@@ -161,15 +161,15 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
         timings: seconds of `prepare` and `track`, for session.json.
     """
     rows = writer.rows
-    behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.room)
+    behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.allocate)
     writer.note(**notes)
-    rows.track.rest()
-    give_back()
+    rows.track.release_pages()
+    trim_heap()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
 def measure_behaviour(
-    rows: Rows, plan: Plan, origin: Provenance, room: Room = np.empty
+    rows: Rows, plan: Plan, origin: Provenance, allocate: Allocator = np.empty
 ) -> tuple[Behaviour, dict[str, Any]]:
     """The behaviour of a track as the plan names it, and notes on the recogniser for session.json.
 
@@ -177,28 +177,28 @@ def measure_behaviour(
         rows: the track as table rows.
         plan: rules and action model.
         origin: skeleton, arena, zones and water.
-        room: allocator of large arrays, such as one of files on disk.
+        allocate: allocator of large arrays, such as one of files on disk.
     """
     from liex_lab.behaviour.summary import measure_rows
 
     recogniser = build_recogniser(plan, origin.skeleton)
-    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, room)
-    rows.track.rest()
-    give_back()
+    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, allocate)
+    rows.track.release_pages()
+    trim_heap()
     return measure_rows(
-        rows, build_rules(plan), build_surroundings(origin), room=room, **named
+        rows, build_rules(plan), build_surroundings(origin), allocate=allocate, **named
     ), notes
 
 
 def name_actions(
-    recogniser: TimelineModel, rows: Rows, room: Room = np.empty
+    recogniser: TimelineModel, rows: Rows, allocate: Allocator = np.empty
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The ethogram of a track by a recogniser, and notes for session.json.
 
     Args:
         recogniser: names the frames.
         rows: the track as table rows, with the distance of the animal from the nearest wall, mm.
-        room: allocator of large arrays.
+        allocate: allocator of large arrays.
 
     Returns:
         `bouts` and the definitions of `actions`, as `behaviour.measure` takes them; and notes:
@@ -207,7 +207,7 @@ def name_actions(
     from liex_lab.tables.rows import bout_rows
 
     frames = rows.frames_table(_NAMED_BY)
-    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), room)
+    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), allocate)
     notes = {
         "action_model": {
             "skeleton": recogniser.skeleton,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import VIEWS, Skeleton
-from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def channel_names(skeleton: Skeleton) -> list[str]:
 
 
 def stretches_of(
-    track: Track, rate_hz: float, wall_mm: Array | None = None, room: Room = np.empty
+    track: Track, rate_hz: float, wall_mm: Array | None = None, allocate: Allocator = np.empty
 ) -> list[Segment]:
     """The channels of a track, one unbroken segment after the other.
 
@@ -91,7 +91,7 @@ def stretches_of(
         track: one animal's track.
         rate_hz: ticks a second.
         wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
-        room: allocator of the channels.
+        allocate: allocator of the channels.
 
     Returns:
         The segments in order of time; none where no pose was measured.
@@ -109,7 +109,13 @@ def stretches_of(
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
     return [
         _stretch(
-            track, rows, time_s, wall, (length_mm, usual_mm), _clock(time_s[rows], rate_hz), room
+            track,
+            rows,
+            time_s,
+            wall,
+            (length_mm, usual_mm),
+            _clock(time_s[rows], rate_hz),
+            allocate,
         )
         for rows in np.split(good, cuts)
     ]
@@ -145,7 +151,7 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
     for some in blocks(len(good), _PIECE):
         axis[some] = track.joints_mm[good[some], front] - track.joints_mm[good[some], rear]
         axis[some] /= np.maximum(np.linalg.norm(axis[some], axis=1, keepdims=True), 1e-9)
-        track.rest()
+        track.release_pages()
     np.cumsum(axis, axis=0, out=total[1:])
     times = time_s[good]
     against = np.empty(len(good), np.bool_)
@@ -244,7 +250,7 @@ def _stretch(
     wall: Array,
     units_mm: tuple[float, float],
     clock: Array,
-    room: Room,
+    allocate: Allocator,
 ) -> Segment:
     """The channels of an unbroken segment, one piece after the other.
 
@@ -256,19 +262,19 @@ def _stretch(
     steep = np.empty(m, np.bool_)
     for piece in blocks(m, _PIECE):
         heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
-        track.rest()
+        track.release_pages()
     heading = np.unwrap(heading)
     # a body that stands upright has no heading: it keeps the last one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
-    values = room((m, len(channel_names(track.skeleton))), np.float64)
+    values = allocate((m, len(channel_names(track.skeleton))), np.float64)
     step = clock[1] - clock[0]
     for piece in blocks(m, _PIECE):
         # a channel looks two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
         channels = _channels(track.skeleton, units_mm, step, heading[around], *found.at(around))
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
-        track.rest()
-        let_go(values)
+        track.release_pages()
+        release_pages(values)
     return Segment(clock, values)
 
 

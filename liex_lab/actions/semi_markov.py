@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions import _semi_markov_kernels as kernels
-from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 
 Array = NDArray[np.float64]
 
@@ -75,13 +75,15 @@ class SemiMarkovModel:
             switch = np.maximum(np.log(self.follow), -1e30)
         return np.concatenate([[0], np.cumsum(least)]), np.log(go), np.log1p(-go), switch
 
-    def decode(self, scores: Array, step_s: float, room: Room = np.empty) -> NDArray[np.int64]:
+    def decode(
+        self, scores: Array, step_s: float, allocate: Allocator = np.empty
+    ) -> NDArray[np.int64]:
         """The most probable sequence of words (Viterbi).
 
         Args:
             scores: (m, K) log scores of each tick.
             step_s: step of the clock, s.
-            room: allocator of the back-pointers, (m, K) twice.
+            allocate: allocator of the back-pointers, (m, K) twice.
 
         Returns:
             (m,) int64 index of the word of every tick.
@@ -90,15 +92,15 @@ class SemiMarkovModel:
         terms = self._terms(step_s)
         value = np.empty(terms[0][-1])
         label = np.zeros(len(scores), np.int64)
-        came_from = room(scores.shape, np.int16)
-        stayed = room(scores.shape, np.bool_)
+        came_from = allocate(scores.shape, np.int16)
+        stayed = allocate(scores.shape, np.bool_)
         for ticks in blocks(len(scores), _PIECE):
             kernels.go_on(ticks.start, ticks.stop, scores, *terms, value, came_from, stayed)
-            let_go(scores, came_from, stayed)
+            release_pages(scores, came_from, stayed)
         kernels.trace_back(terms[0], value, came_from, stayed, label)
         return label
 
-    def probabilities(self, scores: Array, step_s: float, room: Room = np.empty) -> Array:
+    def probabilities(self, scores: Array, step_s: float, allocate: Allocator = np.empty) -> Array:
         """The posterior of each word at every tick (forward-backward).
 
         Ticks are worked out 8192 at a time, each piece given 512 more on either side instead of all
@@ -107,12 +109,12 @@ class SemiMarkovModel:
         Args:
             scores: (m, K) log scores of each tick.
             step_s: step of the clock, s.
-            room: allocator of the result.
+            allocate: allocator of the result.
 
         Returns:
             (m, K) probabilities, rows sum to 1.
         """
-        out = room(scores.shape, float)
+        out = allocate(scores.shape, float)
         terms = self._terms(step_s)
         for ticks in blocks(len(scores), _PIECE):
             low = max(0, ticks.start - _MARGIN)
@@ -120,5 +122,5 @@ class SemiMarkovModel:
             piece = np.empty((high - low, scores.shape[1]))
             kernels.probabilities(np.ascontiguousarray(scores[low:high]), *terms, piece)
             out[ticks] = piece[ticks.start - low : ticks.stop - low]
-            let_go(scores, out)
+            release_pages(scores, out)
         return out

@@ -28,7 +28,7 @@ from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.mlp import Network
-from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ class TimelineModel:
                 Segment(stretch.times_s[low:high], stretch.values[low:high]), names
             )
             features = features[ticks.start - low : ticks.stop - low]
-            let_go(stretch.values)
+            release_pages(stretch.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
             now = speed[ticks, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (
@@ -116,7 +116,7 @@ class TimelineModel:
             yield ticks, np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
 
     def scores(
-        self, stretch: Segment, names: Sequence[str], speed: Array, room: Room = np.empty
+        self, stretch: Segment, names: Sequence[str], speed: Array, allocate: Allocator = np.empty
     ) -> Array:
         """Log scores for the semi-Markov model: what a tick says beyond how frequent each word is.
 
@@ -124,46 +124,46 @@ class TimelineModel:
             stretch: channels of an unbroken segment of m ticks.
             names: of its channels.
             speed: (m,) `steady_speed` of the segment.
-            room: allocator of the result.
+            allocate: allocator of the result.
 
         Returns:
             (m, K) sharpness times (log probability less log prior).
         """
-        scores = room((len(stretch.times_s), len(self.words)), float)
+        scores = allocate((len(stretch.times_s), len(self.words)), float)
         for ticks, log_p in self.log_probabilities(stretch, names, speed):
             scores[ticks] = self.sharpness * (log_p - np.log(np.maximum(self.share, 1e-3)))
-            let_go(scores)
+            release_pages(scores)
         return scores
 
     def recognise(
-        self, track: Track, wall_mm: Array | None = None, room: Room = np.empty
+        self, track: Track, wall_mm: Array | None = None, allocate: Allocator = np.empty
     ) -> Recognised:
         """The ethogram of a track, and the probability of each word in each of its frames.
 
         Args:
             track: one animal's track of n frames.
             wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
-            room: allocator of large intermediate arrays and of the probabilities.
+            allocate: allocator of large intermediate arrays and of the probabilities.
 
         Returns:
             Ethogram, probabilities, and what the frame rate cannot resolve.
         """
         n = track.n_frames
-        probability = room((n, len(self.words)), float)
+        probability = allocate((n, len(self.words)), float)
         score = np.zeros(n)
         code = np.full(n, self.words.index(UNLABELLED))
         part = np.full(n, -1)
         for rows in blocks(n, _PIECE):
             probability[rows] = np.nan
-            let_go(probability)
+            release_pages(probability)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         step = 1.0 / self.clock_hz
-        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, room)):
+        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, allocate)):
             speed = steady_speed(stretch, names)
-            scores = self.scores(stretch, names, speed, room)
-            decoded = self._decode(scores, speed, room)
-            certain = self.chain.probabilities(scores, step, room)
+            scores = self.scores(stretch, names, speed, allocate)
+            decoded = self._decode(scores, speed, allocate)
+            certain = self.chain.probabilities(scores, step, allocate)
             begin = stretch.times_s[0]
             first, last = np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step])
             for piece in blocks(last - first, _PIECE):
@@ -176,27 +176,27 @@ class TimelineModel:
                 probability[rows] = told
                 part[rows] = number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
-                let_go(certain, probability)
+                release_pages(certain, probability)
         ethogram = Ethogram.of_words(
             code, track.times_ns, self.definitions, score, part, names=self.words
         )
         return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
 
-    def _decode(self, scores: Array, speed: Array, room: Room) -> NDArray[np.int64]:
+    def _decode(self, scores: Array, speed: Array, allocate: Allocator) -> NDArray[np.int64]:
         """The most probable words (m,) of bouts that reach the speed their word asks for.
 
         Scores (m, K) of bouts that never do are lowered in place and decoded again, at most six
         times.
         """
         for _ in range(_MOST_DECODED):
-            decoded = self.chain.decode(scores, 1.0 / self.clock_hz, room)
+            decoded = self.chain.decode(scores, 1.0 / self.clock_hz, allocate)
             starts, stops, words = runs_of(decoded)
             wrong = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
             if not wrong.any():
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
                 scores[start:stop, word] -= _REFUSED
-            let_go(scores)
+            release_pages(scores)
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:

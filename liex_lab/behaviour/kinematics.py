@@ -23,7 +23,7 @@ from liex_lab.behaviour.body import BodyAxis
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
-from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 from liex_lab.tables.rows import gap_follows, median_step, stop_times
 from liex_lab.tables.schema import to_pandas
 from liex_lab.tracking.track import Track
@@ -139,7 +139,7 @@ def kinematics(
     half_window_s: float = HALF_WINDOW_S,
     impossible_above_mm_s: float = IMPOSSIBLE_MM_S,
     surface_z_mm: float | None = None,
-    room: Room = np.empty,
+    allocate: Allocator = np.empty,
 ) -> pd.DataFrame:
     """The table `kinematics` of one animal: one row per frame, rates with standard deviations.
 
@@ -150,7 +150,7 @@ def kinematics(
         impossible_above_mm_s: a faster speed is a tracking error and left empty, mm/s.
         surface_z_mm: height of the water's surface above the floor, mm, for an animal that swims;
             None where it is not known.
-        room: makes the arrays of the columns (an allocator, as `np.empty`).
+        allocate: makes the arrays of the columns (an allocator, as `np.empty`).
 
     Returns:
         The columns of `kinematics_columns`: mm, s and rad in the arena frame, NaN where nothing is
@@ -158,16 +158,16 @@ def kinematics(
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = BodyAxis.of(joints.names)
-    shape, heights = _frame_by_frame(body, joints, room)
+    shape, heights = _frame_by_frame(body, joints, allocate)
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
     spans = Spans.of(time_s, observed, half_window_s)
     block: dict[str, Any] = {
-        name: _put_away(frames[name], room) for name in ("frame_index", "time_s", "dt_s")
+        name: _put_away(frames[name], allocate) for name in ("frame_index", "time_s", "dt_s")
     }
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
     block |= _moving(
-        shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, room
+        shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, allocate
     )
     block |= {
         "length_mm": shape.length_mm,
@@ -180,25 +180,27 @@ def kinematics(
     return to_pandas(kinematics_columns(body.swims), block, copy=False)
 
 
-def _frame_by_frame(body: BodyAxis, joints: Joints, room: Room) -> tuple[Shape, dict[str, Array]]:
+def _frame_by_frame(
+    body: BodyAxis, joints: Joints, allocate: Allocator
+) -> tuple[Shape, dict[str, Array]]:
     """What each frame tells by itself, and of an animal that stands its heights, block by block."""
-    shape = Shape.empty(joints.n_frames, room)
-    heights = {} if body.swims else {name: room((joints.n_frames,), float) for name in _HEIGHTS}
+    shape = Shape.empty(joints.n_frames, allocate)
+    heights = {} if body.swims else {name: allocate((joints.n_frames,), float) for name in _HEIGHTS}
     for rows in blocks(joints.n_frames, _BLOCK):
         xyz, sd = joints.at(rows)
         shape.put(rows, Posture.of(body, xyz, sd))
         if not body.swims:
             _put(heights, rows, _walking(body, xyz, sd))
-        shape.rest()
-        let_go(*heights.values())
+        shape.release_pages()
+        release_pages(*heights.values())
     return shape, heights
 
 
-def _put_away(column: pd.Series[Any], room: Room) -> NDArray[Any]:
+def _put_away(column: pd.Series[Any], allocate: Allocator) -> NDArray[Any]:
     """A copy (n,) of a column in an array of the allocator."""
-    values = room((len(column),), column.dtype)
+    values = allocate((len(column),), column.dtype)
     values[:] = column.to_numpy()
-    let_go(values)
+    release_pages(values)
     return values
 
 
@@ -209,10 +211,15 @@ def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> No
 
 
 def _moving(
-    shape: Shape, swims: bool, spans: Spans, hold_s: Array, impossible_above_mm_s: float, room: Room
+    shape: Shape,
+    swims: bool,
+    spans: Spans,
+    hold_s: Array,
+    impossible_above_mm_s: float,
+    allocate: Allocator,
 ) -> dict[str, Array]:
     """Position, speed and turning of the whole body; hold_s (n,) is how long a frame counts, s."""
-    columns = {name: room((len(hold_s),), float) for name in _MOVING}
+    columns = {name: allocate((len(hold_s),), float) for name in _MOVING}
     speed, speed_sd, heading, heading_sd = (
         columns[name] for name in ("speed_mm_s", "speed_sd_mm_s", "heading_rad", "heading_sd_rad")
     )
@@ -239,8 +246,8 @@ def _moving(
                 "body_pitch_sd_rad": shape.pitch_sd_rad[rows],
             },
         )
-        shape.rest()
-        let_go(*columns.values())
+        shape.release_pages()
+        release_pages(*columns.values())
     for rows in blocks(len(hold_s), _BLOCK):  # now that those of the neighbours are known
         here = spans[rows]
         _put(
@@ -253,7 +260,7 @@ def _moving(
                 "yaw_rate_sd_rad_s": here.sd(heading_sd),
             },
         )
-        let_go(*columns.values())
+        release_pages(*columns.values())
     return columns
 
 
@@ -346,7 +353,7 @@ class Joints:
             part = track[rows]
             xyz = np.where(part.bridged[:, None, None], np.nan, part.joints_mm)
             sd = part.sd_mm.copy()
-            track.rest()
+            track.release_pages()
             return _apart(list(np.moveaxis(xyz, -1, 0))), sd
 
         return Joints(list(track.skeleton.names), track.n_frames, at)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import BodyAxis
-from liex_lab.runtime.memory import Room, let_go
+from liex_lab.runtime.memory import Allocator, release_pages
 
 Array = NDArray[np.float64]
 
@@ -205,23 +205,23 @@ class Shape:
     rear_sd_mm: Array
 
     @staticmethod
-    def empty(n: int, room: Room = np.empty) -> Shape:
+    def empty(n: int, allocate: Allocator = np.empty) -> Shape:
         """Columns for n frames, filled with NaN.
 
         Args:
             n: number of frames.
-            room: makes the arrays of the columns (an allocator, as `np.empty`).
+            allocate: makes the arrays of the columns (an allocator, as `np.empty`).
         """
         more = {"centre": (n, 3), "thirds_rad": (n, 3)}
-        shape = Shape(*(room(more.get(one.name, (n,)), float) for one in fields(Shape)))
+        shape = Shape(*(allocate(more.get(one.name, (n,)), float) for one in fields(Shape)))
         for column in vars(shape).values():
             column[:] = np.nan
-            let_go(column)
+            release_pages(column)
         return shape
 
-    def rest(self) -> None:
+    def release_pages(self) -> None:
         """Release the memory of columns that lie on disk, until they are looked at again."""
-        let_go(*vars(self).values())
+        release_pages(*vars(self).values())
 
     def put(self, rows: slice, posture: Posture) -> None:
         """Write the measures of a posture into some frames.

@@ -29,9 +29,9 @@ from liex_lab.behaviour.places import (
 )
 from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
 from liex_lab.behaviour.transitions import transitions
-from liex_lab.runtime.memory import Room
+from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import GAPS, empty_table, let_table_go, to_pandas
+from liex_lab.tables.schema import GAPS, empty_table, release_table, to_pandas
 
 if TYPE_CHECKING:
     from liex_lab.tables.rows import Rows
@@ -104,7 +104,7 @@ def measure(
     *,
     bouts: pd.DataFrame | None = None,
     actions: Mapping[str, str] | None = None,
-    room: Room = np.empty,
+    allocate: Allocator = np.empty,
 ) -> Behaviour:
     """The behaviour tables of one animal from its poses.
 
@@ -118,7 +118,7 @@ def measure(
             rules'.
         actions: its vocabulary, word -> definition; None takes the rules'. Words that occur in no
             vocabulary are added without a definition.
-        room: makes the arrays of the table `kinematics` (an allocator, as `np.empty`).
+        allocate: makes the arrays of the table `kinematics` (an allocator, as `np.empty`).
     """
     rules = rules or MouseRules()
     around = around or Surroundings()
@@ -128,16 +128,16 @@ def measure(
         rules.speed_half_window_s,
         rules.impossible_above_mm_s,
         around.surface_z_mm,
-        room,
+        allocate,
     )
     named = find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved)
     actions = dict(rules.definitions() if actions is None else actions)
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), "tail_angle_rad" in moved)
     gaps = empty_table(GAPS) if gaps is None else gaps
-    let_table_go(moved)
+    release_table(moved)
     summary = summarise(frames, moved, named, words, around)
-    let_table_go(moved)
+    release_table(moved)
     behaviour = Behaviour(
         moved,
         named,
@@ -149,7 +149,7 @@ def measure(
         words,
         actions,
     )
-    let_table_go(moved)
+    release_table(moved)
     return behaviour
 
 

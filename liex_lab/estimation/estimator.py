@@ -501,14 +501,14 @@ class PoseEstimator:
             picked = corrected(picked, self.model, images, size)
             if self.model.settler is None or not len(scores):
                 return picked
-            settled = RidgeCorrection(self.skeleton, self.model.settler).settle(
+            ridge = RidgeCorrection(self.skeleton, self.model.settler).correct(
                 picked.pose, images, size
             )
         return replace(
             picked,
-            pose=settled.pose,
-            told_scale=size * np.exp(settled.grown),
-            told_trust=settled.clear,
+            pose=ridge.pose,
+            told_scale=size * np.exp(ridge.grown),
+            told_trust=ridge.clear,
         )
 
     def _is_animal(

@@ -103,7 +103,7 @@ class RidgeCorrection:
         # are
         return RidgeCorrection(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
-    def settle(self, pose: Pose, images: ImageSet, size: float) -> CorrectedRidge:
+    def correct(self, pose: Pose, images: ImageSet, size: float) -> CorrectedRidge:
         """Correct poses, and estimate the animal's size from each of them.
 
         Args:

@@ -65,7 +65,7 @@ def locate(blocks, labels, tip, size, intrinsics, found):
     fingers = np.zeros(3)
     slot = labels[int(tip[1]), int(tip[2])]
     point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
-    _settle(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
+    _mean_shift(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
     around = AROUND_MM * size
     focal2 = intrinsics[0] * intrinsics[1]
     cut = -1e9
@@ -187,7 +187,7 @@ def _along(p, middle, fingers):
 
 
 @njit(cache=True)
-def _settle(blocks, labels, slot, radius, intrinsics, middle):
+def _mean_shift(blocks, labels, slot, radius, intrinsics, middle):
     """One step of mean shift: `middle` (3,) moves to the mean of what is within `radius` mm."""
     p = np.empty(3)
     box = np.empty(4, np.int64)

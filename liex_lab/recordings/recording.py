@@ -117,7 +117,8 @@ class Recording:
             raise RecordingError(f"{name} holds no frame; a recording has at least one")
         if not np.all(np.diff(self.times_ns) > 0):
             raise RecordingError(
-                f"the time stamps of {name} do not increase strictly; pass them through `settle`"
+                f"the time stamps of {name} do not increase strictly; pass them through "
+                "`make_monotone`"
             )
         self.times_ns.flags.writeable = False
         # at the latest when nobody holds the recording any more, or the program ends

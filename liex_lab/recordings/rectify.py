@@ -116,10 +116,10 @@ def straight_camera(camera: Camera) -> Camera:
             straight.project(camera.unproject(edge, 1.0))[:, axis] for edge in (before, after)
         )
         most = _MAX_GROWTH * size[axis]
-        room = [
+        bounds = [
             np.where(np.isfinite(off), off, most).max() for off in (-low, high - size[axis] + 1.0)
         ]
-        start, stop = (int(np.ceil(min(max(value, 0.0), most))) for value in room)
+        start, stop = (int(np.ceil(min(max(value, 0.0), most))) for value in bounds)
         grown.append((start, stop + -(size[axis] + start + stop) % 4))
     (left, right), (top, bottom) = grown
     return replace(

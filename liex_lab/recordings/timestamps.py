@@ -61,7 +61,7 @@ class Gap:
     reason: str = DROPPED
 
 
-FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `Settled.faults` counts
+FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `MonotoneTimes.faults` counts
 # their places in it
 _REPEATED = 1
 _OUT_OF_ORDER = 2
@@ -69,7 +69,7 @@ _JUMPED = 3
 
 
 @dataclass(frozen=True)
-class Settled:
+class MonotoneTimes:
     """Time stamps made strictly increasing.
 
     Attributes:
@@ -134,7 +134,7 @@ def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> lis
     Args:
         times_ns: (n,) int64 stamps, ns, after they were made to increase.
         step_ns: the median step, ns, for the end of the last frame.
-        faults: (n,) uint8 index into `FAULTS`, as in `Settled.faults`.
+        faults: (n,) uint8 index into `FAULTS`, as in `MonotoneTimes.faults`.
 
     Returns:
         One interval for every frame with a fault, in order.
@@ -159,7 +159,7 @@ def from_rate(n_frames: int, fps: float) -> Times:
     return np.round(np.arange(n_frames) * (1e9 / fps)).astype(np.int64)
 
 
-def settle(times_ns: Times) -> Settled:
+def make_monotone(times_ns: Times) -> MonotoneTimes:
     """Make stamps strictly increasing by moving as few as possible; frames stay in file order.
 
     A clock that was set back, or wrapped around, while frames went on coming is continued from
@@ -175,7 +175,7 @@ def settle(times_ns: Times) -> Settled:
         The stamps, which of them were moved and why, and a sentence about it.
     """
     if np.all(np.diff(times_ns) > 0):
-        return Settled(times_ns, np.zeros(len(times_ns), np.uint8), None)
+        return MonotoneTimes(times_ns, np.zeros(len(times_ns), np.uint8), None)
     joined, jumps = _join_clocks(times_ns)
     times = _fewest_moved(joined)
     moved = times != joined
@@ -202,7 +202,7 @@ def settle(times_ns: Times) -> Settled:
             "of order; frames were kept in file order and these stamps spread between their "
             f"neighbours, moved by {largest_ms:.3f} ms at most"
         )
-    return Settled(times, faults.astype(np.uint8), "; ".join(sentences))
+    return MonotoneTimes(times, faults.astype(np.uint8), "; ".join(sentences))
 
 
 def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
@@ -247,18 +247,18 @@ def _fewest_moved(times_ns: Times) -> Times:
     # decrease.
     slack = times_ns - np.arange(len(times_ns), dtype=np.int64)
     keep = _first_of_equal(times_ns, slack, _longest_nondecreasing(slack.tolist()))
-    settled = times_ns.copy()
+    monotone = times_ns.copy()
     kept = times_ns[keep]
     step = min(median_step(kept) or 1, _LONGEST_STEP_NS)
-    settled[: keep[0]] = int(kept[0]) - step * np.arange(int(keep[0]), 0, -1)
-    settled[keep[-1] + 1 :] = int(kept[-1]) + step * np.arange(1, len(times_ns) - int(keep[-1]))
+    monotone[: keep[0]] = int(kept[0]) - step * np.arange(int(keep[0]), 0, -1)
+    monotone[keep[-1] + 1 :] = int(kept[-1]) + step * np.arange(1, len(times_ns) - int(keep[-1]))
     for n in np.flatnonzero(np.diff(keep) > 1):
         i = int(keep[n])
         j = int(keep[n + 1])
         start = int(kept[n])
         stop = int(kept[n + 1])
-        settled[i + 1 : j] = [start + (stop - start) * k // (j - i) for k in range(1, j - i)]
-    return settled
+        monotone[i + 1 : j] = [start + (stop - start) * k // (j - i) for k in range(1, j - i)]
+    return monotone
 
 
 def _first_of_equal(times_ns: Times, slack: Times, keep: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 _ZEROS = 1 << 20  # bytes written at once
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-Room = Callable[
+Allocator = Callable[
     [tuple[int, ...], Any], NDArray[Any]
 ]  # shape and dtype -> an array to be filled, as np.empty
 
@@ -46,7 +46,7 @@ def peak_memory_mb() -> float | None:
     return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def give_back() -> None:
+def trim_heap() -> None:
     """Trim the heap: hand memory that is not used any more back to the system.
 
     It would be kept for later otherwise: glibc keeps what lies between arrays still in use, and
@@ -62,7 +62,7 @@ def give_back() -> None:
             trim(0)
 
 
-def on_disk(folder: Path) -> Room:
+def on_disk(folder: Path) -> Allocator:
     """An array allocator whose arrays lie in nameless files and go with their last user.
 
     In memory where files of that disk cannot be mapped, as on some shares. Making an array raises
@@ -75,7 +75,7 @@ def on_disk(folder: Path) -> Room:
         A function of shape and dtype that gives an array to be filled, as np.empty.
     """
 
-    def room(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    def allocate(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
         """An array of this shape and dtype in a nameless file; OSError where the disk is full."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if not size:
@@ -93,7 +93,7 @@ def on_disk(folder: Path) -> Room:
                 raise
             return np.empty(shape, dtype)
 
-    return room
+    return allocate
 
 
 def _reserve(file: IO[bytes], size: int) -> None:
@@ -116,7 +116,7 @@ def blocks(n: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, n)) for start in range(0, n, size))
 
 
-def let_go(*arrays: NDArray[Any]) -> None:
+def release_pages(*arrays: NDArray[Any]) -> None:
     """Release the pages of arrays that are mapped from files; they are read again when wanted.
 
     Only for what is shared with its file (`on_disk`) or never written to: changes of a private copy

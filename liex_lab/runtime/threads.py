@@ -10,7 +10,7 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 
-def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
+def prefetch(items: Iterable[Item]) -> Generator[Item, None, None]:
     """Prefetch: the same items, each made by a thread while the one before it is used.
 
     What goes wrong while an item is made is raised in its turn.
@@ -34,7 +34,7 @@ def ahead(items: Iterable[Item]) -> Generator[Item, None, None]:
 
 
 @contextmanager
-def meanwhile(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
+def in_background(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
     """Run one function in the background, on a thread of its own, while the block runs.
 
     A block that ends before is not held up.

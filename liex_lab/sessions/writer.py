@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.memory import Room, give_back, on_disk, peak_memory_mb
+from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, trim_heap
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER, corrected_folder
@@ -201,7 +201,7 @@ class SessionWriter:
         ):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [to_millimetres(frame.depth) for frame in frames[part]]
-            self._settle(_BEHIND)
+            self._drain(_BEHIND)
             replay, messages = (self._loggers[log] for log in LOGS)
             self._logging.append(replay.submit(self._replay.add, index[part], times[part], depth))
             self._logging.append(messages.submit(self._mcap.add, times[part], depth))
@@ -227,7 +227,7 @@ class SessionWriter:
             *(values for name, values in kept.items() if name not in (INDEX, TIMES)),
         )
 
-    def _settle(self, behind: int = 0) -> None:
+    def _drain(self, behind: int = 0) -> None:
         """Wait until the logs are at most so many batches behind; what went wrong is raised
         here.
         """
@@ -242,7 +242,7 @@ class SessionWriter:
         """A checkpoint: everything so far need not be done again. Only what `seen` was given for
         can go on.
         """
-        self._settle()
+        self._drain()
         sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
         if len(self._checkpoint.seen) == len(self._index):
             self._checkpoint.save(
@@ -250,7 +250,7 @@ class SessionWriter:
             )
 
     @property
-    def room(self) -> Room:
+    def allocate(self) -> Allocator:
         """Allocator of arrays on the session's disk.
 
         A track of hours may lie there until the session is whole.
@@ -285,10 +285,10 @@ class SessionWriter:
         """
         self.track = tracked.track
         self._flips = tracked.flips
-        give_back()  # hours of recording leave much behind
+        trim_heap()  # hours of recording leave much behind
         self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
-        seen.rest()
+        seen.release_pages()
 
     @property
     def rows(self) -> Rows:
@@ -356,7 +356,7 @@ class SessionWriter:
                 "the recording holds no frame, so there is no session to write; see `liex doctor`"
             )
         began = time.perf_counter()
-        self._settle()
+        self._drain()
         if self._checkpoint.state.n_frames:  # it took long: what follows may be interrupted, too
             self._take_down()
         rows = self.rows
@@ -370,9 +370,9 @@ class SessionWriter:
         kinematics = results.setdefault("kinematics", rows_only(rows))
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
-        rows.track.rest()
+        rows.track.release_pages()
         of_track.write_measured(self._folder, results, columns)
-        give_back()
+        trim_heap()
         words = [
             *(actions or {}),
             *sorted({str(word) for word in bouts["action"]} - set(actions or {})),
@@ -391,8 +391,8 @@ class SessionWriter:
         self._document.update(self._account(of_track, dict(timings_s or {})))
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
-        rows.track.rest()
-        give_back()
+        rows.track.release_pages()
+        trim_heap()
         try:
             if self._report is not None:
                 self._report(self._folder)

@@ -180,7 +180,7 @@ def _passing(
 
 def beside_animal(
     rng: np.random.Generator,
-    stage: SimulatedScene,
+    scene: SimulatedScene,
     joints: Array,
     length_mm: float,
     kinds: tuple[str, ...],
@@ -192,7 +192,7 @@ def beside_animal(
 
     Args:
         rng: source of randomness.
-        stage: the scene with its walls.
+        scene: the scene with its walls.
         joints: (n, J, 3) of the animal over the event, mm, arena frame.
         length_mm: of the animal, mm.
         kinds: of objects to choose from, see `objects.draw_thing`.
@@ -210,7 +210,7 @@ def beside_animal(
         free = np.linalg.norm(way - place, axis=1).min() - reach
         cost = (
             abs(free - 0.5 * length_mm)
-            + max(0.0, reach - float(stage.room(place)))
+            + max(0.0, reach - float(scene.wall_clearance(place)))
             + 50.0 * (free < 0)
         )
         if cost < best_cost:

@@ -101,9 +101,9 @@ class FishSpecies:
         rotation = root_rotation(rng.uniform(-np.pi, np.pi, n), np.radians(pitch), np.radians(roll))
         pose = hung(self.skeleton, draw_bends(rng, self.skeleton, kind), rotation, size)
         low, high = clearance(self.skeleton, pose, shape, size)
-        room = np.maximum(camera_mm - _NEAREST_MM - high, low + 1.0)
+        headroom = np.maximum(camera_mm - _NEAREST_MM - high, low + 1.0)
         at = np.where(rng.random(n) < _FLOOR_SHARE, rng.uniform(0.0, 0.06, n), rng.random(n))
-        pose.root.translation[:, 2] += low + at * (room - low) + rng.uniform(0.5, 2.0, n)
+        pose.root.translation[:, 2] += low + at * (headroom - low) + rng.uniform(0.5, 2.0, n)
         return Postures(pose, size, kind)
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:

@@ -137,8 +137,8 @@ class GenericSpecies:
                 self.skeleton, angles, root_rotation(heading, tilt[0], 0.6 * tilt[1]), size
             )
             low, high = self._extent(pose, shape, size)
-            room = np.maximum(_NEAR_SHARE * camera_mm - high, -low + 1.0)
-            pose.root.translation[:, 2] += -low + rng.random(n) * (room + low)
+            headroom = np.maximum(_NEAR_SHARE * camera_mm - high, -low + 1.0)
+            pose.root.translation[:, 2] += -low + rng.random(n) * (headroom + low)
             return Postures(pose, size, np.zeros(n, np.int64))
         pose = self._fallen(rng, angles, heading, size)
         low, _ = self._extent(pose, shape, size)
@@ -229,7 +229,7 @@ def moving_session(
     seed: int | list[int],
     n_frames: int,
     *,
-    habits: GenericSpecies,
+    species: GenericSpecies,
     sensor: Sensor | None = None,
     family: str = "train",
     noise: float = 1.0,
@@ -245,8 +245,8 @@ def moving_session(
 
     Args:
         seed: or seeds, that everything is drawn from.
-        n_frames: length of the recording, at the rate of `habits.frame_ns`.
-        habits: the species.
+        n_frames: length of the recording, at the rate of `species.frame_ns`.
+        species: the species.
         sensor: the camera's make; None is the last of the species'.
         family: of body shapes, see `vary_body`.
         noise: multiplies the sensor's random errors and its rate of holes.
@@ -259,14 +259,16 @@ def moving_session(
         The recording with its truth.
     """
     rng = np.random.default_rng(seed)
-    skeleton = habits.skeleton
-    sensor = sensor or habits.sensors[-1]
+    skeleton = species.skeleton
+    sensor = sensor or species.sensors[-1]
     length = (
-        skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+        skeleton.length * float(rng.uniform(*species.sizes))
+        if spine_mm is None
+        else float(spine_mm)
     )
-    stage = SimulatedScene.draw(rng, sensor.camera, length, habits.setting)
-    shape = habits.shapes(rng, family, 1)
-    step_s = habits.frame_ns * 1e-9
+    scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
+    shape = species.shapes(rng, family, 1)
+    step_s = species.frame_ns * 1e-9
     size = np.full(n_frames, length / skeleton.length)
     slow = _CHANGE_S / step_s
     change = np.maximum.accumulate(
@@ -279,21 +281,32 @@ def moving_session(
     level = np.zeros(n_frames)
     body = shape[0].broadcast(n_frames)
     flat = _centred(skeleton, angles, root_rotation(level, level, level), size)
-    low, high = habits._extent(flat, body, size)
+    low, high = species._extent(flat, body, size)
     top = (
-        _NEAR_SHARE * float(stage.T_arena_camera.translation[2]) - float(high.max())
-        if habits.floats
+        _NEAR_SHARE * float(scene.T_arena_camera.translation[2]) - float(high.max())
+        if species.floats
         else 0.0
     )
     water = (-float(low.min()) + 1.0, max(top, -float(low.min()) + 1.0))
-    position, heading = wander(rng, stage, length, speed, turning, level, water, step_s)
+    position, heading = wander(rng, scene, length, speed, turning, level, water, step_s)
     pose = _centred(skeleton, angles, root_rotation(heading, level, level), size)
     pose.root.translation[:] += position
-    if not habits.floats:
+    if not species.floats:
         pose.root.translation[:, 2] -= position[:, 2] + low
-    cast = assemble(
-        rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False
+    contents = assemble(
+        rng,
+        scene,
+        sensor,
+        species,
+        length,
+        shape,
+        pose,
+        size,
+        noise,
+        erosion_px,
+        thing_share,
+        False,
     )
     return SyntheticSession(
-        name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+        name, scene, contents, np.arange(n_frames, dtype=np.int64) * species.frame_ns
     )

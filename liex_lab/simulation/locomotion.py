@@ -63,7 +63,7 @@ def walking_session(
     erosion_px: int = 0,
     thing_share: float = 0.0,
     spine_mm: float | None = None,
-    habits: MouseSpecies | None = None,
+    species: MouseSpecies | None = None,
     name: str = "walking",
 ) -> SyntheticSession:
     """A recording of one mouse that goes about at 30 frames/s, drawn from the seed.
@@ -77,23 +77,25 @@ def walking_session(
         erosion_px: pixels stripped off the animal's outline.
         thing_share: of the frames with a distractor in view.
         spine_mm: length of the animal, mm; None draws it.
-        habits: the species; None the preset mouse.
+        species: the species; None the preset mouse.
         name: of the recording.
 
     Returns:
         The recording with its truth.
     """
     rng = np.random.default_rng(seed)
-    habits = MouseSpecies() if habits is None else habits
-    skeleton = habits.skeleton
+    species = MouseSpecies() if species is None else species
+    skeleton = species.skeleton
     spine = (
-        skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+        skeleton.length * float(rng.uniform(*species.sizes))
+        if spine_mm is None
+        else float(spine_mm)
     )
-    stage = SimulatedScene.draw(rng, sensor.camera, spine)
-    shape = habits.shapes(rng, family, 1)
+    scene = SimulatedScene.draw(rng, sensor.camera, spine)
+    shape = species.shapes(rng, family, 1)
     kinds, spines_per_s = _walk_script(rng, n_frames)
     posture = _flow(rng, skeleton, shape[0].broadcast(n_frames), kinds)
-    position, heading = _path(rng, stage, spine, spines_per_s * spine)
+    position, heading = _path(rng, scene, spine, spines_per_s * spine)
     # the trunk sways with the stride
     phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
     posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [
@@ -111,12 +113,25 @@ def walking_session(
     )
     middle = pose.joints(skeleton)[..., :2].mean(axis=1)
     pose.root.translation[:, :2] += position - middle
-    cast = assemble(
-        rng, stage, sensor, habits, spine, shape, pose, girth, noise, erosion_px, thing_share, False
+    contents = assemble(
+        rng,
+        scene,
+        sensor,
+        species,
+        spine,
+        shape,
+        pose,
+        girth,
+        noise,
+        erosion_px,
+        thing_share,
+        False,
     )
-    assert cast.bends is not None  # mice have tails
-    cast.bends[:] = cast.bends[:1] + 4.0 * _smooth(rng.normal(0.0, 0.05, cast.bends.shape))
-    return SyntheticSession(name, stage, cast)
+    assert contents.bends is not None  # mice have tails
+    contents.bends[:] = contents.bends[:1] + 4.0 * _smooth(
+        rng.normal(0.0, 0.05, contents.bends.shape)
+    )
+    return SyntheticSession(name, scene, contents)
 
 
 def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
@@ -168,20 +183,20 @@ def _smooth(rows: Array) -> Array:
 
 
 def _path(
-    rng: np.random.Generator, stage: SimulatedScene, spine_mm: float, speed: Array
+    rng: np.random.Generator, scene: SimulatedScene, spine_mm: float, speed: Array
 ) -> tuple[Array, Array]:
     """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back
     before a wall.
     """
     n = len(speed)
-    camera = stage.camera
+    camera = scene.camera
     middle = floor_point(
         camera,
-        stage.T_arena_camera,
+        scene.T_arena_camera,
         np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]),
     )
-    home = stage.centre if stage.freedom(stage.centre) > stage.freedom(middle) else middle
-    margin = min(0.85 * spine_mm, 0.7 * stage.freedom(home))
+    home = scene.centre if scene.freedom(scene.centre) > scene.freedom(middle) else middle
+    margin = min(0.85 * spine_mm, 0.7 * scene.freedom(home))
     position = np.empty((n, 2))
     heading = np.empty(n)
     at = home + rng.normal(0.0, 0.2 * margin, 2)
@@ -191,12 +206,12 @@ def _path(
         rate = 0.93 * rate + rng.normal(0.0, 0.25)
         back = np.arctan2(home[1] - at[1], home[0] - at[0])
         away = (back - way + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (stage.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
+        close = np.clip(1.0 - (scene.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
         # it turns back faster the faster it goes, and stays within a mouse's turning rate
         pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
         way += np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
         step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
-        if stage.freedom(at + step) > margin or stage.freedom(at + step) > stage.freedom(at):
+        if scene.freedom(at + step) > margin or scene.freedom(at + step) > scene.freedom(at):
             at = at + step
         position[i] = at
         heading[i] = way
@@ -213,7 +228,7 @@ def swimming_session(
     erosion_px: int = 0,
     thing_share: float = 0.0,
     spine_mm: float | None = None,
-    habits: FishSpecies | None = None,
+    species: FishSpecies | None = None,
     name: str = "swimming",
 ) -> SyntheticSession:
     """A recording of one fish that swims in bouts at 50 frames/s, drawn from the seed.
@@ -227,21 +242,23 @@ def swimming_session(
         erosion_px: pixels stripped off the animal's outline.
         thing_share: of the frames with a distractor in view.
         spine_mm: length of the fish, mm; None draws it.
-        habits: the species; None the preset zebrafish.
+        species: the species; None the preset zebrafish.
         name: of the recording.
 
     Returns:
         The recording with its truth.
     """
     rng = np.random.default_rng(seed)
-    habits = FishSpecies() if habits is None else habits
-    skeleton = habits.skeleton
+    species = FishSpecies() if species is None else species
+    skeleton = species.skeleton
     length = (
-        skeleton.length * float(rng.uniform(*habits.sizes)) if spine_mm is None else float(spine_mm)
+        skeleton.length * float(rng.uniform(*species.sizes))
+        if spine_mm is None
+        else float(spine_mm)
     )
-    stage = SimulatedScene.draw(rng, sensor.camera, length, habits.setting)
-    shape = habits.shapes(rng, family, 1)
-    step_s = habits.frame_ns * 1e-9
+    scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
+    shape = species.shapes(rng, family, 1)
+    step_s = species.frame_ns * 1e-9
     speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
     middle = np.full(n_frames, 0.47)
     # a turn begins in front and leaves the body at the tail; the wave runs from head to tail
@@ -262,19 +279,30 @@ def swimming_session(
     level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
     low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
     top = max(
-        float(stage.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()),
+        float(scene.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()),
         float(low.max()) + 2.0,
     )
     position, heading = wander(
-        rng, stage, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s
+        rng, scene, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s
     )
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
-    cast = assemble(
-        rng, stage, sensor, habits, length, shape, pose, size, noise, erosion_px, thing_share, False
+    contents = assemble(
+        rng,
+        scene,
+        sensor,
+        species,
+        length,
+        shape,
+        pose,
+        size,
+        noise,
+        erosion_px,
+        thing_share,
+        False,
     )
     return SyntheticSession(
-        name, stage, cast, np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+        name, scene, contents, np.arange(n_frames, dtype=np.int64) * species.frame_ns
     )
 
 
@@ -317,7 +345,7 @@ def _swim_script(
 
 def wander(
     rng: np.random.Generator,
-    stage: SimulatedScene,
+    scene: SimulatedScene,
     length: float,
     speed: Array,
     turning: Array,
@@ -332,7 +360,7 @@ def wander(
 
     Args:
         rng: source of randomness.
-        stage: the scene with walls and camera.
+        scene: the scene with walls and camera.
         length: of the animal, mm.
         speed: (n,) body lengths/s.
         turning: (n,) rad/s, positive to the left.
@@ -344,14 +372,14 @@ def wander(
         Positions (n, 3) of the body's middle, mm, arena frame, and headings (n,) rad.
     """
     n = len(speed)
-    centre = stage.camera.unproject(
-        [(stage.camera.width - 1) / 2, (stage.camera.height - 1) / 2], 1.0
+    centre = scene.camera.unproject(
+        [(scene.camera.width - 1) / 2, (scene.camera.height - 1) / 2], 1.0
     )
-    ray = stage.T_arena_camera.rotation @ centre
+    ray = scene.T_arena_camera.rotation @ centre
     low, high = water
     z = rng.uniform(low, high)
     home = (
-        stage.T_arena_camera.translation + ray * (stage.T_arena_camera.translation[2] - z) / -ray[2]
+        scene.T_arena_camera.translation + ray * (scene.T_arena_camera.translation[2] - z) / -ray[2]
     )[:2]
     margin = 0.6 * length
     position = np.empty((n, 3))
@@ -361,12 +389,12 @@ def wander(
     for i in range(n):
         back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
         away = (back - way + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (stage.freedom(xy, z) - margin) / (0.8 * length), 0.0, 1.0)
+        close = np.clip(1.0 - (scene.freedom(xy, z) - margin) / (0.8 * length), 0.0, 1.0)
         way += (turning[i] + 8.0 * close * np.clip(away, -1.0, 1.0)) * step_s
         run = speed[i] * length * step_s
         step = run * np.cos(pitch[i]) * np.array([np.cos(way), np.sin(way)])
-        free = stage.freedom(xy + step, z)
-        if free > margin or free > stage.freedom(xy, z):
+        free = scene.freedom(xy + step, z)
+        if free > margin or free > scene.freedom(xy, z):
             xy = xy + step
         z = float(np.clip(z + run * np.sin(pitch[i]), low, high))
         position[i] = [*xy, z]

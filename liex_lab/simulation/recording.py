@@ -23,7 +23,7 @@ from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.simulation import _render_kernels as _stage
+from liex_lab.simulation import _render_kernels as _scene
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.objects import THING_FACES, draw_thing
 from liex_lab.simulation.scene import SimulatedScene, outline_of
@@ -114,45 +114,45 @@ class SyntheticSession(TrueRecording):
     """A virtual animal in a virtual arena, rendered on demand.
 
     Attributes:
-        stage: the still scene and its camera.
-        cast: what moves in it, and the sensor's errors.
+        scene: the still scene and its camera.
+        contents: what moves in it, and the sensor's errors.
         shape: the animal's body.
     """
 
     def __init__(
         self,
         name: str,
-        stage: SimulatedScene,
-        cast: FrameContents,
+        scene: SimulatedScene,
+        contents: FrameContents,
         times_ns: NDArray[np.int64] | None = None,
     ) -> None:
         """Put moving contents into a still scene.
 
         Args:
             name: of the recording.
-            stage: the still scene and its camera.
-            cast: what moves in it, n frames.
+            scene: the still scene and its camera.
+            contents: what moves in it, n frames.
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
-        n = len(cast.seeds)
+        n = len(contents.seeds)
         times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
         super().__init__(
-            name=name, format="synthetic", camera=stage.camera, times_ns=times, read=self._depth
+            name=name, format="synthetic", camera=scene.camera, times_ns=times, read=self._depth
         )
-        self.stage = stage
-        self.cast = cast
-        self.skeleton = cast.skeleton
-        self.surface = Surface.of(cast.skeleton)
-        self.shape = cast.shape
-        self.spine_mm = cast.spine_mm
-        self.T_arena_camera = stage.T_arena_camera
+        self.scene = scene
+        self.contents = contents
+        self.skeleton = contents.skeleton
+        self.surface = Surface.of(contents.skeleton)
+        self.shape = contents.shape
+        self.spine_mm = contents.spine_mm
+        self.T_arena_camera = scene.T_arena_camera
         normal = -self.T_arena_camera.rotation[2]
         self.floor = Floor.from_plane(
-            normal, float(self.T_arena_camera.translation[2]), stage.camera
+            normal, float(self.T_arena_camera.translation[2]), scene.camera
         )
-        self.pose = cast.pose.moved(self.T_arena_camera.inverse())
+        self.pose = contents.pose.moved(self.T_arena_camera.inverse())
         self.joints_camera = self.pose.joints(self.skeleton)
-        self.joints_arena = cast.pose.joints(self.skeleton)
+        self.joints_arena = contents.pose.joints(self.skeleton)
 
     def _depth(self, index: int) -> Depth:
         return self.depths(index, index + 1)[0]
@@ -167,34 +167,34 @@ class SyntheticSession(TrueRecording):
         Returns:
             (stop - start, H, W) float32 mm, 0 where unread.
         """
-        cast = self.cast
+        contents = self.contents
         part = slice(start, stop)
-        camera = self.stage.camera
+        camera = self.scene.camera
         pose = Pose(
-            SE3(cast.pose.root.rotation[part], cast.pose.root.translation[part]),
-            cast.pose.angles[part],
-            cast.pose.scale[part],
+            SE3(contents.pose.root.rotation[part], contents.pose.root.translation[part]),
+            contents.pose.angles[part],
+            contents.pose.scale[part],
         )
-        bends = None if cast.bends is None else cast.bends[part]
-        vertices = self.surface.vertices(pose, cast.shape, cast.girth[part], bends)
+        bends = None if contents.bends is None else contents.bends[part]
+        vertices = self.surface.vertices(pose, contents.shape, contents.girth[part], bends)
         out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
         T_camera_arena = self.T_arena_camera.inverse()
-        _stage.frames_parallel(
-            self.stage.still,
+        _scene.frames_parallel(
+            self.scene.still,
             vertices,
             self.surface.faces,
-            cast.things[part],
-            cast.thing_faces,
-            cast.shown[part],
+            contents.things[part],
+            contents.thing_faces,
+            contents.shown[part],
             np.ascontiguousarray(T_camera_arena.rotation),
             T_camera_arena.translation,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-            cast.parameters[part],
-            cast.seeds[part],
+            contents.parameters[part],
+            contents.seeds[part],
             NORMAL,
             out,
         )
-        unit = float(cast.parameters[0, UNIT])
+        unit = float(contents.parameters[0, UNIT])
         return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
@@ -225,7 +225,7 @@ class SyntheticSession(TrueRecording):
         erosion_px: int = 0,
         thing_share: float = 0.0,
         spine_mm: float | None = None,
-        habits: Species | None = None,
+        species: Species | None = None,
         name: str | None = None,
     ) -> SyntheticSession:
         """A session of independent postures and positions before one camera, drawn from the seed.
@@ -241,30 +241,30 @@ class SyntheticSession(TrueRecording):
             erosion_px: pixels stripped off the animal's outline, see `Sensor.draw`.
             thing_share: of the frames with a distractor in view.
             spine_mm: length of the animal, mm; None draws it.
-            habits: the species; None a mouse.
+            species: the species; None a mouse.
             name: of the recording; None takes one after the sensor.
 
         Returns:
             The session with its truth.
         """
         rng = np.random.default_rng(seed)
-        habits = MouseSpecies() if habits is None else habits
-        home = habits.skeleton.length
+        species = MouseSpecies() if species is None else species
+        home = species.skeleton.length
         sensor = (
-            habits.sensors[int(rng.integers(len(habits.sensors)))] if sensor is None else sensor
+            species.sensors[int(rng.integers(len(species.sensors)))] if sensor is None else sensor
         )
-        drawn = home * float(rng.uniform(*habits.sizes))
+        drawn = home * float(rng.uniform(*species.sizes))
         spine = drawn if spine_mm is None else float(spine_mm)
-        stage = SimulatedScene.draw(rng, sensor.camera, spine, habits.setting)
-        shape = habits.shapes(rng, family, 1)
+        scene = SimulatedScene.draw(rng, sensor.camera, spine, species.setting)
+        shape = species.shapes(rng, family, 1)
         size = np.full(n_frames, spine / home)
-        camera_mm = np.full(n_frames, stage.T_arena_camera.translation[2])
-        pose, girth, _ = habits.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
-        cast = assemble(
+        camera_mm = np.full(n_frames, scene.T_arena_camera.translation[2])
+        pose, girth, _ = species.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
+        contents = assemble(
             rng,
-            stage,
+            scene,
             sensor,
-            habits,
+            species,
             spine,
             shape,
             pose,
@@ -274,17 +274,17 @@ class SyntheticSession(TrueRecording):
             thing_share,
             True,
         )
-        times = np.arange(n_frames, dtype=np.int64) * habits.frame_ns
+        times = np.arange(n_frames, dtype=np.int64) * species.frame_ns
         return SyntheticSession(
-            name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", stage, cast, times
+            name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", scene, contents, times
         )
 
 
 def assemble(
     rng: np.random.Generator,
-    stage: SimulatedScene,
+    scene: SimulatedScene,
     sensor: Sensor,
-    habits: Species,
+    species: Species,
     spine_mm: float,
     shape: Body,
     pose: Pose,
@@ -298,9 +298,9 @@ def assemble(
 
     Args:
         rng: source of randomness.
-        stage: the still scene.
+        scene: the still scene.
         sensor: the camera's make, of which one unit is drawn.
-        habits: the species.
+        species: the species.
         spine_mm: length of the animal, mm.
         shape: its body, a batch of one.
         pose: (n) arena frame; the root translations are changed in place where `scatter` is set.
@@ -314,30 +314,30 @@ def assemble(
         What moves in front of the camera in n frames.
     """
     n = len(girth)
-    surface = Surface.of(habits.skeleton)
-    bends = habits.bends(rng, n)
+    surface = Surface.of(species.skeleton)
+    bends = species.bends(rng, n)
     vertices = surface.vertices(pose, shape[0], girth, bends)
     trunk = vertices[:, : surface.n_trunk_vertices]
     if scatter:
-        bottoms = trunk[..., 2].min(axis=1) if habits.floats else None
-        shift = stage.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
+        bottoms = trunk[..., 2].min(axis=1) if species.floats else None
+        shift = scene.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
         pose.root.translation[:, :2] += shift
         trunk[..., :2] += shift[:, None]
-    things, shown = _beside(rng, stage, trunk, spine_mm, thing_share, habits, sensor.stride)
+    things, shown = _beside(rng, scene, trunk, spine_mm, thing_share, species, sensor.stride)
     parameters = np.repeat(sensor.draw(rng, 1, shape.fur, noise, erosion_px), n, axis=0)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     return FrameContents(
-        habits.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds
+        species.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds
     )
 
 
 def _beside(
     rng: np.random.Generator,
-    stage: SimulatedScene,
+    scene: SimulatedScene,
     trunk: Array,
     spine_mm: float,
     share: float,
-    habits: Species,
+    species: Species,
     stride: int,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """One distractor for a session, at a free position of its own in every frame.
@@ -345,21 +345,21 @@ def _beside(
     Returns:
         Its meshes (n, V, 3) mm and where it is shown (n,).
     """
-    mesh = draw_thing(rng, str(rng.choice(habits.things)), spine_mm)
+    mesh = draw_thing(rng, str(rng.choice(species.things)), spine_mm)
     n = len(trunk)
     things = np.repeat(mesh[None], n, axis=0)
     shown = rng.random(n) < share
-    reach = 1.1 * stage.half
+    reach = 1.1 * scene.half
     for i in np.flatnonzero(shown):
         own = trunk[i, ::3, :2]
         for _ in range(40):
-            shift = stage.centre + rng.uniform(-1.0, 1.0, 2) * reach
+            shift = scene.centre + rng.uniform(-1.0, 1.0, 2) * reach
             outline = mesh[::3, :2] + shift
             gap = np.linalg.norm(outline[:, None] - own, axis=-1).min()
             # a hand reaches over the wall; anything else stands within
-            within = mesh[:, 2].max() > 0.6 * spine_mm or stage.room(shift) > 0
-            free = bool(gap > 8.0 * habits.setting.scale and within)
-            if free and not _covers(stage, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
+            within = mesh[:, 2].max() > 0.6 * spine_mm or scene.wall_clearance(shift) > 0
+            free = bool(gap > 8.0 * species.setting.scale and within)
+            if free and not _covers(scene, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
                 things[i, :, :2] += shift
                 break
         else:
@@ -367,11 +367,11 @@ def _beside(
     return things, shown
 
 
-def _covers(stage: SimulatedScene, thing: Array, trunk: Array, margin_px: float) -> bool:
+def _covers(scene: SimulatedScene, thing: Array, trunk: Array, margin_px: float) -> bool:
     """Whether the distractor and the animal overlap in the picture or nearly so."""
-    T_camera_arena = stage.T_arena_camera.inverse()
-    a = stage.camera.project(T_camera_arena @ thing)
-    b = stage.camera.project(T_camera_arena @ trunk)
+    T_camera_arena = scene.T_arena_camera.inverse()
+    a = scene.camera.project(T_camera_arena @ thing)
+    b = scene.camera.project(T_camera_arena @ trunk)
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
     around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()
@@ -382,7 +382,7 @@ def test_split(
     name: str,
     spine_mm: float | None = None,  # noqa: PT028
     n_sessions: int = N_SESSIONS,  # noqa: PT028
-    habits: Species | None = None,  # noqa: PT028
+    species: Species | None = None,  # noqa: PT028
     seed: int | None = None,  # noqa: PT028
 ) -> list[SyntheticSession]:
     """The sessions of a fixed split: 40 of 50 frames, as many from each sensor.
@@ -391,7 +391,7 @@ def test_split(
         name: 'clean', 'hard' or 'other-body', a key of `SPLITS`.
         spine_mm: length of every animal, mm; None draws it.
         n_sessions: takes only the first so many.
-        habits: the species; None a mouse.
+        species: the species; None a mouse.
         seed: another one makes recordings like those of the split, to develop on; None is the
             split's own.
 
@@ -404,17 +404,17 @@ def test_split(
     if name not in SPLITS:
         raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
     frozen, family, noise, erosion_px, thing_share = SPLITS[name]
-    habits = MouseSpecies() if habits is None else habits
+    species = MouseSpecies() if species is None else species
     return [
         SyntheticSession.draw(
             [frozen if seed is None else seed, k],
-            sensor=(sensor := habits.sensors[k % len(habits.sensors)]),
+            sensor=(sensor := species.sensors[k % len(species.sensors)]),
             family=family,
             noise=noise,
             erosion_px=erosion_px * sensor.stride,
             thing_share=thing_share,
             spine_mm=spine_mm,
-            habits=habits,
+            species=species,
             name=f"{name}-{k:02d}",
         )
         for k in range(n_sessions)

@@ -118,7 +118,7 @@ class SimulatedScene:
         wall_mm = float(rng.uniform(low, min(high, 0.7 * height)))
         if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
-        stage = SimulatedScene(
+        scene = SimulatedScene(
             camera,
             T_arena_camera,
             kind,
@@ -129,7 +129,7 @@ class SimulatedScene:
             np.zeros((0, 2)),
             np.zeros((0, 0), np.float32),
         )
-        return stage._furnished(rng, spine_mm, setting)
+        return scene._furnished(rng, spine_mm, setting)
 
     def _furnished(
         self, rng: np.random.Generator, spine_mm: float, setting: SceneSpec
@@ -166,7 +166,7 @@ class SimulatedScene:
         s = np.sin(yaw)
         return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
 
-    def room(self, xy: Array) -> Array:
+    def wall_clearance(self, xy: Array) -> Array:
         """Signed distance of points of the floor from the walls, mm; negative outside.
 
         Args:
@@ -194,7 +194,7 @@ class SimulatedScene:
         p = self.T_arena_camera.inverse() @ np.array([xy[0], xy[1], z])
         uv = c.project(p)
         border = np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min() * p[2] / c.fx
-        free = min(float(self.room(xy)), float(border))
+        free = min(float(self.wall_clearance(xy)), float(border))
         if len(self.clutter):
             free = min(free, float(np.linalg.norm(self.clutter - xy, axis=1).min()))
         return free
@@ -214,12 +214,12 @@ class SimulatedScene:
         floor = height / fall
         ground = floor[..., None] * d[..., :2]
         raised = _unevenness(rng, ground, scale)
-        room = self.room(ground)
+        wall_clearance = self.wall_clearance(ground)
         # multiple reflections fill the corner between floor and wall
         corner = rng.uniform(0.0, 12.0) * scale
         spread = rng.uniform(6.0, 25.0) * scale
-        raised += corner * np.exp(-np.maximum(room, 0.0) / spread) * (self.wall_mm > 0)
-        inside = (room > 0) & (d[..., 2] < -1e-3)
+        raised += corner * np.exp(-np.maximum(wall_clearance, 0.0) / spread) * (self.wall_mm > 0)
+        inside = (wall_clearance > 0) & (d[..., 2] < -1e-3)
         depth = np.where(inside, floor - raised / fall, 0.0)
         wall = self._wall_distance(d)
         on_wall = ~inside & (wall > 0) & (height + wall * d[..., 2] < self.wall_mm)
@@ -275,7 +275,7 @@ class SimulatedScene:
         reach = float(self.half.max()) if self.wall_mm > 0 else 0.9 * float(self.half.max())
         aim = self.centre + rng.uniform(-reach, reach, (n, _TRIES, 2))
         points = outline[:, None] - middle[:, None, None] + aim[:, :, None]
-        room = self.room(points).min(axis=2) - _WALL_MM
+        wall_clearance = self.wall_clearance(points).min(axis=2) - _WALL_MM
         T_camera_arena = self.T_arena_camera.inverse()
         c = self.camera
         for height in (np.zeros(n) if bottoms is None else bottoms, tops):
@@ -285,16 +285,18 @@ class SimulatedScene:
                 np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3))
                 - _EDGE_PX
             )
-            room = np.minimum(room, border)
+            wall_clearance = np.minimum(wall_clearance, border)
         if len(self.clutter):
             gap = (
                 np.linalg.norm(points[:, :, :, None] - self.clutter[::7], axis=-1).min(axis=(2, 3))
                 - _CLUTTER_MM
             )
-            room = np.minimum(room, gap)
+            wall_clearance = np.minimum(wall_clearance, gap)
         # the first place with room enough, else the roomiest
         chosen = np.where(
-            (room > 0).any(axis=1), np.argmax(room > 0, axis=1), np.argmax(room, axis=1)
+            (wall_clearance > 0).any(axis=1),
+            np.argmax(wall_clearance > 0, axis=1),
+            np.argmax(wall_clearance, axis=1),
         )
         return aim[np.arange(n), chosen] - middle
 

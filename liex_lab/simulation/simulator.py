@@ -111,17 +111,17 @@ class BodySimulator:
     """Simulator of an animal that a `Species` describes: where it lives, its body, its postures.
 
     Attributes:
-        habits: the animal's species.
+        species: the animal's species.
         splits: names of the test splits.
     """
 
-    habits: Species
+    species: Species
     splits: tuple[str, ...] = tuple(synthetic.SPLITS)
 
     @property
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
-        return self.habits.skeleton
+        return self.species.skeleton
 
     @property
     def protocol(self) -> str:
@@ -149,7 +149,7 @@ class BodySimulator:
         Returns:
             An iterator of sets of patches, one a block.
         """
-        return windows.training_blocks(seed, n_blocks, self.habits, **settings)
+        return windows.training_blocks(seed, n_blocks, self.species, **settings)
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
@@ -167,7 +167,7 @@ class BodySimulator:
         Raises:
             LiexError: there is no split of this name.
         """
-        return synthetic.test_split(name, spine_mm, n_sessions, self.habits)
+        return synthetic.test_split(name, spine_mm, n_sessions, self.species)
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ class MouseSimulator(BodySimulator):
         Returns:
             The recording with its truth.
         """
-        assert isinstance(self.habits, MouseSpecies)
-        return locomotion.walking_session(seed, n_frames, habits=self.habits, **settings)
+        assert isinstance(self.species, MouseSpecies)
+        return locomotion.walking_session(seed, n_frames, species=self.species, **settings)
 
 
 @dataclass(frozen=True)
@@ -204,8 +204,8 @@ class FishSimulator(BodySimulator):
         Returns:
             The recording with its truth.
         """
-        assert isinstance(self.habits, FishSpecies)
-        return locomotion.swimming_session(seed, n_frames, habits=self.habits, **settings)
+        assert isinstance(self.species, FishSpecies)
+        return locomotion.swimming_session(seed, n_frames, species=self.species, **settings)
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,8 @@ class GenericSimulator(BodySimulator):
         Returns:
             The side, a multiple of 8 px.
         """
-        assert isinstance(self.habits, GenericSpecies)
-        return self.habits.window_px(length_mm)
+        assert isinstance(self.species, GenericSpecies)
+        return self.species.window_px(length_mm)
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
         """A recording of an animal that goes about and changes its posture; see `moving_session`.
@@ -235,8 +235,8 @@ class GenericSimulator(BodySimulator):
         Returns:
             The recording with its truth.
         """
-        assert isinstance(self.habits, GenericSpecies)
-        return generic.moving_session(seed, n_frames, habits=self.habits, **settings)
+        assert isinstance(self.species, GenericSpecies)
+        return generic.moving_session(seed, n_frames, species=self.species, **settings)
 
 
 def world_of(skeleton: Skeleton) -> Simulator:

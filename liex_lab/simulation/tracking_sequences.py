@@ -104,8 +104,10 @@ class TestSequence(TrueRecording):
         camera = self.camera
         middle = self.joints_camera.mean(axis=1)
         reach = 1.2 * self.spine_mm * camera.fx / middle[:, 2]
-        still = self.scene.stage.still if isinstance(self.scene, SyntheticSession) else None
-        self._loss.apply(depths, still, start, self.scene.cast.seeds, camera.project(middle), reach)
+        still = self.scene.scene.still if isinstance(self.scene, SyntheticSession) else None
+        self._loss.apply(
+            depths, still, start, self.scene.contents.seeds, camera.project(middle), reach
+        )
         return depths
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
@@ -203,7 +205,7 @@ def _setting(world: Simulator, sensor: Sensor | None) -> tuple[Sensor, int, bool
     if isinstance(world, HandSimulator):
         return sensor or NYU_SENSOR, FRAME_NS, True
     if isinstance(world, BodySimulator):
-        return sensor or world.habits.sensors[0], world.habits.frame_ns, world.habits.floats
+        return sensor or world.species.sensors[0], world.species.frame_ns, world.species.floats
     raise RecordingError(
         f"there are no test sequences of a {world.skeleton.name}; mouse, fish and hand have them"
     )
@@ -220,7 +222,7 @@ def _hands(
 ) -> tuple[HandSession, list[Event]]:
     """Some moments of a hand, with things before and beside it, and when it is hidden."""
     assert isinstance(base, HandSession)
-    cast = base.cast[rows]
+    contents = base.contents[rows]
     hidden = list[Event]()
     if events:
         arena = hazards.draw_things(
@@ -232,11 +234,14 @@ def _hands(
             hazards.beside_hand,
         )
         things = base.T_arena_camera.inverse() @ arena
-        cast = replace(
-            cast, thing=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES
+        contents = replace(
+            contents,
+            thing=things,
+            shown=np.ones(len(rows), np.bool_),
+            thing_faces=hazards.TWO_FACES,
         )
-        hidden = _hidden(base.camera, cast.hand, things, events)
-    return HandSession(title, base.skeleton, base.sensor, cast, times), hidden
+        hidden = _hidden(base.camera, contents.hand, things, events)
+    return HandSession(title, base.skeleton, base.sensor, contents, times), hidden
 
 
 def _animals(
@@ -251,13 +256,13 @@ def _animals(
     """As `_hands` of an animal."""
     assert isinstance(base, SyntheticSession)
     assert isinstance(world, BodySimulator)
-    cast = _taken(base.cast, rows)
-    stage = base.stage
-    habits = world.habits
+    contents = _taken(base.contents, rows)
+    scene = base.scene
+    species = world.species
     hidden = list[Event]()
 
     def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
-        return hazards.beside_animal(rng, stage, joints, length_mm, habits.things)
+        return hazards.beside_animal(rng, scene, joints, length_mm, species.things)
 
     if events:
         things = hazards.draw_things(
@@ -267,36 +272,39 @@ def _animals(
             base.joints_arena[rows],
             base.spine_mm,
             beside,
-            habits.floats,
+            species.floats,
         )
-        cast = replace(
-            cast, things=things, shown=np.ones(len(rows), np.bool_), thing_faces=hazards.TWO_FACES
+        contents = replace(
+            contents,
+            things=things,
+            shown=np.ones(len(rows), np.bool_),
+            thing_faces=hazards.TWO_FACES,
         )
         surface = Surface.of(base.skeleton)
         T_camera_arena = base.T_arena_camera.inverse()
-        body = surface.vertices(cast.pose, cast.shape, cast.girth, cast.bends)[
+        body = surface.vertices(contents.pose, contents.shape, contents.girth, contents.bends)[
             :, : surface.n_trunk_vertices
         ]
         hidden = _hidden(base.camera, T_camera_arena @ body, T_camera_arena @ things, events)
-    return SyntheticSession(title, stage, cast, times), hidden
+    return SyntheticSession(title, scene, contents, times), hidden
 
 
-def _taken(cast: FrameContents, rows: NDArray[np.int64]) -> FrameContents:
+def _taken(contents: FrameContents, rows: NDArray[np.int64]) -> FrameContents:
     """Some moments of what moves, in another order of time."""
     pose = Pose(
-        SE3(cast.pose.root.rotation[rows], cast.pose.root.translation[rows]),
-        cast.pose.angles[rows],
-        cast.pose.scale[rows],
+        SE3(contents.pose.root.rotation[rows], contents.pose.root.translation[rows]),
+        contents.pose.angles[rows],
+        contents.pose.scale[rows],
     )
     return replace(
-        cast,
+        contents,
         pose=pose,
-        girth=cast.girth[rows],
-        bends=None if cast.bends is None else cast.bends[rows],
-        things=cast.things[rows],
-        shown=cast.shown[rows],
-        parameters=cast.parameters[rows],
-        seeds=cast.seeds[rows],
+        girth=contents.girth[rows],
+        bends=None if contents.bends is None else contents.bends[rows],
+        things=contents.things[rows],
+        shown=contents.shown[rows],
+        parameters=contents.parameters[rows],
+        seeds=contents.seeds[rows],
     )
 
 

@@ -23,7 +23,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Body, Surface
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
-from liex_lab.simulation import _render_kernels as _stage
+from liex_lab.simulation import _render_kernels as _scene
 from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
 from liex_lab.simulation.objects import PART_FACES, rounded
 from liex_lab.simulation.scene import SceneSpec, draw_views
@@ -148,7 +148,7 @@ class _Views:
 def training_windows(
     seed: int,
     n: int,
-    habits: Species | None = None,
+    species: Species | None = None,
     *,
     family: str = "train",
     noise: float = 1.0,
@@ -163,7 +163,7 @@ def training_windows(
     Args:
         seed: of the whole set.
         n: how many patches; whole blocks are rendered and the last one is cut.
-        habits: the species; None a mouse.
+        species: the species; None a mouse.
         family: of body shapes, one of `body.shape.FAMILIES`.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
@@ -180,7 +180,7 @@ def training_windows(
     for block in training_blocks(
         seed,
         -(-n // BLOCK),
-        habits,
+        species,
         family=family,
         noise=noise,
         erosion_px=erosion_px,
@@ -197,7 +197,7 @@ def training_windows(
 def training_blocks(
     seed: int,
     n_blocks: int,
-    habits: Species | None = None,
+    species: Species | None = None,
     *,
     first: int = 0,
     family: str = "train",
@@ -215,7 +215,7 @@ def training_blocks(
     Args:
         seed: of the whole set; a block depends on it and on its own number alone.
         n_blocks: how many blocks to make.
-        habits: the species; None a mouse.
+        species: the species; None a mouse.
         first: number of the first block.
         family: of body shapes, one of `body.shape.FAMILIES`.
         noise: multiplies the sensor's random errors and its rate of holes, see `Sensor.draw`.
@@ -230,19 +230,19 @@ def training_blocks(
     Yields:
         One set of `BLOCK` patches a block.
     """
-    habits = MouseSpecies() if habits is None else habits
-    surface = Surface.of(habits.skeleton)
+    species = MouseSpecies() if species is None else species
+    surface = Surface.of(species.skeleton)
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
-        views = _draw_looks(rng, habits, family, noise, erosion_px, degraded_share, spine_mm)
+        views = _draw_looks(rng, species, family, noise, erosion_px, degraded_share, spine_mm)
         yield _draw_block(
-            rng, habits, surface, views, window_px, number * (BLOCK // PER_SESSION), parallel
+            rng, species, surface, views, window_px, number * (BLOCK // PER_SESSION), parallel
         )
 
 
 def _draw_looks(
     rng: np.random.Generator,
-    habits: Species,
+    species: Species,
     family: str,
     noise: float,
     erosion_px: int,
@@ -253,13 +253,13 @@ def _draw_looks(
     images.
     """
     m = BLOCK // PER_SESSION
-    skeleton = habits.skeleton
-    sensor = np.arange(m) % len(habits.sensors)
-    shape = habits.shapes(rng, family, m)
+    skeleton = species.skeleton
+    sensor = np.arange(m) % len(species.sensors)
+    shape = species.shapes(rng, family, m)
     intrinsics = np.empty((m, 4))
     picture = np.empty((m, 2), np.int64)
     parameters = np.empty((m, 0))
-    for k, kind in enumerate(habits.sensors):
+    for k, kind in enumerate(species.sensors):
         rows = sensor == k
         camera = kind.camera.every(kind.stride)
         # units of one make differ by a few per cent in focal length, and by some pixels in the
@@ -273,15 +273,15 @@ def _draw_looks(
     _degrade(rng, parameters, degraded_share)
     nominal = skeleton.length if spine_mm is None else spine_mm
     each = np.repeat(np.arange(m), PER_SESSION)
-    T_arena_camera = draw_views(rng, m, habits.setting)
-    scale = habits.setting.scale
+    T_arena_camera = draw_views(rng, m, species.setting)
+    scale = species.setting.scale
     return _Views(
         sensor[each],
         intrinsics[each],
         picture[each],
         SE3(T_arena_camera.rotation[each], T_arena_camera.translation[each]),
         parameters[each],
-        (nominal / skeleton.length * rng.uniform(*habits.sizes, m))[each],
+        (nominal / skeleton.length * rng.uniform(*species.sizes, m))[each],
         shape[each],
         scale * rng.uniform(0.0, 1.0, m)[each],
         (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale])[each],
@@ -330,7 +330,7 @@ def inverse_depth_plane(
 
 def _draw_block(
     rng: np.random.Generator,
-    habits: Species,
+    species: Species,
     surface: Surface,
     views: _Views,
     window_px: int,
@@ -339,25 +339,25 @@ def _draw_block(
 ) -> TrainingPatches:
     """The images of one block."""
     n = len(views.size)
-    skeleton = habits.skeleton
-    scale = habits.setting.scale
-    pose, girth, kinds = habits.postures(
+    skeleton = species.skeleton
+    scale = species.setting.scale
+    pose, girth, kinds = species.postures(
         rng, views.size, views.shape, views.T_arena_camera.translation[:, 2]
     )
-    _place(rng, habits, pose, views)
-    vertices = surface.vertices(pose, views.shape, girth, habits.bends(rng, n), parallel)
+    _place(rng, species, pose, views)
+    vertices = surface.vertices(pose, views.shape, girth, species.bends(rng, n), parallel)
     trunk = vertices[:, : surface.n_trunk_vertices]
     T_camera_arena = views.T_arena_camera.inverse()
     origin = window_origin(trunk, T_camera_arena, views.intrinsics, window_px)
     thing, has_thing = _draw_neighbours(
-        rng, trunk, views.size * skeleton.length, scale, habits.floats
+        rng, trunk, views.size * skeleton.length, scale, species.floats
     )
-    walls = _draw_walls(rng, trunk, habits.setting)
+    walls = _draw_walls(rng, trunk, species.setting)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
-        _stage.draw_windows(
+        _scene.draw_windows(
             vertices,
             surface.faces,
             thing,
@@ -393,18 +393,18 @@ def _draw_block(
         first_session + np.arange(n) // PER_SESSION,
         views.sensor,
         kinds,
-        habits.sensors[0].unit_mm,
-        habits.sensors[0].spread_mm(views.parameters, views.T_arena_camera.translation[:, 2]),
+        species.sensors[0].unit_mm,
+        species.sensors[0].spread_mm(views.parameters, views.T_arena_camera.translation[:, 2]),
     )
 
 
-def _place(rng: np.random.Generator, habits: Species, pose: Pose, views: _Views) -> None:
+def _place(rng: np.random.Generator, species: Species, pose: Pose, views: _Views) -> None:
     """Move the poses over the floor so that each animal is somewhere in its picture, whole."""
     n = len(pose.scale)
     T = views.T_arena_camera
-    skeleton = habits.skeleton
+    skeleton = species.skeleton
     middle = pose.joints(skeleton).mean(axis=1)
-    height = T.translation[:, 2] - (middle[:, 2] if habits.floats else 0.0)
+    height = T.translation[:, 2] - (middle[:, 2] if species.floats else 0.0)
     margin = 0.85 * pose.scale * skeleton.length * views.intrinsics[:, 0] / height + 6.0
     uv = np.stack(
         [margin + rng.random(n) * (views.picture[:, k] - 2.0 * margin) for k in range(2)],

@@ -19,7 +19,7 @@ from liex_lab.actions.ethogram import Ethogram, runs_of
 from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.geometry import so3
-from liex_lab.runtime.memory import blocks, give_back
+from liex_lab.runtime.memory import blocks, trim_heap
 from liex_lab.tables.schema import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
 from liex_lab.tracking.track import Flip, Track
 
@@ -85,7 +85,7 @@ class Rows:
 
         schema = [column for column in FRAMES if column.name in names]
         table = pd.concat([to_pandas(schema, block) for block in self.frames()], ignore_index=True)
-        give_back()
+        trim_heap()
         return table
 
     def poses(self) -> Iterator[Block]:
@@ -258,7 +258,7 @@ class Rows:
     def _parts(self, rows_per_frame: int) -> Iterator[slice]:
         for part in blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame)):
             yield part
-            self.track.rest()
+            self.track.release_pages()
 
 
 def _xyz(name: str, values: Array) -> dict[str, Array]:

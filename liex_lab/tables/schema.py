@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.memory import blocks, give_back, let_go
+from liex_lab.runtime.memory import blocks, release_pages, trim_heap
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -541,7 +541,7 @@ def write_table(
             n_rows += batch.num_rows
             writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
             del block, batch  # before the next one is made
-    give_back()
+    trim_heap()
     return n_rows
 
 
@@ -694,16 +694,16 @@ def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
     """
     for part in blocks(max(len(table), 1), ROWS_PER_GROUP):
         yield {str(name): table[name].iloc[part].to_numpy() for name in table.columns}
-        let_table_go(table)
+        release_table(table)
 
 
-def let_table_go(table: pd.DataFrame) -> None:
+def release_table(table: pd.DataFrame) -> None:
     """Release the memory pages of a table's columns that lie on disk, until they are read again.
 
     Args:
         table: a data frame; columns of text are left alone.
     """
-    let_go(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
+    release_pages(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
 
 
 def _pandas_dtype(column: Column) -> str:

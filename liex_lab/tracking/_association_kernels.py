@@ -3,12 +3,11 @@
 A chain visits at most one hypothesis of each frame and costs, in nats, sum of emission + transition
 + missed-detection costs; cost[t, h] = emission[t, h] + min over (a, g) of cost[a, g] +
 transition(a, g; t, h) + missed-detection cost of the frames between, where frames may be passed by
-and the beam holds the best last links (Viterbi 1967).
-Transition cost between joints: d^2 / 2 s_1^2 + b^2 / 2 s_2^2, with d the shift of the joints' mean,
-b the mean change of posture, s_k^2 = (levels[0])^2 (e_a^2 + e_b^2) + (levels[k] L dt)^2; robust by
-T log(1 + c / T), T = levels[3].
-`two_ways` is the forward-backward algorithm over two states, head and tail as on the path or
-exchanged, and gives the flip posterior.
+and the beam holds the best last links (Viterbi 1967). Transition cost between joints: d^2 / 2 s_1^2
++ b^2 / 2 s_2^2, with d the shift of the joints' mean, b the mean change of posture, s_k^2 =
+(levels[0])^2 (e_a^2 + e_b^2) + (levels[k] L dt)^2; robust by T log(1 + c / T), T = levels[3].
+`forward_backward` is the forward-backward algorithm over two states, head and tail as on the path
+or exchanged, and gives the flip posterior.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ NONE = -1
 
 
 @njit(cache=True)
-def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling):
+def transition_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling):
     """Transition cost, nats: how unlikely an animal gets from joints (J, 3) mm to others in dt s.
 
     The middle and the posture about it move by standard deviations of levels[1] and levels[2]
@@ -62,7 +61,19 @@ def leap_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling)
 
 @njit(cache=True)
 def extend(
-    t, live, n_live, times, joints, error, emission, idle, levels, length, ceiling, cost, parent
+    t,
+    beam,
+    n_beam,
+    times,
+    joints,
+    error,
+    emission,
+    missed_cost,
+    levels,
+    length,
+    ceiling,
+    cost,
+    parent,
 ):
     """One Viterbi step: add frame t and its hypotheses to the beam; returns the beam's size.
 
@@ -70,23 +81,23 @@ def extend(
 
     Args:
         t: index of the frame.
-        live: (B, 2) the beam, frame and hypothesis of the best chains' last links; updated in
+        beam: (B, 2) the beam, frame and hypothesis of the best chains' last links; updated in
             place.
-        n_live: how many rows of it are in use.
+        n_beam: how many rows of it are in use.
         times: (n,) s.
         joints: (n, H, J, 3) mm.
         error: (n, H) predicted mean joint error, mm.
         emission: (n, H) cost of each hypothesis by itself, nats; not finite where there is none.
-        idle: (n + 1,) missed-detection cost of all frames before each, cumulative, nats.
-        levels: see `leap_cost`.
+        missed_cost: (n + 1,) missed-detection cost of all frames before each, cumulative, nats.
+        levels: see `transition_cost`.
         length: spine length of the animal, mm.
-        ceiling: see `leap_cost`.
+        ceiling: see `transition_cost`.
         cost: (n, H) output at t, cost of the best chain that ends there, nats; infinite without
             one.
         parent: (n, H, 2) output at t, frame and hypothesis before, `NONE` where the chain begins.
 
     Returns:
-        How many rows of `live` are in use afterwards.
+        How many rows of `beam` are in use afterwards.
     """
     for h in range(joints.shape[1]):
         cost[t, h] = np.inf
@@ -94,14 +105,14 @@ def extend(
         parent[t, h, 1] = NONE
         if not np.isfinite(emission[t, h]):
             continue
-        best = idle[t]  # the chain begins here
-        for k in range(n_live):
-            a = live[k, 0]
-            g = live[k, 1]
-            so_far = cost[a, g] + idle[t] - idle[a + 1]
+        best = missed_cost[t]  # the chain begins here
+        for k in range(n_beam):
+            a = beam[k, 0]
+            g = beam[k, 1]
+            so_far = cost[a, g] + missed_cost[t] - missed_cost[a + 1]
             if so_far >= best and parent[t, h, 0] != NONE:
                 continue
-            leap = leap_cost(
+            transition = transition_cost(
                 joints[a, g],
                 joints[t, h],
                 error[a, g],
@@ -111,37 +122,37 @@ def extend(
                 levels,
                 ceiling,
             )
-            if so_far + leap < best:
-                best = so_far + leap
+            if so_far + transition < best:
+                best = so_far + transition
                 parent[t, h, 0] = a
                 parent[t, h, 1] = g
         cost[t, h] = best + emission[t, h]
-    return _keep_best(t, live, n_live, idle, cost, joints.shape[1])
+    return _keep_best(t, beam, n_beam, missed_cost, cost, joints.shape[1])
 
 
 @njit(cache=True)
-def _keep_best(t, live, n_live, idle, cost, n_hypotheses):
-    """Prune: the best chains after frame t into `live`, best first; returns how many."""
-    size = live.shape[0]
-    all_of = np.empty((n_live + n_hypotheses, 2), np.int64)
-    costs = np.empty(n_live + n_hypotheses)
+def _keep_best(t, beam, n_beam, missed_cost, cost, n_hypotheses):
+    """Prune: the best chains after frame t into `beam`, best first; returns how many."""
+    size = beam.shape[0]
+    all_of = np.empty((n_beam + n_hypotheses, 2), np.int64)
+    costs = np.empty(n_beam + n_hypotheses)
     n = 0
-    for k in range(n_live + n_hypotheses):
-        if k < n_live:
-            a = live[k, 0]
-            h = live[k, 1]
+    for k in range(n_beam + n_hypotheses):
+        if k < n_beam:
+            a = beam[k, 0]
+            h = beam[k, 1]
         else:
             a = t
-            h = k - n_live
+            h = k - n_beam
         if np.isfinite(cost[a, h]):
             all_of[n, 0] = a
             all_of[n, 1] = h
-            costs[n] = cost[a, h] + idle[t + 1] - idle[a + 1]
+            costs[n] = cost[a, h] + missed_cost[t + 1] - missed_cost[a + 1]
             n += 1
     order = np.argsort(costs[:n], kind="mergesort")
     kept = min(n, size)
     for k in range(kept):
-        live[k] = all_of[order[k]]
+        beam[k] = all_of[order[k]]
     return kept
 
 
@@ -149,13 +160,13 @@ def _keep_best(t, live, n_live, idle, cost, n_hypotheses):
 def extend_all(
     start,
     stop,
-    live,
-    n_live,
+    beam,
+    n_beam,
     times,
     joints,
     error,
     emission,
-    idle,
+    missed_cost,
     levels,
     length,
     ceiling,
@@ -167,39 +178,39 @@ def extend_all(
     Args:
         start: first frame.
         stop: frame after the last.
-        live: (B, 2) the beam, updated in place.
-        n_live: how many rows of it are in use.
+        beam: (B, 2) the beam, updated in place.
+        n_beam: how many rows of it are in use.
         times: (n,) s.
         joints: (n, H, J, 3) mm.
         error: (n, H) predicted mean joint error, mm.
         emission: (n, H) nats.
-        idle: (n + 1,) cumulative missed-detection cost, nats.
-        levels: see `leap_cost`.
+        missed_cost: (n + 1,) cumulative missed-detection cost, nats.
+        levels: see `transition_cost`.
         length: spine length of the animal, mm.
-        ceiling: see `leap_cost`.
+        ceiling: see `transition_cost`.
         cost: (n, H) output.
         parent: (n, H, 2) output.
 
     Returns:
-        How many rows of `live` are in use afterwards.
+        How many rows of `beam` are in use afterwards.
     """
     for t in range(start, stop):
-        n_live = extend(
+        n_beam = extend(
             t,
-            live,
-            n_live,
+            beam,
+            n_beam,
             times,
             joints,
             error,
             emission,
-            idle,
+            missed_cost,
             levels,
             length,
             ceiling,
             cost,
             parent,
         )
-    return n_live
+    return n_beam
 
 
 @njit(cache=True)
@@ -220,11 +231,11 @@ def trace_back(frame, hypothesis, parent, first, path):
 
 
 @njit(cache=True)
-def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
+def forward_backward(times, one, two, error, evidence, levels, length, ceiling, doubt):
     """Forward-backward over two states: fill the flip posterior of each frame.
 
-    Transitions within and between the two states cost what `leap_cost` says of their joints; all
-    sums are in logarithms.
+    Transitions within and between the two states cost what `transition_cost` says of their joints;
+    all sums are in logarithms.
 
     Args:
         times: (n,) s.
@@ -233,26 +244,26 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
         error: (n,) predicted mean joint error, mm.
         evidence: (n,) log likelihood ratio of the frame by itself, nats, positive for the first
             way.
-        levels: see `leap_cost`.
+        levels: see `transition_cost`.
         length: spine length of the animal, mm.
-        ceiling: see `leap_cost`.
+        ceiling: see `transition_cost`.
         doubt: (n,) output, posterior probability of the second way.
     """
     n = times.size
     stay = np.empty((n, 2))
-    leap = np.empty((n, 2))
+    transition = np.empty((n, 2))
     for t in range(1, n):
         dt = times[t] - times[t - 1]
-        stay[t, 0] = leap_cost(
+        stay[t, 0] = transition_cost(
             one[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
         )
-        stay[t, 1] = leap_cost(
+        stay[t, 1] = transition_cost(
             two[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling
         )
-        leap[t, 0] = leap_cost(
+        transition[t, 0] = transition_cost(
             one[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling
         )
-        leap[t, 1] = leap_cost(
+        transition[t, 1] = transition_cost(
             two[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
         )
     # logarithms of what the past says of each way
@@ -260,9 +271,9 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
     second = np.zeros(n)
     second[0] = -evidence[0]
     for t in range(1, n):
-        first[t] = np.logaddexp(first[t - 1] - stay[t, 0], second[t - 1] - leap[t, 1])
+        first[t] = np.logaddexp(first[t - 1] - stay[t, 0], second[t - 1] - transition[t, 1])
         second[t] = (
-            np.logaddexp(first[t - 1] - leap[t, 0], second[t - 1] - stay[t, 1]) - evidence[t]
+            np.logaddexp(first[t - 1] - transition[t, 0], second[t - 1] - stay[t, 1]) - evidence[t]
         )
         top = max(first[t], second[t])
         first[t] -= top
@@ -275,8 +286,8 @@ def two_ways(times, one, two, error, evidence, levels, length, ceiling, doubt):
         if t > 0:
             later = b - evidence[t]
             a, b = (
-                np.logaddexp(a - stay[t, 0], later - leap[t, 0]),
-                np.logaddexp(a - leap[t, 1], later - stay[t, 1]),
+                np.logaddexp(a - stay[t, 0], later - transition[t, 0]),
+                np.logaddexp(a - transition[t, 1], later - stay[t, 1]),
             )
             top = max(a, b)
             a -= top

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
 
@@ -74,24 +74,24 @@ class HypothesisAssociation:
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
         self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend, tuning.tail])
 
-    def joints(self, seen: Observations, room: Room = np.empty) -> NDArray[np.float32]:
+    def joints(self, seen: Observations, allocate: Allocator = np.empty) -> NDArray[np.float32]:
         """Positions of the k joints that transition costs are measured by.
 
         Args:
             seen: hypotheses (n, H).
-            room: allocator of the result.
+            allocate: allocator of the result.
 
         Returns:
             (n, H, k, 3) mm, float32, arena frame, NaN where there is no hypothesis; k is at most 8.
         """
-        return seen.joints(self._joints, room)
+        return seen.joints(self._joints, allocate)
 
     def path(
         self,
         seen: Observations,
         told: NDArray[np.int64] | None = None,
         joints: NDArray[np.float32] | None = None,
-        room: Room = np.empty,
+        allocate: Allocator = np.empty,
     ) -> NDArray[np.int64]:
         """The most probable path: which hypothesis of each frame is the animal, or `NONE`.
 
@@ -99,55 +99,55 @@ class HypothesisAssociation:
             seen: hypotheses (n, H).
             told: (m,) decisions of the first m frames that stand, None where all are open.
             joints: what `joints` gave, where it is at hand.
-            room: allocator of intermediate arrays.
+            allocate: allocator of intermediate arrays.
 
         Returns:
             (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
         """
         n, h = seen.score.shape
-        emission = self._emission(seen, room)
+        emission = self._emission(seen, allocate)
         if told is not None:
             emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
-        idle = np.concatenate(
+        missed_cost = np.concatenate(
             [[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))]
         )
-        cost = room((n, h), float)
-        parent = room((n, h, 2), np.int64)
-        live = np.zeros((_BEAM, 2), np.int64)
+        cost = allocate((n, h), float)
+        parent = allocate((n, h, 2), np.int64)
+        beam = np.zeros((_BEAM, 2), np.int64)
         joints = self.joints(seen) if joints is None else joints
         seconds = seen.seconds
-        n_live = 0
+        n_beam = 0
         for rows in blocks(n, _BLOCK):
-            n_live = kernels.extend_all(
+            n_beam = kernels.extend_all(
                 rows.start,
                 rows.stop,
-                live,
-                n_live,
+                beam,
+                n_beam,
                 seconds,
                 joints,
                 seen.error_mm,
                 emission,
-                idle,
+                missed_cost,
                 self._levels,
                 self._length,
                 self._tuning.ceiling,
                 cost,
                 parent,
             )
-            let_go(joints, emission, cost, parent)
+            release_pages(joints, emission, cost, parent)
         path = np.full(n, NONE, np.int64)
-        if n_live:
-            kernels.trace_back(live[0, 0], live[0, 1], parent, 0, path)
+        if n_beam:
+            kernels.trace_back(beam[0, 0], beam[0, 1], parent, 0, path)
         return path
 
-    def _emission(self, seen: Observations, room: Room) -> Array:
+    def _emission(self, seen: Observations, allocate: Allocator) -> Array:
         """Emission cost (n, H) of each hypothesis, nats: its capped score; NaN without."""
-        cost = room(seen.score.shape, float)
+        cost = allocate(seen.score.shape, float)
         for rows in blocks(len(cost), _BLOCK):
             cost[rows] = np.minimum(
                 seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most
             )
-            let_go(cost)
+            release_pages(cost)
         return cost
 
     def doubt(
@@ -155,7 +155,7 @@ class HypothesisAssociation:
         seen: Observations,
         path: NDArray[np.int64],
         joints: NDArray[np.float32] | None = None,
-        room: Room = np.empty,
+        allocate: Allocator = np.empty,
     ) -> Array:
         """Flip posterior (n,): probability that head and tail are exchanged on this path.
 
@@ -168,14 +168,14 @@ class HypothesisAssociation:
             seen: hypotheses (n, H).
             path: (n,) from `path`.
             joints: what `joints` gave, where it is at hand.
-            room: allocator of intermediate arrays.
+            allocate: allocator of intermediate arrays.
 
         Returns:
             (n,) probabilities; 0 throughout where the path is empty.
         """
         rows = np.arange(len(path))
         other = np.where(path >= 0, path ^ 1, NONE)
-        emission = self._emission(seen, room)
+        emission = self._emission(seen, allocate)
         here = np.where(path >= 0, emission[rows, np.maximum(path, 0)], 0.0)
         turned = np.where(path >= 0, emission[rows, np.maximum(other, 0)], 0.0)
         evidence = np.where(np.isfinite(turned), turned, self._tuning.score_most + here) - here
@@ -184,16 +184,16 @@ class HypothesisAssociation:
         if not len(used):
             return doubt
         joints = self.joints(seen) if joints is None else joints
-        one, two = (room((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
+        one, two = (allocate((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
         for part in blocks(len(used), _BLOCK):
             taken = path[used[part]]
             one[part] = joints[used[part], taken]
             other_way = joints[used[part], taken ^ 1]
             two[part] = np.where(np.isfinite(other_way), other_way, one[part, ::-1])
-            let_go(joints, one, two)
+            release_pages(joints, one, two)
         error = seen.error_mm[used, path[used]].astype(float)
         at_used = np.empty(len(used))
-        kernels.two_ways(
+        kernels.forward_backward(
             seen.seconds[used],
             one,
             two,

@@ -17,7 +17,7 @@ from liex_lab.body._kernels import place_joints
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.memory import Room, let_go
+from liex_lab.runtime.memory import Allocator, release_pages
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -133,9 +133,9 @@ class Observations:
         """The number of frames n."""
         return len(self.times_ns)
 
-    def rest(self) -> None:
+    def release_pages(self) -> None:
         """Release the memory pages of columns that lie on disk, until they are read again."""
-        let_go(*(getattr(self, name) for name in COLUMNS))
+        release_pages(*(getattr(self, name) for name in COLUMNS))
 
     @property
     def seconds(self) -> Array:
@@ -177,17 +177,17 @@ class Observations:
         taken[path < 0] = np.nan
         return taken
 
-    def joints(self, joints: Sequence[int], room: Room = np.empty) -> Small:
+    def joints(self, joints: Sequence[int], allocate: Allocator = np.empty) -> Small:
         """Positions of some joints in all hypotheses, by forward kinematics.
 
         Args:
             joints: indices of k joints.
-            room: allocator of the result.
+            allocate: allocator of the result.
 
         Returns:
             (n, H, k, 3) mm, float32, arena frame; NaN where there is no hypothesis.
         """
-        out = room((*self.score.shape, len(joints), 3), np.float32)
+        out = allocate((*self.score.shape, len(joints), 3), np.float32)
         for start in range(0, len(self), _BLOCK):
             out[start : start + _BLOCK] = np.nan
             part = self[start : start + _BLOCK]
@@ -196,8 +196,8 @@ class Observations:
                 if len(rows):
                     pose = part.pose(np.full(len(part), h))[rows]
                     out[start + rows, h] = joints_of(self.skeleton, pose)[:, list(joints)]
-            let_go(out)
-            self.rest()
+            release_pages(out)
+            self.release_pages()
         return out
 
 

@@ -27,7 +27,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.memory import Room, blocks
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
@@ -85,7 +85,7 @@ def track_whole(
     seen: Observations,
     corrections: Sequence[Flip] = (),
     tuning: TrackingParameters | None = None,
-    room: Room = np.empty,
+    allocate: Allocator = np.empty,
 ) -> Tracked:
     """The track of a recording, smoothed over all of its frames at once, and its head-tail flips.
 
@@ -98,20 +98,20 @@ def track_whole(
         corrections: spans in which a person says that head and tail are exchanged; those with
             `undone_at` are not applied.
         tuning: motion and association parameters; None takes the animal's own.
-        room: allocator of the track's columns, `np.empty` or one on disk.
+        allocate: allocator of the track's columns, `np.empty` or one on disk.
 
     Returns:
         The track (n rows) and the flips, those found and those of `corrections`, in order of time.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
-    joints = chain.joints(seen, room)
-    path = chain.path(seen, joints=joints, room=room)
-    doubt = chain.doubt(seen, path, joints, room)
+    joints = chain.joints(seen, allocate)
+    path = chain.path(seen, joints=joints, allocate=allocate)
+    doubt = chain.doubt(seen, path, joints, allocate)
     del joints
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
-    track = Track.empty(subject.skeleton, seen.times_ns, room=room)
+    track = Track.empty(subject.skeleton, seen.times_ns, allocate=allocate)
     used = np.zeros(len(seen), np.bool_)
     seconds = seen.seconds
 
@@ -150,7 +150,7 @@ def track_whole(
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
     for rows in blocks(len(seen), _BLOCK):
-        _settle(
+        _mask_and_flag(
             subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows]
         )
         _rest(track, seen)
@@ -161,8 +161,8 @@ def track_whole(
 
 
 def _rest(track: Track, seen: Observations) -> None:
-    track.rest()
-    seen.rest()
+    track.release_pages()
+    seen.release_pages()
 
 
 def _turn_round(
@@ -260,7 +260,9 @@ def to_track(
     bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
     track = Track.empty(subject.skeleton, seen.times_ns[told])
     _write(subject, track, curve[told], tuning)
-    _settle(subject, track, seen[told], path[told], doubt[told], measured[told], bridged[told])
+    _mask_and_flag(
+        subject, track, seen[told], path[told], doubt[told], measured[told], bridged[told]
+    )
     return track
 
 
@@ -287,7 +289,7 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParamet
     track.sd_angles_rad[:, 0] = 0.0
 
 
-def _settle(
+def _mask_and_flag(
     subject: Subject,
     track: Track,
     seen: Observations,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.runtime.memory import Room, blocks, let_go
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class Track:
         skeleton: Skeleton,
         times_ns: NDArray[np.int64],
         flag: str = "not_found",
-        room: Room = np.empty,
+        allocate: Allocator = np.empty,
     ) -> Track:
         """A track of these times in which nothing has been measured yet.
 
@@ -94,7 +94,7 @@ class Track:
             skeleton: kinematic tree of the animal.
             times_ns: (n,) time stamps.
             flag: word of `FLAGS` for all rows.
-            room: allocator of the columns.
+            allocate: allocator of the columns.
 
         Returns:
             n rows, NaN, 0 or False.
@@ -110,9 +110,9 @@ class Track:
                 dtype: of the column.
                 *shape: of one row.
             """
-            made = room((n, *shape), dtype)
+            made = allocate((n, *shape), dtype)
             made[...] = value
-            let_go(made)
+            release_pages(made)
             return made
 
         def unknown(*shape: int) -> Array:
@@ -158,9 +158,9 @@ class Track:
         """Some consecutive frames; what is written into them is written into the whole."""
         return Track(self.skeleton, *(getattr(self, name)[rows] for name in _columns()))
 
-    def rest(self) -> None:
+    def release_pages(self) -> None:
         """Release the memory pages of columns that lie on disk, until they are read again."""
-        let_go(*(getattr(self, name) for name in _columns()))
+        release_pages(*(getattr(self, name) for name in _columns()))
 
     @property
     def n_frames(self) -> int:
@@ -173,7 +173,7 @@ class Track:
         there = np.empty(self.n_frames, np.bool_)
         for rows in blocks(self.n_frames, _BLOCK):
             there[rows] = np.isfinite(self.joints_mm[rows, 0, 0])
-            let_go(self.joints_mm)
+            release_pages(self.joints_mm)
         return there
 
     @property

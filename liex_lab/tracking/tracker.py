@@ -19,7 +19,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.foreground.height_maps import Foreground
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.runtime.memory import Room
+from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
@@ -188,19 +188,19 @@ class FrameTracker:
         return single_frames(self.subject, seen)
 
     def track(
-        self, seen: Observations, corrections: Sequence[Flip] = (), room: Room = np.empty
+        self, seen: Observations, corrections: Sequence[Flip] = (), allocate: Allocator = np.empty
     ) -> Tracked:
         """The smoothed track of a whole recording, see `offline.track_whole`.
 
         Args:
             seen: what `observe` gave of all frames.
             corrections: spans in which a person says that head and tail are exchanged.
-            room: allocator of the track's columns.
+            allocate: allocator of the track's columns.
 
         Returns:
             The track and its head-tail flips.
         """
-        return track_whole(self.subject, seen, corrections, room=room)
+        return track_whole(self.subject, seen, corrections, allocate=allocate)
 
     def _put(
         self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]

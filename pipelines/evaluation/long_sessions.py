@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.plan import Plan
-from liex_lab.runtime.memory import give_back, peak_memory_mb
+from liex_lab.runtime.memory import peak_memory_mb, trim_heap
 
 from ..build import build_provenance, build_tracker
 from ..session import conclude
@@ -88,7 +88,7 @@ def write_long(
     plan = Plan.load("mouse")
     n = int(minutes * 60 * FPS)
     short = _look_at_short(plan)
-    give_back()
+    trim_heap()
     told("began")
     began = time.perf_counter()
     with SessionWriter(
@@ -98,7 +98,9 @@ def write_long(
             writer.add(frames, seen=part)
         told("written")
         whole = writer.seen(Observations)
-        writer.take(track_whole(short.subject, whole, room=writer.room), whole, short.subject)
+        writer.take(
+            track_whole(short.subject, whole, allocate=writer.allocate), whole, short.subject
+        )
         del whole
         told("tracked")
         conclude(writer, plan, {"prepare": 0.0, "track": 0.0})

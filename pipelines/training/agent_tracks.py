@@ -30,7 +30,7 @@ from liex_lab.simulation._render_kernels import WALL_COLUMNS
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
 from liex_lab.simulation.agents.agent import STEP_S, Individual, Motion
-from liex_lab.simulation.agents.render import CameraPath, film
+from liex_lab.simulation.agents.render import CameraPath, render_agent
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.species import MouseSpecies
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -193,14 +193,14 @@ def act(
     """
     stage = {"fish": _fish, "mouse": _mouse}[scenario.animal]
     rng = np.random.default_rng([scenario.individual, scenario.seed])
-    motion, rows, pose, girth, walls, habits, camera, shape, room = stage(scenario, rng)
+    motion, rows, pose, girth, walls, species, camera, shape, wall_mm = stage(scenario, rng)
     window_px = _FISH_WINDOW if scenario.animal == "fish" else _MOUSE_WINDOW
     tracker = PatchObserver(estimator)
     sizes = {} if sizes is None else sizes
     n_sample = 1 if scenario.individual in sizes else min(_SIZE_FRAMES, len(rows))
     some = np.linspace(0, len(rows) - 1, n_sample).astype(int)
     near = None if walls is None else walls[some]
-    (sample,) = film(rng, habits, camera, shape, pose[some], girth[some], near, window_px)
+    (sample,) = render_agent(rng, species, camera, shape, pose[some], girth[some], near, window_px)
     if scenario.individual not in sizes:
         sizes[scenario.individual] = tracker.find_size(sample)
     size = sizes[scenario.individual]
@@ -209,9 +209,9 @@ def act(
         if not scenario.filmed_s
         else int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
     )
-    parts = film(
+    parts = render_agent(
         rng,
-        habits,
+        species,
         camera,
         shape,
         pose[:n],
@@ -223,14 +223,14 @@ def act(
     seen = tracker.observe(parts, times, size)
     whole = Camera(*camera.intrinsics, *(int(x) for x in camera.picture))
     subject = tracker.subject(whole, sample.floor(0).T_arena_camera, size)
-    wall = np.full(n, np.nan) if room is None else room[:n]
+    wall = np.full(n, np.nan) if wall_mm is None else wall_mm[:n]
     return AgentTrack(
         seen,
         subject,
         motion.word[rows[:n]],
         f"{scenario.animal}-{scenario.individual}",
         wall,
-        pose[:n].joints(habits.skeleton).astype(np.float32),
+        pose[:n].joints(species.skeleton).astype(np.float32),
         scenario.word,
     )
 
@@ -250,36 +250,36 @@ _Staged = tuple[
 
 def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     """A fish in a tank: its motion, poses and camera."""
-    habits = FishSpecies()
+    species = FishSpecies()
     own = np.random.default_rng([scenario.individual, 0])
     fish = Individual.draw(own, (25.0 / 30.0, 34.0 / 30.0), scenario.novel)
-    shape = habits.shapes(own, "train", 1)
+    shape = species.shapes(own, "train", 1)
     assert isinstance(shape, BodyShape)
     height_mm = float(rng.uniform(300.0, 330.0))
-    water = fish_acts.depth_of_water(habits, shape, fish.size, height_mm)
-    actor = fish_acts.FishActor(fish, fish.size * habits.skeleton.length, water, height_mm)
+    water = fish_acts.depth_of_water(species, shape, fish.size, height_mm)
+    actor = fish_acts.FishActor(fish, fish.size * species.skeleton.length, water, height_mm)
     motion = actor.cut(rng, scenario.word) if scenario.word else actor.uncut(rng, scenario.seconds)
     rows = motion.at(scenario.rate_hz)
-    pose = fish_acts.fish_poses(rng, habits, motion, rows, fish.size)
-    camera = CameraPath.draw(rng, habits, habits.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
-    return motion, rows, pose, np.full(len(rows), fish.size), None, habits, camera, shape, None
+    pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
+    camera = CameraPath.draw(rng, species, species.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
+    return motion, rows, pose, np.full(len(rows), fish.size), None, species, camera, shape, None
 
 
 def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     """A mouse in a box: its motion, poses, girth, camera, and wall distances, mm."""
-    habits = MouseSpecies()
+    species = MouseSpecies()
     own = np.random.default_rng([scenario.individual, 0])
     mouse = Individual.draw(own, (0.95, 1.3), scenario.novel)
-    shape = habits.shapes(own, "train", 1)
+    shape = species.shapes(own, "train", 1)
     half = rng.uniform([290.0, 250.0], [400.0, 330.0])
-    actor = mouse_acts.MouseActor.of(mouse, habits.skeleton, shape, half)
+    actor = mouse_acts.MouseActor.of(mouse, species.skeleton, shape, half)
     motion = actor.uncut(rng, scenario.seconds)
     rows = motion.at(scenario.rate_hz)
-    pose, girth = mouse_acts.mouse_poses(rng, habits, motion, rows, mouse.size, shape)
-    middle = pose.joints(habits.skeleton)[..., :2].mean(axis=1)
-    sensor = habits.sensors[int(rng.integers(len(habits.sensors)))]
-    camera = CameraPath.draw(rng, habits, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
-    room = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
+    pose, girth = mouse_acts.mouse_poses(rng, species, motion, rows, mouse.size, shape)
+    middle = pose.joints(species.skeleton)[..., :2].mean(axis=1)
+    sensor = species.sensors[int(rng.integers(len(species.sensors)))]
+    camera = CameraPath.draw(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
+    wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
     known = (
         scenario.novel or rng.random() < 0.75
     )  # of some to learn from nobody knows where the walls are
@@ -289,10 +289,10 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
         pose,
         girth,
         _walls(rng, middle, half),
-        habits,
+        species,
         camera,
         shape,
-        room if known else np.full(len(rows), np.nan),
+        wall_mm if known else np.full(len(rows), np.nan),
     )
 
 

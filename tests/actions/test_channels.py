@@ -100,5 +100,5 @@ def test_channels_made_piece_by_piece_are_those_made_at_once(
     track.joints_mm[:] += rng.normal(size=track.joints_mm.shape)
     (whole,) = stretches_of(track, 30.0)
     monkeypatch.setattr("liex_lab.actions.channels._PIECE", 7)
-    (pieces,) = stretches_of(track, 30.0, room=on_disk(tmp_path))
+    (pieces,) = stretches_of(track, 30.0, allocate=on_disk(tmp_path))
     assert pieces.values.tobytes() == whole.values.tobytes()

@@ -72,7 +72,7 @@ def test_what_lies_on_disk_on_the_way_is_named_as_in_memory(
     one = going_and_staying(14)
     in_memory, on_the_disk = (
         model.recognise(one.track),
-        model.recognise(one.track, room=on_disk(tmp_path)),
+        model.recognise(one.track, allocate=on_disk(tmp_path)),
     )
     assert on_the_disk.ethogram == in_memory.ethogram
     np.testing.assert_array_equal(on_the_disk.probability, in_memory.probability)

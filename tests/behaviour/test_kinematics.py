@@ -57,8 +57,8 @@ def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, mo
     told = fish.tables() if swims else tables_of(mouse)
     in_memory = kinematics(*told, surface_z_mm=90.0)
     monkeypatch.setattr(import_module("liex_lab.behaviour.kinematics"), "_BLOCK", 16)
-    on_the_disk = kinematics(*told, surface_z_mm=90.0, room=on_disk(tmp_path))
-    tables.let_table_go(on_the_disk)
+    on_the_disk = kinematics(*told, surface_z_mm=90.0, allocate=on_disk(tmp_path))
+    tables.release_table(on_the_disk)
     pd.testing.assert_frame_equal(on_the_disk, in_memory, check_exact=True)
 
 

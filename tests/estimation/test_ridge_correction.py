@@ -122,21 +122,21 @@ def test_wrong_poses_settle_and_tell_the_size(settler):
     heights = maps(true)
     for i in range(len(size)):
         one = off[np.array([i])]
-        settled = settler.settle(one, images_of(heights[i : i + 1]), float(size[i]))
-        for pose, errors in ((one, before), (settled.pose, after)):
+        corrected = settler.correct(one, images_of(heights[i : i + 1]), float(size[i]))
+        for pose, errors in ((one, before), (corrected.pose, after)):
             errors.append(np.abs(pose.joints(FISH)[0, :, 2] - true.joints(FISH)[i, :, 2]).mean())
-        told.append(np.log(size[i] / true.scale[i]) + settled.grown[0])
-        assert settled.clear[0] > 0.5
+        told.append(np.log(size[i] / true.scale[i]) + corrected.grown[0])
+        assert corrected.clear[0] > 0.5
     assert np.mean(after) < 0.35 * np.mean(before)
     assert np.mean(np.abs(told)) < 0.5 * np.mean(np.abs(np.log(size / true.scale)))
 
 
 def test_a_pose_that_sees_nothing_stays_near_where_it_is(settler):
     off, size = wrong(fish(1, 7), 8)
-    settled = settler.settle(off, images_of(np.zeros((1, SIDE, SIDE), np.int16)), float(size[0]))
-    assert np.linalg.norm(settled.pose.joints(FISH) - off.joints(FISH), axis=-1).max() < 6.0
-    assert abs(settled.grown[0]) < 0.5
-    assert settled.clear[0] == 0.0
+    corrected = settler.correct(off, images_of(np.zeros((1, SIDE, SIDE), np.int16)), float(size[0]))
+    assert np.linalg.norm(corrected.pose.joints(FISH) - off.joints(FISH), axis=-1).max() < 6.0
+    assert abs(corrected.grown[0]) < 0.5
+    assert corrected.clear[0] == 0.0
 
 
 def test_tangents_follow_the_chain_in_the_pictures_plane():

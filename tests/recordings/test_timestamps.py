@@ -19,9 +19,9 @@ from liex_lab.recordings.timestamps import (
     find_faults,
     find_gaps,
     from_rate,
+    make_monotone,
     match_counts,
     median_step,
-    settle,
     start_of_clock,
     start_of_day,
 )
@@ -33,22 +33,22 @@ stamps = st.lists(st.integers(-20, 20), min_size=1, max_size=9)
 @given(stamps)
 def test_settled_times_increase_and_stay_where_they_already_did(times: list[int]) -> None:
     given_ns = np.array(times, np.int64)
-    found = settle(given_ns)
-    settled, sentence = found.times_ns, found.problem
-    np.testing.assert_array_equal(found.faults > 0, settled != given_ns)
-    assert np.all(np.diff(settled) > 0)
+    found = make_monotone(given_ns)
+    monotone, sentence = found.times_ns, found.problem
+    np.testing.assert_array_equal(found.faults > 0, monotone != given_ns)
+    assert np.all(np.diff(monotone) > 0)
     if np.all(np.diff(given_ns) > 0):
-        np.testing.assert_array_equal(settled, given_ns)
+        np.testing.assert_array_equal(monotone, given_ns)
         assert sentence is None
     else:
         assert sentence is not None
-        assert f"{(settled != given_ns).sum()} of {len(times)}" in sentence
+        assert f"{(monotone != given_ns).sum()} of {len(times)}" in sentence
 
 
 @given(stamps)
 def test_no_other_choice_moves_fewer_stamps(times: list[int]) -> None:
-    settled = settle(np.array(times, np.int64)).times_ns
-    kept = int((settled == times).sum())
+    monotone = make_monotone(np.array(times, np.int64)).times_ns
+    kept = int((monotone == times).sum())
 
     def can_stay(chosen: tuple[int, ...]) -> bool:
         """Room for the stamps between: at least one nanosecond each."""
@@ -60,7 +60,7 @@ def test_no_other_choice_moves_fewer_stamps(times: list[int]) -> None:
 
 
 def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
-    found = settle(np.array([0, 33, 10**12, 100, 133]))
+    found = make_monotone(np.array([0, 33, 10**12, 100, 133]))
     np.testing.assert_array_equal(found.times_ns, [0, 33, 66, 100, 133])
     assert "1 of 5" in str(found.problem)
     assert find_faults(found.times_ns, 33, found.faults) == [Gap(2, 3, 66, 100, 0, "clock_jumped")]
@@ -68,24 +68,24 @@ def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
 
 def test_stamps_that_are_moved_are_spread_evenly_between_those_that_stay() -> None:
     np.testing.assert_array_equal(
-        settle(np.array([0, 33, 33, 99, 132])).times_ns, [0, 33, 66, 99, 132]
+        make_monotone(np.array([0, 33, 33, 99, 132])).times_ns, [0, 33, 66, 99, 132]
     )
     np.testing.assert_array_equal(
-        settle(np.array([0, 33, 33, 33, 132])).times_ns, [0, 33, 66, 99, 132]
+        make_monotone(np.array([0, 33, 33, 33, 132])).times_ns, [0, 33, 66, 99, 132]
     )
     np.testing.assert_array_equal(
-        settle(np.array([0, 33, 33, 34])).times_ns, [0, 16, 33, 34]
+        make_monotone(np.array([0, 33, 33, 34])).times_ns, [0, 16, 33, 34]
     )  # no room behind it
     np.testing.assert_array_equal(
-        settle(np.array([0, 30, 60, 90, 5, 6])).times_ns, [0, 30, 60, 90, 120, 150]
+        make_monotone(np.array([0, 30, 60, 90, 5, 6])).times_ns, [0, 30, 60, 90, 120, 150]
     )
     np.testing.assert_array_equal(
-        settle(np.array([900, 901, 60, 90, 120])).times_ns, [0, 30, 60, 90, 120]
+        make_monotone(np.array([900, 901, 60, 90, 120])).times_ns, [0, 30, 60, 90, 120]
     )
 
 
 def faults_of(times: list[int]) -> list[str]:
-    return [FAULTS[fault] for fault in settle(np.array(times, np.int64)).faults]
+    return [FAULTS[fault] for fault in make_monotone(np.array(times, np.int64)).faults]
 
 
 def test_each_stamp_that_is_moved_is_told_with_its_reason() -> None:
@@ -101,7 +101,7 @@ def test_a_clock_that_is_set_back_goes_on_as_after_a_missing_frame(back: int, at
     step = 33_333_333 if back > 10**6 else 1000
     stated = np.arange(40, dtype=np.int64) * step
     stated[at:] -= back
-    found = settle(stated)
+    found = make_monotone(stated)
     expected = np.arange(40, dtype=np.int64) * step
     expected[at:] += step
     np.testing.assert_array_equal(found.times_ns, expected)
@@ -112,7 +112,7 @@ def test_a_clock_that_is_set_back_goes_on_as_after_a_missing_frame(back: int, at
 def test_a_counter_that_wraps_every_minute_goes_on_each_time() -> None:
     step = 40_000_000
     stated = (np.arange(5000, dtype=np.int64) * step) % (60 * 10**9)
-    found = settle(stated)
+    found = make_monotone(stated)
     assert (found.faults == FAULTS.index("clock_jumped")).sum() == 3
     assert set(np.diff(found.times_ns).tolist()) == {step, 2 * step}
 
@@ -120,7 +120,7 @@ def test_a_counter_that_wraps_every_minute_goes_on_each_time() -> None:
 def test_a_few_frames_out_of_order_are_no_jump_of_the_clock() -> None:
     stated = np.arange(40, dtype=np.int64) * 100
     stated[[20, 21, 22]] = stated[[22, 20, 21]]
-    found = settle(stated)
+    found = make_monotone(stated)
     assert (found.times_ns != stated).sum() == 1
     assert {FAULTS[fault] for fault in found.faults} == {"", "stamp_out_of_order"}
 
@@ -129,7 +129,7 @@ def test_clocks_in_noise_stay_within_what_an_integer_holds() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         wild = np.sort(rng.integers(-(2**61), 2**61, (4, 10)), axis=1).ravel()
-        assert np.all(np.diff(settle(wild).times_ns) > 0)
+        assert np.all(np.diff(make_monotone(wild).times_ns) > 0)
 
 
 def test_a_recording_lists_what_its_clock_did(tmp_path: Path) -> None:

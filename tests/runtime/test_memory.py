@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.runtime.memory import let_go, on_disk
+from liex_lab.runtime.memory import on_disk, release_pages
 from liex_lab.tracking.track import Track
 
 _MB = 1 << 20
@@ -28,7 +28,7 @@ def test_what_is_written_stays_when_its_memory_is_let_go_of_and_no_file_is_left(
     array = on_disk(tmp_path)((1000, 3), np.float64)
     part = array[10:20]
     part[:] = np.arange(30.0).reshape(10, 3)
-    let_go(part, np.zeros(3))
+    release_pages(part, np.zeros(3))
     np.testing.assert_array_equal(array[10:20].ravel(), np.arange(30.0))
     assert not array[:10].any()
     assert list(tmp_path.iterdir()) == []
@@ -39,10 +39,10 @@ def test_what_is_written_stays_when_its_memory_is_let_go_of_and_no_file_is_left(
 def test_a_track_on_disk_takes_no_memory_when_it_rests(tmp_path):
     mouse, n = Skeleton.load("mouse"), 100_000
     before = resident_mb()
-    track = Track.empty(mouse, np.arange(n, dtype=np.int64), room=on_disk(tmp_path))
+    track = Track.empty(mouse, np.arange(n, dtype=np.int64), allocate=on_disk(tmp_path))
     track.joints_mm[:] = 1.0
     assert resident_mb() - before > 10
-    track.rest()
+    track.release_pages()
     assert resident_mb() - before < 5
     assert track.posed.all()
     assert np.isnan(track.uv_px).all()

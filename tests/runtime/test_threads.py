@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from liex_lab.runtime.threads import ahead, meanwhile
+from liex_lab.runtime.threads import in_background, prefetch
 
 
 def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
-    assert list(ahead(range(7))) == list(range(7))
-    assert list(ahead([])) == []
+    assert list(prefetch(range(7))) == list(range(7))
+    assert list(prefetch([])) == []
 
 
 def test_one_item_is_made_while_the_one_before_it_is_used() -> None:
@@ -26,7 +26,7 @@ def test_one_item_is_made_while_the_one_before_it_is_used() -> None:
                 third.set()
             yield k
 
-    coming = ahead(items())
+    coming = prefetch(items())
     assert next(coming) == 0
     assert next(coming) == 1
     assert third.wait(10)
@@ -39,7 +39,7 @@ def test_what_goes_wrong_is_raised_after_the_items_before_it() -> None:
         yield 1
         raise OSError("the drive is gone")
 
-    coming = ahead(items())
+    coming = prefetch(items())
     assert next(coming) == 1
     with pytest.raises(OSError, match="drive"):
         next(coming)
@@ -56,11 +56,11 @@ def test_something_is_made_while_a_block_runs_and_its_error_is_raised_where_it_i
     def fail() -> int:
         raise OSError("the drive is gone")
 
-    with meanwhile(make) as made:
+    with in_background(make) as made:
         assert begun.wait(10)  # before anybody asks for it
         asked.set()
         assert made() == made() == 7
-    with meanwhile(fail) as failed, pytest.raises(OSError, match="gone"):
+    with in_background(fail) as failed, pytest.raises(OSError, match="gone"):
         failed()
-    with meanwhile(fail):  # nobody wants it
+    with in_background(fail):  # nobody wants it
         pass

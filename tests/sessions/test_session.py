@@ -310,9 +310,9 @@ def test_thumbnails_hold_the_depth_around_the_animal(session):
 _WRITE_MANY = """
 import sys
 import numpy as np
-from liex_lab.camera import PRIMESENSE
+from liex_lab.optics.camera import PRIMESENSE
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.sessions import Session
+from liex_lab.sessions import SessionWriter
 from tests.sessions.walking_mouse import WalkingMouse, part, steady
 
 n = int(sys.argv[2])

@@ -22,11 +22,11 @@ def fish() -> fish_acts.FishActor:
 
 @pytest.fixture(scope="module")
 def mouse() -> mouse_acts.MouseActor:
-    rng, habits = np.random.default_rng(3), MouseSpecies()
+    rng, species = np.random.default_rng(3), MouseSpecies()
     return mouse_acts.MouseActor.of(
         Individual.draw(rng, (1.1, 1.1)),
-        habits.skeleton,
-        habits.shapes(rng, "train", 1),
+        species.skeleton,
+        species.shapes(rng, "train", 1),
         np.array([300.0, 260.0]),
     )
 
@@ -98,12 +98,14 @@ def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse
 
 
 def test_a_reared_mouse_has_its_nose_high(mouse) -> None:
-    rng, habits = np.random.default_rng(5), MouseSpecies()
+    rng, species = np.random.default_rng(5), MouseSpecies()
     motion = mouse.uncut(rng, 120.0)
     rows = motion.at(10.0)
-    pose, _ = mouse_acts.mouse_poses(rng, habits, motion, rows, 1.1, habits.shapes(rng, "train", 1))
-    z = pose.joints(habits.skeleton)[..., 2]
-    raised = (z[:, -1] - z[:, 0]) / (1.1 * habits.skeleton.length)
+    pose, _ = mouse_acts.mouse_poses(
+        rng, species, motion, rows, 1.1, species.shapes(rng, "train", 1)
+    )
+    z = pose.joints(species.skeleton)[..., 2]
+    raised = (z[:, -1] - z[:, 0]) / (1.1 * species.skeleton.length)
     reared = np.char.startswith(motion.word[rows], "rear")
     assert np.quantile(raised[reared], 0.75) > 0.5
     assert np.quantile(raised[motion.word[rows] == "walk"], 0.95) < 0.25

@@ -100,10 +100,10 @@ def test_the_joints_lie_within_the_fish_of_the_picture(pictures):
 
 def test_fish_hang_between_the_floor_and_the_nearest_that_the_camera_sees_whole():
     rng = np.random.default_rng(4)
-    habits, n = FishSpecies(), 600
+    species, n = FishSpecies(), 600
     size, camera_mm = rng.uniform(0.6, 1.5, n), rng.uniform(230.0, 330.0, n)
-    shape = habits.shapes(rng, "train", n)
-    pose, girth, kind = habits.postures(rng, size, shape, camera_mm)
+    shape = species.shapes(rng, "train", n)
+    pose, girth, kind = species.postures(rng, size, shape, camera_mm)
     z = Surface.of(FISH).vertices(pose, shape, girth)[..., 2]
     assert z.min() > 0.0
     assert (camera_mm - z.max(axis=1)).min() > 140.0
@@ -130,7 +130,7 @@ def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
 
 
 def test_the_same_seed_gives_the_same_fish():
-    first, again = (SyntheticSession.draw([7, 1], 2, habits=FishSpecies()) for _ in range(2))
+    first, again = (SyntheticSession.draw([7, 1], 2, species=FishSpecies()) for _ in range(2))
     np.testing.assert_array_equal(first.depths(0, 2), again.depths(0, 2))
     assert first.camera == RAYTRIX_R5
     assert 25.0 <= first.spine_mm <= 40.0

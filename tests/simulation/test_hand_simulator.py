@@ -82,7 +82,7 @@ def test_splits_are_fixed_and_their_people_differ() -> None:
     np.testing.assert_array_equal(clean[1].joints_camera, again[1].joints_camera)
     np.testing.assert_array_equal(clean[0].depths(3, 5), again[0].depths(3, 5))
     assert clean[0].spine_mm != clean[1].spine_mm
-    assert world.test_split("hard", n_sessions=1)[0].cast.shown.any()
+    assert world.test_split("hard", n_sessions=1)[0].contents.shown.any()
     assert world.test_split("clean", spine_mm=150.0, n_sessions=1)[0].spine_mm == pytest.approx(
         150.0
     )
@@ -127,5 +127,5 @@ def test_gestures_flow() -> None:
     assert (
         np.linalg.norm(session.joints_camera[0] - session.joints_camera[-1], axis=-1).max() > 30.0
     )
-    assert np.ptp(session.cast.spine_mm) == 0.0
+    assert np.ptp(session.contents.spine_mm) == 0.0
     np.testing.assert_array_equal(session.frame(7).depth, session.depths(7, 8)[0])

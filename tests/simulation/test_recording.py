@@ -313,7 +313,7 @@ def test_the_floor_of_a_session_is_where_its_plane_is(session: SyntheticSession)
     )
     depth = session.frame(0).depth
     c, r = np.round(
-        session.camera.project(session.T_arena_camera.inverse() @ [*session.stage.centre, 0.0])
+        session.camera.project(session.T_arena_camera.inverse() @ [*session.scene.centre, 0.0])
     ).astype(int)
     patch = (slice(r - 15, r + 15), slice(c - 15, c + 15))
     assert np.median(np.abs(depth[patch] - plane[patch])) < 6.0
@@ -323,8 +323,8 @@ def test_the_splits_are_fixed_halved_between_sensors_and_apart() -> None:
     clean, hard = test_split("clean", n_sessions=4), test_split("hard", n_sessions=4)
     assert [s.width for s in clean] == [640, 512, 640, 512]
     assert all(len(s) == 50 for s in clean + hard)
-    assert not any(s.cast.shown.any() for s in clean)
-    assert 0.3 < np.mean([s.cast.shown.mean() for s in hard]) < 0.65
+    assert not any(s.contents.shown.any() for s in clean)
+    assert 0.3 < np.mean([s.contents.shown.mean() for s in hard]) < 0.65
     assert len({s.spine_mm for s in clean + hard}) == 8
     assert test_split("clean", spine_mm=80.0, n_sessions=1)[0].spine_mm == 80.0
     with pytest.raises(LiexError, match="known are clean, hard, other-body"):
@@ -334,8 +334,8 @@ def test_the_splits_are_fixed_halved_between_sensors_and_apart() -> None:
 def test_another_object_never_touches_the_animal_in_the_picture() -> None:
     for s in test_split("hard", n_sessions=4):
         T_camera_arena = s.T_arena_camera.inverse()
-        for i in np.flatnonzero(s.cast.shown)[:6]:
-            thing = s.camera.project(T_camera_arena @ s.cast.things[i])
+        for i in np.flatnonzero(s.contents.shown)[:6]:
+            thing = s.camera.project(T_camera_arena @ s.contents.things[i])
             body = s.camera.project(s.joints_camera[i])
             assert np.linalg.norm(thing[:, None] - body, axis=-1).min() > 4.0
 
@@ -346,7 +346,7 @@ def test_a_walk_is_continuous_and_shows_every_kind_of_posture() -> None:
     assert speed.max() < 600.0
     assert np.linalg.norm(np.ptp(s.joints_arena[:, 0], axis=0)) > s.spine_mm
     assert s.joints_arena[:, 4, 2].max() > 0.7 * s.spine_mm  # it rears
-    assert (s.stage.room(s.joints_arena[..., :2]) > 0).all()
+    assert (s.scene.wall_clearance(s.joints_arena[..., :2]) > 0).all()
     uv = s.camera.project(s.joints_camera)
     assert (uv > 0).all()
     assert (uv < [s.width - 1, s.height - 1]).all()

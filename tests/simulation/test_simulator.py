@@ -71,7 +71,7 @@ def test_splits_are_drawn_of_the_animal_and_a_stated_size_is_taken(animal):
     assert {first.spine_mm, second.spine_mm} == {1.2 * world.skeleton.length}
     assert len(first) == 50
     assert isinstance(first, SyntheticSession)
-    assert first.cast.shown.any()
+    assert first.contents.shown.any()
     uv = first.camera.project(first.joints_camera)
     assert (uv > 0).all()
     with pytest.raises(LiexError, match="no split 'easy'"):
@@ -80,13 +80,13 @@ def test_splits_are_drawn_of_the_animal_and_a_stated_size_is_taken(animal):
 
 @pytest.mark.parametrize("skeleton", [SNAKE, STAR], ids=["snake", "star"])
 def test_an_unknown_animal_rests_on_the_floor_within_its_joints_limits(skeleton):
-    rng, habits = np.random.default_rng(8), GenericSpecies(skeleton)
+    rng, species = np.random.default_rng(8), GenericSpecies(skeleton)
     n = 200
-    shape = habits.shapes(rng, "augmented", n)
-    pose, girth, _ = habits.postures(rng, rng.uniform(0.7, 1.4, n), shape, np.full(n, 700.0))
+    shape = species.shapes(rng, "augmented", n)
+    pose, girth, _ = species.postures(rng, rng.uniform(0.7, 1.4, n), shape, np.full(n, 700.0))
     low = Surface.of(skeleton).vertices(pose, shape, girth)[..., 2].min(axis=1)
     assert (low >= -1e-9).all()
-    assert (low <= 2.0 * habits.setting.scale + 1e-9).all()
+    assert (low <= 2.0 * species.setting.scale + 1e-9).all()
     angles = pose.angles[:, 1:]
     assert (angles[:, ~skeleton.axes[1:]] == 0).all()
     assert (angles >= skeleton.limits[1:, :, 0] - 1e-12).all()
@@ -106,11 +106,11 @@ def test_bends_next_to_one_another_are_alike_and_reach_the_limits():
 
 def test_an_animal_of_the_camera_view_hangs_above_the_floor():
     table = {**SNAKE.table, "view": {"frame": "camera"}}
-    habits = GenericSpecies(Skeleton.from_table(table, "eel.toml"))
+    species = GenericSpecies(Skeleton.from_table(table, "eel.toml"))
     rng = np.random.default_rng(10)
-    shape = habits.shapes(rng, "train", 100)
-    pose, girth, _ = habits.postures(rng, np.ones(100), shape, np.full(100, 900.0))
-    z = Surface.of(habits.skeleton).vertices(pose, shape, girth)[..., 2]
+    shape = species.shapes(rng, "train", 100)
+    pose, girth, _ = species.postures(rng, np.ones(100), shape, np.full(100, 900.0))
+    z = Surface.of(species.skeleton).vertices(pose, shape, girth)[..., 2]
     assert z.min() > 0.0
     assert z.max() < 900.0 * 0.6
     assert z.min(axis=1).std() > 50.0
@@ -129,7 +129,7 @@ def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
 
 
 def test_an_unknown_animal_moves_smoothly_over_the_floor():
-    recording = moving_session(12, 120, habits=GenericSpecies(SNAKE))
+    recording = moving_session(12, 120, species=GenericSpecies(SNAKE))
     step = np.linalg.norm(np.diff(recording.joints_arena, axis=0), axis=-1)
     assert step.max() < 0.15 * recording.spine_mm
     assert step.mean() > 0.1
@@ -139,20 +139,20 @@ def test_an_unknown_animal_moves_smoothly_over_the_floor():
 @pytest.mark.parametrize("animal", ["fish", "snake"])
 def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it(animal):
     world = world_of(SNAKE if animal == "snake" else Skeleton.load(animal))
-    skeleton, habits = world.skeleton, world.habits  # type: ignore[attr-defined]
-    recording = SyntheticSession.draw([13, 2], 20, habits=habits)
+    skeleton, species = world.skeleton, world.species  # type: ignore[attr-defined]
+    recording = SyntheticSession.draw([13, 2], 20, species=species)
     spans = (0.6 * skeleton.length, 1.5 * skeleton.length)
     scene, sample = BackgroundSubtraction.learn(
         recording, spans, 20, skeleton.view.min_height_mm, skeleton.view
     )
     assert scene.stride == (2 if animal == "fish" else 1)
-    crops = scene.extract(sample, recording.spine_mm / skeleton.length, camera_view=habits.floats)
+    crops = scene.extract(sample, recording.spine_mm / skeleton.length, camera_view=species.floats)
     assert crops.found.mean() > 0.9
     middle = scene.camera.project(recording.joints_camera.mean(axis=1))
     half = 48 * crops.step[:, None]
     assert (np.abs(crops.origin + half - middle)[crops.found] < 0.5 * half[crops.found]).all()
     whole = scene.extract(
-        recording.depths(0, 4), recording.spine_mm / skeleton.length, camera_view=habits.floats
+        recording.depths(0, 4), recording.spine_mm / skeleton.length, camera_view=species.floats
     )
     np.testing.assert_array_equal(whole.heights, crops.heights[:4])
     np.testing.assert_array_equal(whole.origin, crops.origin[:4])
@@ -160,7 +160,7 @@ def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it
 
 def test_the_mouse_of_the_world_is_the_mouse_of_the_modules():
     world = world_of(Skeleton.load("mouse"))
-    assert isinstance(world.habits, MouseSpecies)  # type: ignore[attr-defined]
+    assert isinstance(world.species, MouseSpecies)  # type: ignore[attr-defined]
     drawn = world.test_split("clean", n_sessions=1)[0]
     again = SyntheticSession.draw([71_001, 0], sensor=drawn_sensor(), name="clean-00")
     np.testing.assert_array_equal(drawn.depths(0, 1), again.depths(0, 1))

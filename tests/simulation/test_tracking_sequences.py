@@ -83,8 +83,8 @@ def test_holes_are_unread_and_an_occluder_is_nearer_than_the_animal(hard):
 def test_a_faint_animal_is_lost_in_the_floor_where_it_is_low(hard):
     (span, *_) = spans(hard, "faint")
     i = (span.start + span.stop) // 2
-    above = hard.scene.stage.still - hard.frame(i).depth
-    inside = (hard.frame(i).depth > 0) & (hard.scene.stage.still > 0)
+    above = hard.scene.scene.still - hard.frame(i).depth
+    inside = (hard.frame(i).depth > 0) & (hard.scene.scene.still > 0)
     lowest = hard._loss.faint_mm[i]
     assert lowest > 0.15 * hard.spine_mm
     assert not ((above > 1.0) & (above < lowest - 1.0) & inside).any()

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from liex_lab.geometry import so3
-from liex_lab.recordings.timestamps import find_faults, find_gaps, median_step, settle
+from liex_lab.recordings.timestamps import find_faults, find_gaps, make_monotone, median_step
 from liex_lab.tables.rows import Rows, nearness, stop_times, stretches
 from liex_lab.tables.schema import GAPS, ROTATIONS, to_pandas
 from tests.sessions.walking_mouse import SD_ROOT, WalkingMouse, steady
@@ -40,7 +40,7 @@ def test_stamps_that_were_moved_have_rows_of_their_own():
     times = mouse.times_ns.copy()
     times[10] = times[9]
     times[40:] += 3600 * 10**9
-    found = settle(times)
+    found = make_monotone(times)
     step = median_step(found.times_ns)
     track = replace(mouse.track(), times_ns=found.times_ns)
     faults = [*find_gaps(found.times_ns, step), *find_faults(found.times_ns, step, found.faults)]

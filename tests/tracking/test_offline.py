@@ -233,7 +233,7 @@ def test_a_track_on_disk_is_the_one_in_memory(measured, tmp_path, monkeypatch):
     flip = Flip(20, 30, 1.0, True, "human")
     here, there = (
         track_whole(SUBJECT, seen, [flip]),
-        track_whole(SUBJECT, seen, [flip], room=on_disk(tmp_path)),
+        track_whole(SUBJECT, seen, [flip], allocate=on_disk(tmp_path)),
     )
     assert here.flips == there.flips
     for column in fields(Track):

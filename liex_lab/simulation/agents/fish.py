@@ -124,11 +124,11 @@ class FishActor:
             AssertionError: none of 50 tries leaves space for the action.
         """
         for _ in range(50):
-            story = self.begin(rng, word)
-            before = story.play(UNLABELLED, lambda: self._between(rng, 0.25))
-            done = before and story.play(word, lambda: self.act(rng, word))
-            if done and story.play(UNLABELLED, lambda: self._between(rng, 0.25)):
-                return story.told()
+            sequence = self.begin(rng, word)
+            before = sequence.play(UNLABELLED, lambda: self._between(rng, 0.25))
+            done = before and sequence.play(word, lambda: self.act(rng, word))
+            if done and sequence.play(UNLABELLED, lambda: self._between(rng, 0.25)):
+                return sequence.told()
         raise AssertionError(f"no room for {word}")
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
@@ -141,24 +141,24 @@ class FishActor:
         Returns:
             The motion on the 5 ms clock.
         """
-        story = self.begin(rng)
+        sequence = self.begin(rng)
         names = list(_SHARES)
         share = np.array([_SHARES[name] for name in names]) * np.exp(
             rng.normal(0.0, 0.25, len(names))
         )
-        while story.n_steps * STEP_S < seconds:
+        while sequence.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share / share.sum()))
-            if story.play(word, partial(self.act, rng, word), 6) and rng.random() > _BETWEEN:
+            if sequence.play(word, partial(self.act, rng, word), 6) and rng.random() > _BETWEEN:
                 continue
-            if not story.play(UNLABELLED, lambda: self._between(rng, None)):
-                self._go_home(rng, story)
-        return story.told()
+            if not sequence.play(UNLABELLED, lambda: self._between(rng, None)):
+                self._go_home(rng, sequence)
+        return sequence.told()
 
-    def _go_home(self, rng: np.random.Generator, story: BehaviourSequence) -> None:
+    def _go_home(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
         """An unnamed slow turn towards the middle, or, cornered, one on the spot."""
-        x, y, z = story.position
+        x, y, z = sequence.position
         low, high = self.water
-        away = (np.arctan2(-y, -x) - story.heading + np.pi) % (2 * np.pi) - np.pi
+        away = (np.arctan2(-y, -x) - sequence.heading + np.pi) % (2 * np.pi) - np.pi
         level = 0.3 * np.clip(((low + high) / 2 - z) / (high - low), -1, 1)
 
         def home(pace: float) -> Array:
@@ -169,11 +169,11 @@ class FishActor:
             c[:, CLIMB] = level
             return c
 
-        if not story.play(UNLABELLED, lambda: home(0.5)):
+        if not sequence.play(UNLABELLED, lambda: home(0.5)):
             inside = np.clip(z, low + 2.0, high - 2.0)
             half = self._half(inside) - 2.0
-            story.nudge(np.array([*np.clip([x, y], -half, half), inside]))
-            story.play(UNLABELLED, lambda: home(0.0))
+            sequence.nudge(np.array([*np.clip([x, y], -half, half), inside]))
+            sequence.play(UNLABELLED, lambda: home(0.0))
 
     def _blank(self, rng: np.random.Generator, seconds: float) -> tuple[Array, Array]:
         """The clock and the channels of a fish that does nothing but hold itself."""
@@ -414,7 +414,7 @@ class FishActor:
 
 def fish_poses(
     rng: np.random.Generator,
-    habits: FishSpecies,
+    species: FishSpecies,
     motion: Motion,
     rows: NDArray[np.int64],
     size: float,
@@ -423,7 +423,7 @@ def fish_poses(
 
     Args:
         rng: source of randomness, for small standing waves and the length of the travelling one.
-        habits: the species.
+        species: the species.
         motion: its motion.
         rows: (n,) int64 steps of it.
         size: of the fish over home size.
@@ -438,7 +438,7 @@ def fish_poses(
     length = rng.uniform(0.9, 1.1)
     c = motion.channels[rows]
     yaw = bend_profile(
-        habits.skeleton,
+        species.skeleton,
         c[:, _FRONT],
         c[:, _HIND],
         c[:, _WAVE],
@@ -448,18 +448,18 @@ def fish_poses(
         own * (0.2 + np.minimum(c[:, _WAVE], 1.0))[:, None],
     )
     rotation = root_rotation(motion.heading[rows], c[:, CLIMB], c[:, _ROLL])
-    pose = hung(habits.skeleton, yaw, rotation, np.full(n, size))
+    pose = hung(species.skeleton, yaw, rotation, np.full(n, size))
     pose.root.translation[:] += motion.position[rows]
     return pose
 
 
 def depth_of_water(
-    habits: FishSpecies, shape: BodyShape, size: float, camera_mm: float
+    species: FishSpecies, shape: BodyShape, size: float, camera_mm: float
 ) -> tuple[float, float]:
     """Lowest and highest middle of a fish, so that all of it stays in the water.
 
     Args:
-        habits: the species.
+        species: the species.
         shape: its body.
         size: over home size.
         camera_mm: height of the camera above the floor, mm; no part comes nearer than 185 mm to it.
@@ -467,5 +467,5 @@ def depth_of_water(
     Returns:
         Lowest and highest, mm above the floor.
     """
-    reach = size * (float(np.max(shape.half_height)) + 0.36 * habits.skeleton.length)
+    reach = size * (float(np.max(shape.half_height)) + 0.36 * species.skeleton.length)
     return reach, camera_mm - _NEAREST_MM - reach

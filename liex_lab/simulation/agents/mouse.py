@@ -140,40 +140,42 @@ class MouseActor:
         rest[_RISE] = self.rest
         rest[_STRETCH] = 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
-        story = BehaviourSequence(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
+        sequence = BehaviourSequence(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
         names = list(_SHARES)
         share = np.array([_SHARES[name] for name in names]) * np.exp(
             rng.normal(0.0, 0.25, len(names))
         )
-        while story.n_steps * STEP_S < seconds:
+        while sequence.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share / share.sum()))
             if word == "rear_supported":
-                self._to_wall(rng, story)
-            done = self._possible(story, word) and story.play(word, partial(self.act, rng, word), 6)
+                self._to_wall(rng, sequence)
+            done = self._possible(sequence, word) and sequence.play(
+                word, partial(self.act, rng, word), 6
+            )
             if not done and word in ("walk", "run", "dart"):  # no room ahead
-                self._turn_home(rng, story)
-                story.play(word, partial(self.act, rng, word), 8)
-            elif rng.random() < _BETWEEN and not story.play(
+                self._turn_home(rng, sequence)
+                sequence.play(word, partial(self.act, rng, word), 8)
+            elif rng.random() < _BETWEEN and not sequence.play(
                 UNLABELLED, lambda: self._between(rng), 4
             ):
-                self._turn_home(rng, story)
-        return story.told()
+                self._turn_home(rng, sequence)
+        return sequence.told()
 
-    def _possible(self, story: BehaviourSequence, word: str) -> bool:
+    def _possible(self, sequence: BehaviourSequence, word: str) -> bool:
         """Whether a rear here is of that kind: one on a wall has it before the nose, any other is
         away from walls.
         """
         if word == "rear_supported":
-            return self._room(story) < _WALL_MM
-        nose = story.position[:2] + 0.5 * self.spine_mm * np.array(
-            [np.cos(story.heading), np.sin(story.heading)]
+            return self._room(sequence) < _WALL_MM
+        nose = sequence.position[:2] + 0.5 * self.spine_mm * np.array(
+            [np.cos(sequence.heading), np.sin(sequence.heading)]
         )
         return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
 
-    def _room(self, story: BehaviourSequence) -> float:
+    def _room(self, sequence: BehaviourSequence) -> float:
         """From the nose to the wall ahead, mm."""
-        way = np.array([np.cos(story.heading), np.sin(story.heading)])
-        nose = story.position[:2] + 0.5 * self.spine_mm * way
+        way = np.array([np.cos(sequence.heading), np.sin(sequence.heading)])
+        nose = sequence.position[:2] + 0.5 * self.spine_mm * way
         ahead = np.where(
             np.abs(way) > 0.3,
             (self.half - np.sign(way) * nose) / np.maximum(np.abs(way), 1e-9),
@@ -181,35 +183,39 @@ class MouseActor:
         )
         return float(ahead.min())
 
-    def _to_wall(self, rng: np.random.Generator, story: BehaviourSequence) -> None:
+    def _to_wall(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
         """Turn to the nearest wall and walk up to it."""
-        axis = int(np.argmin(self.half - np.abs(story.position[:2])))
+        axis = int(np.argmin(self.half - np.abs(sequence.position[:2])))
         toward = np.zeros(2)
-        toward[axis] = np.sign(story.position[axis]) or 1.0
-        self._turn_by(rng, story, np.arctan2(toward[1], toward[0]) + rng.normal(0.0, 0.25))
+        toward[axis] = np.sign(sequence.position[axis]) or 1.0
+        self._turn_by(rng, sequence, np.arctan2(toward[1], toward[0]) + rng.normal(0.0, 0.25))
         for _ in range(3):
-            room = self._room(story)
-            if room < 0.8 * _WALL_MM or not np.isfinite(room):
+            clearance = self._room(sequence)
+            if clearance < 0.8 * _WALL_MM or not np.isfinite(clearance):
                 return
             speed = self.mouse.vigour * self.mouse.size * rng.uniform(90.0, 240.0)
-            seconds = max(0.3, (room - 0.3 * _WALL_MM) / speed)
-            story.play("walk", partial(self._stride, rng, seconds, speed), 2)
+            seconds = max(0.3, (clearance - 0.3 * _WALL_MM) / speed)
+            sequence.play("walk", partial(self._stride, rng, seconds, speed), 2)
 
-    def _turn_home(self, rng: np.random.Generator, story: BehaviourSequence) -> None:
+    def _turn_home(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
         """Turn to the middle of the box, on the spot where there is no room."""
         self._turn_by(
-            rng, story, np.arctan2(-story.position[1], -story.position[0]) + rng.normal(0.0, 0.3)
+            rng,
+            sequence,
+            np.arctan2(-sequence.position[1], -sequence.position[0]) + rng.normal(0.0, 0.3),
         )
 
-    def _turn_by(self, rng: np.random.Generator, story: BehaviourSequence, heading: float) -> None:
-        away = (heading - story.heading + np.pi) % (2 * np.pi) - np.pi
+    def _turn_by(
+        self, rng: np.random.Generator, sequence: BehaviourSequence, heading: float
+    ) -> None:
+        away = (heading - sequence.heading + np.pi) % (2 * np.pi) - np.pi
         if abs(away) < np.radians(32.0):
             return
         word = "turn_left" if away > 0 else "turn_right"
-        if not story.play(word, lambda: self._turning(rng, away, rng.uniform(0.0, 40.0)), 3):
+        if not sequence.play(word, lambda: self._turning(rng, away, rng.uniform(0.0, 40.0)), 3):
             limit = self.half - 0.58 * self.spine_mm
-            story.nudge(np.array([*np.clip(story.position[:2], -limit, limit), 0.0]))
-            story.play(word, lambda: self._turning(rng, away, 0.0), 3)
+            sequence.nudge(np.array([*np.clip(sequence.position[:2], -limit, limit), 0.0]))
+            sequence.play(word, lambda: self._turning(rng, away, 0.0), 3)
 
     def act(self, rng: np.random.Generator, word: str) -> Array:
         """Control channels of one action.
@@ -418,7 +424,7 @@ class MouseActor:
 
 def mouse_poses(
     rng: np.random.Generator,
-    habits: MouseSpecies,
+    species: MouseSpecies,
     motion: Motion,
     rows: NDArray[np.int64],
     size: float,
@@ -428,7 +434,7 @@ def mouse_poses(
 
     Args:
         rng: source of randomness, for the gap under the trunk (up to 2 mm).
-        habits: the species.
+        species: the species.
         motion: its motion.
         rows: (n,) int64 steps of it.
         size: of the mouse over home size.
@@ -439,7 +445,7 @@ def mouse_poses(
     """
     c = motion.channels[rows]
     n = len(rows)
-    skeleton = habits.skeleton
+    skeleton = species.skeleton
     turn = np.zeros((n, skeleton.n_joints))
     turn[:, 1:-1] = c[:, _BEND]
     # a body that bends to one side heads between its ends

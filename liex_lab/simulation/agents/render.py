@@ -16,7 +16,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Body, Surface
 from liex_lab.foreground.height_maps import Patches
 from liex_lab.geometry import SE3
-from liex_lab.simulation import _render_kernels as _stage
+from liex_lab.simulation import _render_kernels as _scene
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.objects import PART_FACES, rounded
 from liex_lab.simulation.scene import draw_views
@@ -51,7 +51,7 @@ class CameraPath:
     @staticmethod
     def draw(
         rng: np.random.Generator,
-        habits: Species,
+        species: Species,
         sensor: Sensor,
         fur: Array,
         height_mm: float,
@@ -64,7 +64,7 @@ class CameraPath:
 
         Args:
             rng: source of randomness.
-            habits: the species; its scene's tilt and scale are drawn from.
+            species: the species; its scene's tilt and scale are drawn from.
             sensor: the camera's make.
             fur: (1,) of the animal, from 0 to 1.
             height_mm: of the camera above the floor, mm.
@@ -75,12 +75,12 @@ class CameraPath:
         """
         camera = sensor.camera.every(stride)
         focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
-        T = draw_views(rng, 1, habits.setting)
+        T = draw_views(rng, 1, species.setting)
         place = SE3(T.rotation[0], np.array([0.0, 0.0, height_mm]))
         parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))[0]
         margin = np.array([camera.width, camera.height]) / 2.0
         picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
-        error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * habits.setting.scale]
+        error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * species.setting.scale]
         return CameraPath(
             np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]),
             picture,
@@ -90,9 +90,9 @@ class CameraPath:
         )
 
 
-def film(
+def render_agent(
     rng: np.random.Generator,
-    habits: Species,
+    species: Species,
     camera: CameraPath,
     shape: Body,
     pose: Pose,
@@ -104,7 +104,7 @@ def film(
 
     Args:
         rng: source of randomness, for the noise and the tail.
-        habits: the species.
+        species: the species.
         camera: that looks at it.
         shape: its body, a batch of which the first counts.
         pose: (n) arena frame.
@@ -115,10 +115,10 @@ def film(
     Yields:
         Up to 256 patches: depth and background float32 mm with the camera's intrinsics and floor.
     """
-    surface = Surface.of(habits.skeleton)
+    surface = Surface.of(species.skeleton)
     n = len(girth)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    bends = habits.bends(rng, 1)
+    bends = species.bends(rng, 1)
     for start in range(0, n, _BLOCK):
         part = slice(start, min(start + _BLOCK, n))
         m = part.stop - part.start
@@ -134,7 +134,7 @@ def film(
         depth = np.empty((m, window_px, window_px), np.uint16)
         background = np.empty_like(depth)
         nothing = rounded(np.zeros((m, 3)), np.ones((m, 3)), np.zeros(m), np.full(m, 2.0))
-        _stage.draw_windows(
+        _scene.draw_windows(
             vertices,
             surface.faces,
             nothing,
@@ -145,7 +145,7 @@ def film(
             intrinsics,
             np.tile(camera.picture, (m, 1)),
             origin,
-            np.zeros((m, _stage.WALL_COLUMNS)) if walls is None else walls[part],
+            np.zeros((m, _scene.WALL_COLUMNS)) if walls is None else walls[part],
             np.zeros(m),
             np.tile(camera.parameters, (m, 1)),
             seeds[part],
@@ -161,5 +161,5 @@ def film(
             intrinsics,
             origin.astype(float),
             floor,
-            habits.skeleton.view,
+            species.skeleton.view,
         )

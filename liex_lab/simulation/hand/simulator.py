@@ -32,7 +32,7 @@ from liex_lab.recordings.formats.images.nyu_labels import (
 )
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
-from liex_lab.simulation.hand import scene as stage
+from liex_lab.simulation.hand import scene as scene
 from liex_lab.simulation.hand.gestures import draw_gestures
 from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
 from liex_lab.simulation.pose_prior import SIZE_RANGE
@@ -74,7 +74,7 @@ class HandSession(TrueRecording):
 
     Attributes:
         sensor: the camera's make.
-        cast: the hand and what is around it, n frames.
+        contents: the hand and what is around it, n frames.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class HandSession(TrueRecording):
         name: str,
         skeleton: Skeleton,
         sensor: Sensor,
-        cast: stage.HandFrameContents,
+        contents: scene.HandFrameContents,
         times_ns: NDArray[np.int64] | None = None,
     ) -> None:
         """A recording of given contents.
@@ -91,24 +91,24 @@ class HandSession(TrueRecording):
             name: of the recording.
             skeleton: of the hand.
             sensor: the camera's make.
-            cast: the hand and what is around it, n frames, camera frame.
+            contents: the hand and what is around it, n frames, camera frame.
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
-        n = len(cast.seeds)
+        n = len(contents.seeds)
         times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
         super().__init__(
             name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth
         )
         self.skeleton = skeleton
         self.sensor = sensor
-        self.cast = cast
+        self.contents = contents
         self.surface = Surface.of(skeleton)
-        self.spine_mm = float(cast.spine_mm[0])
+        self.spine_mm = float(contents.spine_mm[0])
         self.floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
         self.T_arena_camera = self.floor.T_arena_camera
-        self.pose = cast.pose
-        self.joints_camera = cast.joints
-        self.joints_arena = self.T_arena_camera @ cast.joints
+        self.pose = contents.pose
+        self.joints_camera = contents.joints
+        self.joints_arena = self.T_arena_camera @ contents.joints
 
     def _depth(self, index: int) -> Depth:
         return self.depths(index, index + 1)[0]
@@ -124,11 +124,11 @@ class HandSession(TrueRecording):
             (stop - start, H, W) float32 mm, 0 where unread.
         """
         c = self.camera
-        part = self.cast[slice(start, stop)]
+        part = self.contents[slice(start, stop)]
         n = len(part.seeds)
         intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n, 4)).copy()
         size = np.broadcast_to(np.array([c.width, c.height]), (n, 2)).copy()
-        faces = stage.hand_faces(self.skeleton)
+        faces = scene.hand_faces(self.skeleton)
         return part.pictures(
             faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)
         ).astype(np.float32)
@@ -263,9 +263,9 @@ class HandSimulator:
         size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
         low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind[each]]
         angles, turns = draw_wide(rng, skeleton, n)
-        places = stage.draw_places(rng, intrinsics[each], picture[each].astype(float), low, high)
-        pose = stage.hold_out(rng, skeleton, angles, turns, size, places)
-        cast = stage.assemble(
+        places = scene.draw_places(rng, intrinsics[each], picture[each].astype(float), low, high)
+        pose = scene.hold_out(rng, skeleton, angles, turns, size, places)
+        contents = scene.assemble(
             rng,
             skeleton,
             pose,
@@ -277,7 +277,7 @@ class HandSimulator:
             PER_SESSION,
         )
         uv = (
-            cast.hand[..., :2] / cast.hand[..., 2:] * intrinsics[each][:, None, :2]
+            contents.hand[..., :2] / contents.hand[..., 2:] * intrinsics[each][:, None, :2]
             + intrinsics[each][:, None, 2:]
         )
         shift = rng.uniform(-0.08, 0.08, (n, 2)) * window_px
@@ -287,8 +287,8 @@ class HandSimulator:
         origin = np.clip(
             origin, 0, np.maximum(picture[each] - window_px, 0)
         )  # an arm leaves a window as a picture
-        depth = cast.pictures(
-            stage.hand_faces(skeleton),
+        depth = contents.pictures(
+            scene.hand_faces(skeleton),
             intrinsics[each],
             picture[each],
             origin,
@@ -307,8 +307,8 @@ class HandSimulator:
             pose.root,
             pose.angles,
             pose.scale,
-            cast.joints,
-            cast.spine_mm,
+            contents.joints,
+            contents.spine_mm,
             number * m + each,
             kind[each],
             np.zeros(n, np.int64),
@@ -363,20 +363,20 @@ class HandSimulator:
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (n, 4)
         ).copy()
         picture = np.broadcast_to(np.array([camera.width, camera.height]), (n, 2)).copy()
-        low, high = np.full((2, n), np.array(stage.DISTANCE_MM)[:, None])
-        pose = stage.hold_out(
+        low, high = np.full((2, n), np.array(scene.DISTANCE_MM)[:, None])
+        pose = scene.hold_out(
             rng,
             self.skeleton,
             angles,
             turns,
             size,
-            stage.draw_places(rng, intrinsics, picture.astype(float), low, high),
+            scene.draw_places(rng, intrinsics, picture.astype(float), low, high),
         )
         parameters = np.repeat(NYU_SENSOR.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
-        cast = stage.assemble(
+        contents = scene.assemble(
             rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1
         )
-        return HandSession(name, self.skeleton, NYU_SENSOR, cast)
+        return HandSession(name, self.skeleton, NYU_SENSOR, contents)
 
     def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
         """Angles (n, J, 3) and T_view_palm (n, 3, 3) that no training picture was drawn after,
@@ -454,13 +454,13 @@ def gesture_session(
     c = sensor.camera
     intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n_frames, 4)).copy()
     picture = np.array([[c.width, c.height]], float)
-    (middle,) = stage.draw_places(
+    (middle,) = scene.draw_places(
         rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0])
     )
     moving = draw_gestures(rng, skeleton, n_frames, FRAME_NS * 1e-9, middle)
-    pose = stage.hold_out(rng, skeleton, moving.angles, moving.turns, size, moving.places)
+    pose = scene.hold_out(rng, skeleton, moving.angles, moving.turns, size, moving.places)
     parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0)
-    cast = stage.assemble(
+    contents = scene.assemble(
         rng,
         skeleton,
         pose,
@@ -472,7 +472,7 @@ def gesture_session(
         n_frames,
         moving.wrists,
     )
-    return HandSession(name, skeleton, sensor, cast)
+    return HandSession(name, skeleton, sensor, contents)
 
 
 def _same(shape: HandShape, n: int) -> HandShape:

@@ -60,7 +60,7 @@ def test_the_model_knows_its_animal_and_how_it_is_looked_at(model):
 def test_its_accuracy_is_measured_on_rendered_snakes(model, monkeypatch):
     drawn = synthetic.test_split
     monkeypatch.setattr(
-        synthetic, "test_split", lambda name, spine, n, habits: drawn(name, spine, 2, habits)
+        synthetic, "test_split", lambda name, spine, n, species: drawn(name, spine, 2, species)
     )
     result = evaluate_pose(SNAKE, "clean", model=model)
     assert result["n_frames"] == 100

@@ -22,7 +22,13 @@ from liex_lab.recordings.formats.images.stack import Stack
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamp_files import name_times, read_csv_times
-from liex_lab.recordings.timestamps import Settled, from_rate, match_counts, settle, start_of_clock
+from liex_lab.recordings.timestamps import (
+    MonotoneTimes,
+    from_rate,
+    make_monotone,
+    match_counts,
+    start_of_clock,
+)
 from liex_lab.runtime.progress import Progress, silent
 
 KINDS: dict[str, tuple[str, ...]] = {  # of pictures: how their files' names end
@@ -203,22 +209,22 @@ class Folder:
         told = self.told
         the_camera = told.camera(stack.width, stack.height, camera)
         problems = [*told.problems, *stack.problems, *_say_cut(stack)]
-        settled, start = self._times(fps, problems)
+        monotone, start = self._times(fps, problems)
         _refuse_negative(stack, self.decode, told)
         stated_in = [self.folder / CAMERA_FILE, self.folder / told.timestamps, *self.beside]
         return Recording(
             name=path.resolve().stem if path.is_file() else path.resolve().name,
             format=format,
             camera=the_camera,
-            times_ns=settled.times_ns,
+            times_ns=monotone.times_ns,
             read=Pictures(stack, self.decode, problems).read,
             sources=[*self.files, *(file for file in stated_in if file.is_file())],
             problems=problems,
             truncated=stack.truncated,
-            n_whole=sum(stack.whole[: len(settled.times_ns)]),
+            n_whole=sum(stack.whole[: len(monotone.times_ns)]),
             metadata=({"session_start_time": start} if start else {}) | told.metadata,
             close=stack.close,
-            faults=settled.faults,
+            faults=monotone.faults,
         )
 
     @property
@@ -226,7 +232,7 @@ class Folder:
         """Where the pictures lie."""
         return self.path if self.path.is_dir() else self.path.parent
 
-    def _times(self, fps: float | None, problems: list[str]) -> tuple[Settled, str | None]:
+    def _times(self, fps: float | None, problems: list[str]) -> tuple[MonotoneTimes, str | None]:
         """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they
         tell it.
 
@@ -256,9 +262,9 @@ class Folder:
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
             times = from_rate(n, hz)
             moment = False
-        settled = settle(times[:n])
-        problems += [settled.problem] if settled.problem else []
-        return settled, start_of_clock(int(settled.times_ns[0])) if moment else None
+        monotone = make_monotone(times[:n])
+        problems += [monotone.problem] if monotone.problem else []
+        return monotone, start_of_clock(int(monotone.times_ns[0])) if moment else None
 
     def _no_times(self) -> RecordingError:
         return RecordingError(

@@ -44,7 +44,7 @@ from liex_lab.recordings.formats.messages.messages import (
 from liex_lab.recordings.formats.messages.parsers import parser_of, plain_schema
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamps import settle, start_of_clock
+from liex_lab.recordings.timestamps import make_monotone, start_of_clock
 from liex_lab.runtime.progress import Progress
 
 # 16-bit pictures too, but of brightness: not chosen unless asked for
@@ -244,9 +244,9 @@ def _open(
     )
     # A writer may flush its topics out of turn; the order of logging is the file's own order.
     order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
-    settled = settle(_stamps(chosen, order, problems))
-    problems += [settled.problem] if settled.problem else []
-    start = start_of_clock(int(settled.times_ns[0]))
+    monotone = make_monotone(_stamps(chosen, order, problems))
+    problems += [monotone.problem] if monotone.problem else []
+    start = start_of_clock(int(monotone.times_ns[0]))
     stated = {name: file.notes[name] for name in _FACTS if name in file.notes}
     metadata = ({"session_start_time": start} if start else {}) | stated | camera_file.metadata
     frames = _Frames(
@@ -256,14 +256,14 @@ def _open(
         name=path.resolve().stem,
         format=kind,
         camera=the_camera,
-        times_ns=settled.times_ns,
+        times_ns=monotone.times_ns,
         read=frames.read,
         sources=[path],
         problems=problems,
         truncated=not file.whole,
         metadata=metadata,
         close=file.close,
-        faults=settled.faults,
+        faults=monotone.faults,
         grow=grow,
     )
 

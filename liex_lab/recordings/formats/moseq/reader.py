@@ -35,7 +35,13 @@ from liex_lab.recordings.formats.moseq.metadata import (
 )
 from liex_lab.recordings.formats.video.index import DepthTrack
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamps import Times, from_rate, match_counts, median_step, settle
+from liex_lab.recordings.timestamps import (
+    Times,
+    from_rate,
+    make_monotone,
+    match_counts,
+    median_step,
+)
 from liex_lab.runtime.progress import Progress, silent
 
 DEPTH = "depth.dat"
@@ -317,8 +323,8 @@ class _Session:
     ) -> Recording:
         camera = self._camera(stack, track)
         times = self._times(len(stack), track)
-        settled = settle(times)
-        self.problems += [settled.problem] if settled.problem else []
+        monotone = make_monotone(times)
+        self.problems += [monotone.problem] if monotone.problem else []
         start = (
             {"session_start_time": track.session_start}
             if track is not None and track.session_start
@@ -328,13 +334,13 @@ class _Session:
             name=name,
             format="moseq",
             camera=camera,
-            times_ns=settled.times_ns,
+            times_ns=monotone.times_ns,
             read=Pictures(stack, self.camera_file.decode, self.problems).read,
             sources=sources,
             problems=self.problems,
             truncated=stack.truncated or self.cut,
             close=close,
-            faults=settled.faults,
+            faults=monotone.faults,
             metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
         )
 

@@ -31,7 +31,7 @@ from liex_lab.recordings.formats.oni.index import (
 from liex_lab.recordings.formats.oni.records import OniFile
 from liex_lab.recordings.frame import Depth, depth_mm
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamps import Settled, from_rate, settle, start_of_clock
+from liex_lab.recordings.timestamps import MonotoneTimes, from_rate, make_monotone, start_of_clock
 from liex_lab.runtime.progress import Progress, silent
 
 RAW = b"NONE"
@@ -193,8 +193,8 @@ def _open(
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems += camera_file.problems
     the_camera = _camera(path, node, look, camera_file, camera, problems)
-    settled = _times(node, look, fps, problems)
-    times = settled.times_ns
+    monotone = _times(node, look, fps, problems)
+    times = monotone.times_ns
     frames = OniFrames(file, node, look, camera_file, problems)
     if not any(
         frames.decode(i) is not None
@@ -215,7 +215,7 @@ def _open(
         problems=problems,
         truncated=not whole,
         close=file.close,
-        faults=settled.faults,
+        faults=monotone.faults,
         metadata=({"session_start_time": start} if start else {}) | camera_file.metadata,
     )
 
@@ -295,7 +295,7 @@ def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
     return look
 
 
-def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) -> Settled:
+def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) -> MonotoneTimes:
     """Microseconds as ns; a rate where the clock stood still."""
     stamps = np.frombuffer(node.times_us, node.times_us.typecode)
     n = len(stamps)
@@ -311,7 +311,7 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
             f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, "
             f"{origin}"
         )
-        return settle(from_rate(n, hz))
+        return make_monotone(from_rate(n, hz))
     order = np.arange(n)
     sane = np.maximum.accumulate(np.where(stamps <= _LATEST_US, order, 0))
     if n_wild := int((sane != order).sum()):
@@ -320,9 +320,9 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
             "frames were taken to follow the one before at once"
         )
     times_us = np.minimum(stamps[sane], np.uint64(_LATEST_US)).astype(np.int64)
-    settled = settle(times_us * 1000 + (order - sane))
-    problems += [settled.problem] if settled.problem else []
-    return settled
+    monotone = make_monotone(times_us * 1000 + (order - sane))
+    problems += [monotone.problem] if monotone.problem else []
+    return monotone
 
 
 def _camera(
