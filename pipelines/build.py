@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from liex_lab.behaviour.places import Surroundings
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.height_maps import Foreground
+    from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.optics.camera import Camera, Distortion, Lens
     from liex_lab.optics.refraction import Water
     from liex_lab.recordings.recording import Recording
@@ -232,7 +232,7 @@ def build_tracker(
 
 def build_scene(
     recording: Recording, plan: Plan, skeleton: Skeleton, n_frames: int
-) -> tuple[Foreground, NDArray[np.float32]]:
+) -> tuple[Segmenter, NDArray[np.float32]]:
     """The learned segmentation and the sampled frames it was learned from.
 
     Background subtraction with a floor plane, or for a hand segmentation by distance.
@@ -302,7 +302,7 @@ def build_provenance(
     )
 
 
-def build_arena(scene: Foreground, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
     """The outline of the arena's floor, and the plan's zones placed in it, arena frame, mm.
 
     Args:

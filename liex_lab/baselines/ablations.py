@@ -17,7 +17,7 @@ from liex_lab.baselines.baseline import Guesses, see
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.foreground.crop_camera import in_camera_frame
-from liex_lab.foreground.height_maps import Foreground
+from liex_lab.foreground.segmenter import Segmenter
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PlainMean:
         """The animal's skeleton."""
         return self.estimator.skeleton
 
-    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Size of the animal as the estimator finds it; the home size for the paper's variant.
 
         Args:
@@ -47,7 +47,7 @@ class PlainMean:
         return self.estimator.find_size(sample, scene)
 
     def estimate(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> Guesses:
         """Average each joint's position over all candidates.
 

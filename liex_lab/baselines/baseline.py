@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.foreground.height_maps import Foreground, HeightMaps
+from liex_lab.foreground.height_maps import HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class Baseline(Protocol):
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
 
-    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames.
 
         Args:
@@ -63,7 +64,7 @@ class Baseline(Protocol):
         """
 
     def estimate(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> Guesses:
         """Estimate the joints in each frame.
 
@@ -78,7 +79,7 @@ class Baseline(Protocol):
         """
 
 
-def see(depths: NDArray[np.float32], scene: Foreground, parallel: bool) -> tuple[HeightMaps, Array]:
+def see(depths: NDArray[np.float32], scene: Segmenter, parallel: bool) -> tuple[HeightMaps, Array]:
     """Segment the animal of each frame as the paper's features see it.
 
     Heights are measured along the optical axis, and no size is known. Where two components have

@@ -32,7 +32,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
 from liex_lab.foreground.crop_camera import in_camera_frame
-from liex_lab.foreground.height_maps import Foreground
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.runtime.threads import threads
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ class Cnn:
     skeleton: Skeleton
     net: torch.nn.Sequential
 
-    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Always 1: the network knows nothing of size.
 
         Args:
@@ -178,7 +178,7 @@ class Cnn:
         return 1.0
 
     def estimate(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> Guesses:
         """Estimate the joints in each frame.
 

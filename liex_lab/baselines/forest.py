@@ -34,7 +34,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
 from liex_lab.foreground.crop_camera import in_camera_frame
-from liex_lab.foreground.height_maps import Foreground
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples
 from liex_lab.forests.grow import GrowthPlan, grow_forest
@@ -87,7 +87,7 @@ class RegressionForest:
     where: Forest
     pose: Forest
 
-    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Always 1: the paper's forests know nothing of size.
 
         Args:
@@ -97,7 +97,7 @@ class RegressionForest:
         return 1.0
 
     def estimate(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> Guesses:
         """Estimate the joints in each frame.
 

@@ -39,7 +39,8 @@ from liex_lab.estimation.ridge_correction import SURE_SHARE, RidgeCorrection
 from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
 from liex_lab.estimation.training import base_at_front
 from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.height_maps import Foreground, HeightMaps
+from liex_lab.foreground.height_maps import HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
@@ -330,7 +331,7 @@ class PoseEstimator:
         return *poses[:3], scores
 
     def estimate(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> Estimates:
         """Estimate one pose per frame.
 
@@ -349,7 +350,7 @@ class PoseEstimator:
         return self._estimates(self._look(depths, scene, size, parallel)[0], size, parallel)
 
     def hypotheses(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool = True
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> tuple[Estimates, ...]:
         """Estimate what else the frames may show besides the best pose.
 
@@ -426,7 +427,7 @@ class PoseEstimator:
         return tuple(whole[k * n : (k + 1) * n] for k in range(len(both)))
 
     def _look(
-        self, depths: NDArray[np.float32], scene: Foreground, size: float, parallel: bool
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool
     ) -> tuple[Detection, Detection]:
         """Detect the animal with its candidates, and the next likely component; see `estimate`."""
         camera_view = self.model.method.camera_view
@@ -514,7 +515,7 @@ class PoseEstimator:
     def _is_animal(
         self,
         depths: NDArray[np.float32],
-        scene: Foreground,
+        scene: Segmenter,
         size: float,
         first: Detection,
         second: Detection,
@@ -533,7 +534,7 @@ class PoseEstimator:
             return likeness[1] < likeness[0]
         return second.scores.min(axis=1) + likeness[1] < first.scores.min(axis=1) + likeness[0]
 
-    def find_size(self, sample: NDArray[np.float32], scene: Foreground) -> float:
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames of the recording.
 
         The area seen from above gives the first guess. The model then measures the spine in every

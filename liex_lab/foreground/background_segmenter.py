@@ -6,7 +6,7 @@ A pixel is foreground where its reading is nearer than
 
 where `background` is the farthest mode of the pixel's readings over time and `spread` the standard
 deviation of that mode (see `background`); where no mode is known on the floor, the plane fitted to
-the floor takes over. Foreground pixels are joined to 8-connected components of 4 x 4 blocks; the
+the floor takes over. Segmenter pixels are joined to 8-connected components of 4 x 4 blocks; the
 animal is the component whose area comes nearest to the one that recurs in the most frames, and its
 height map and image moments are cut by the kernels (see `height_maps`). A part of the animal that
 kept still and so was absorbed into the background (the "sleeping person" problem) is found as a
@@ -28,7 +28,8 @@ from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.background import learn_background, sample_frames, stride_for
 from liex_lab.foreground.crop_camera import pack_crop_cameras
-from liex_lab.foreground.height_maps import HeightMaps, Segmenter
+from liex_lab.foreground.height_maps import HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.threads import threads

@@ -22,7 +22,8 @@ from liex_lab.errors import EstimationError
 from liex_lab.foreground import _hand_kernels as kernels
 from liex_lab.foreground.background import sample_frames
 from liex_lab.foreground.crop_camera import crop_columns, pack_crop_cameras, view_of
-from liex_lab.foreground.height_maps import CROP, HeightMaps, Segmenter
+from liex_lab.foreground.height_maps import CROP, HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.threads import threads

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.foreground.height_maps import Foreground, HeightMaps
+from liex_lab.foreground.height_maps import HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3
 from liex_lab.tracking.observations import joints_of
 
@@ -46,14 +47,14 @@ class OcclusionCorrection:
     """
 
     skeleton: Skeleton
-    scene: Foreground
+    scene: Segmenter
     begins: float = 0.0
     ends: float = 1.0
 
     @staticmethod
     def fit(
         skeleton: Skeleton,
-        scene: Foreground,
+        scene: Segmenter,
         pose: Pose,
         crops: HeightMaps,
         depths: NDArray[np.float32],

@@ -23,7 +23,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.height_maps import Foreground
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests.forest import predict
 from liex_lab.geometry import SE3, brownian_path, brownian_steps, so3
 from liex_lab.recordings.frame import DepthFrame
@@ -96,7 +96,7 @@ class ParticleFilter:
     def __init__(
         self,
         estimator: PoseEstimator,
-        scene: Foreground,
+        scene: Segmenter,
         size: float,
         rng: np.random.Generator,
         how: Wander | None = None,

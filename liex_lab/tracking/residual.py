@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
-from liex_lab.foreground.height_maps import CROP, Foreground, HeightMaps
+from liex_lab.foreground.height_maps import CROP, HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3
 
 Array = NDArray[np.float64]
@@ -39,7 +40,7 @@ class BodyResidual:
     girth: float = 1.0
     camera_view: bool = False
 
-    def of(self, pose_arena: Pose, crops: HeightMaps, scene: Foreground) -> Array:
+    def of(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> Array:
         """Median absolute difference between body and reading over the pixels that both cover.
 
         Args:
@@ -64,7 +65,7 @@ class BodyResidual:
         surface: Surface,
         pose_arena: Pose,
         crops: HeightMaps,
-        scene: Foreground,
+        scene: Segmenter,
         camera_view: bool = False,
     ) -> BodyResidual:
         """The girth with which the default body explains these frames best: 13 are tried.
@@ -85,7 +86,7 @@ class BodyResidual:
 
 
 def render_crops(
-    surface: Surface, pose_arena: Pose, girth: float, crops: HeightMaps, scene: Foreground
+    surface: Surface, pose_arena: Pose, girth: float, crops: HeightMaps, scene: Segmenter
 ) -> NDArray[np.float32]:
     """The body's depth on the pixels of the height maps, by rasterising its mesh.
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.foreground.height_maps import Foreground
+from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
@@ -51,7 +51,7 @@ class FrameTracker:
     """
 
     estimator: PoseEstimator
-    scene: Foreground
+    scene: Segmenter
     size: float
     size_origin: str
     body: BodyResidual
@@ -64,7 +64,7 @@ class FrameTracker:
     @staticmethod
     def prepare(
         estimator: PoseEstimator,
-        scene: Foreground,
+        scene: Segmenter,
         sample: NDArray[np.float32],
         spine_mm: float | None = None,
         doubtful_mm: float | None = None,

@@ -32,7 +32,7 @@ from ..build import plan_of
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.height_maps import Foreground
+    from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.simulation.recording import TrueRecording
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def subject_of(
 
 
 def measure(
-    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Foreground
+    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Segmenter
 ) -> tuple[Array, Array, Array]:
     """Joints, predicted errors and their interval of the frames, measured by one subject.
 

@@ -25,7 +25,7 @@ from liex_lab.runtime.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.height_maps import Foreground
+    from liex_lab.foreground.segmenter import Segmenter
 
 Array = NDArray[Any]
 N_FRAMES = 128
@@ -47,7 +47,7 @@ class _Footage:
 
     name: str
     frames: NDArray[np.float32]
-    scene: Foreground
+    scene: Segmenter
     size: float
 
     @property
