@@ -182,7 +182,7 @@ class SceneLook:
                 missing = error
                 continue
             crops = scene.extract(sample, 1.0)
-            length = 4.0 * float(np.median(crops.moments[crops.found, 6]))
+            length = 4.0 * float(np.median(crops.blobs.sd_along[crops.found]))
             if factor == 1.0:
                 self._tell_animal(scene, background, length, float(crops.found.mean()))
             else:

@@ -23,6 +23,7 @@ from liex_lab.estimation._feature_kernels import (
     place_rest,
 )
 from liex_lab.estimation._residual_kernels import N_FIT, explain_pose
+from liex_lab.foreground._blob_kernels import ANGLE
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests._walk import LANES, walk_one_view, walk_views
 
@@ -253,7 +254,7 @@ def _see_all(
             explain_pose(
                 heights[i],
                 crop_cameras[i],
-                moments[i, 5],
+                moments[i, ANGLE],
                 rotations[i, k],
                 positions[i, k],
                 scales[i, k],

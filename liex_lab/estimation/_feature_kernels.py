@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from liex_lab.foreground._blob_kernels import unpack_moments
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_camera
 from liex_lab.geometry._so3_kernels import exp_so3
 
@@ -73,14 +74,15 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
         size: the animal's size over home size.
         scalars: (N_SCALARS,) float32, filled.
     """
-    area = max(moments[1], 1.0)
-    volume = max(moments[2], 1.0)
+    blob = unpack_moments(moments)
+    area = max(blob.area_mm2, 1.0)
+    volume = max(blob.volume_mm3, 1.0)
     scalars[0] = _LOG_UNIT * np.log(area / (size * size))
     scalars[1] = _LOG_UNIT * np.log(volume / (size * size * size))
-    scalars[2] = _MM_UNIT * moments[6] / size
-    scalars[3] = _MM_UNIT * moments[7] / size
-    dx = moments[3] - position[0]
-    dy = moments[4] - position[1]
+    scalars[2] = _MM_UNIT * blob.sd_along / size
+    scalars[3] = _MM_UNIT * blob.sd_across / size
+    dx = blob.x - position[0]
+    dy = blob.y - position[1]
     scalars[4] = _MM_UNIT * (rotation[0, 0] * dx + rotation[1, 0] * dy) / size
     scalars[5] = _MM_UNIT * (rotation[0, 1] * dx + rotation[1, 1] * dy) / size
     scalars[6] = _MM_UNIT * position[2] / size
@@ -89,15 +91,14 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     norm = max(c * c + s * s, 1e-12)
     # how steeply the joint rises, over the back where its slope along the long axis is known (else
     # 0)
-    rise = moments[8] * (np.cos(moments[5]) * c + np.sin(moments[5]) * s) / np.sqrt(norm)
+    rise = blob.slope * (np.cos(blob.angle) * c + np.sin(blob.angle) * s) / np.sqrt(norm)
     scalars[7] = _LOG_UNIT * (rotation[2, 0] - rise)
     scalars[8] = _LOG_UNIT * rotation[2, 1]
     # the sine of twice the angle from the joint's heading to the long axis, without asking for the
     # heading's angle
-    twice = np.sin(2.0 * moments[5]) * (c * c - s * s) - np.cos(2.0 * moments[5]) * 2.0 * s * c
-    scalars[9] = (
-        _LOG_UNIT * twice / norm * (moments[6] - moments[7]) / max(moments[6] + moments[7], 1e-6)
-    )
+    twice = np.sin(2.0 * blob.angle) * (c * c - s * s) - np.cos(2.0 * blob.angle) * 2.0 * s * c
+    longer = blob.sd_along - blob.sd_across
+    scalars[9] = _LOG_UNIT * twice / norm * longer / max(blob.sd_along + blob.sd_across, 1e-6)
     scalars[10] = _LOG_UNIT * np.log(scale / size)
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from liex_lab.foreground._blob_kernels import ANGLE
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
 
 N_FIT = 8
@@ -226,7 +227,7 @@ def explain_all(
         explain_pose(
             heights[i],
             crop_cameras[i],
-            moments[i, 5],
+            moments[i, ANGLE],
             rotations[s],
             positions[s],
             scale[s],

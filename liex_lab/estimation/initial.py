@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import REFERENCE_MM
+from liex_lab.foreground.height_maps import moment_columns
 from liex_lab.geometry import so3
 
 Array = NDArray[np.float64]
@@ -82,15 +83,16 @@ def start_poses(
     """
     n, k = size.shape
     starts = np.broadcast_to(starts, (n, k, 4))
-    centre = moments[:, None, 3:5]
+    blob = moment_columns(moments)
+    centre = np.stack([blob.x, blob.y], axis=-1)[:, None]
     position = np.empty((n, k, 3))
-    mean_height = (moments[:, 2] / np.maximum(moments[:, 1], 1.0))[:, None]
+    mean_height = (blob.volume_mm3 / np.maximum(blob.area_mm2, 1.0))[:, None]
     if axis_start:
         jitter = _JITTER_MM * round(home_length / REFERENCE_MM, 6)
-        roundness = moments[:, 7] / np.maximum(moments[:, 6], 1e-6)
+        roundness = blob.sd_across / np.maximum(blob.sd_along, 1e-6)
         spread = _JITTER[0] + _JITTER[1] * roundness**2
         heading = (
-            moments[:, None, 5] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
+            blob.angle[:, None] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
         )
         scale = size.copy()
         behind = _BEHIND * home_length * scale * (-1.0 if base_at_front else 1.0)
@@ -113,7 +115,7 @@ def start_poses(
     rotation[..., 2, 2] = 1.0
     if axis_start and camera_view:
         rise = (
-            np.arctan(moments[:, None, 8]) * (1.0 - 2.0 * (np.arange(k) % 2))
+            np.arctan(blob.slope[:, None]) * (1.0 - 2.0 * (np.arange(k) % 2))
             + _JITTER_RISE * starts[..., 3]
         )
         rotation = rotation @ _lifted(rise)

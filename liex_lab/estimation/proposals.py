@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.method import Method
+from liex_lab.foreground.height_maps import moment_columns
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict_each
 from liex_lab.forests.grow import grow_forest
@@ -43,11 +44,12 @@ def views_along_axis(
     m = len(size)
     image = np.repeat(np.arange(m, dtype=np.int32), N_WAYS)
     moments = images.moments[image]
-    heading = moments[:, 5] + np.pi * (np.arange(N_WAYS * m) % N_WAYS)
+    blob = moment_columns(moments)
+    heading = blob.angle + np.pi * (np.arange(N_WAYS * m) % N_WAYS)
     turn = np.zeros((N_WAYS * m, 3))
     turn[:, 2] = heading
     rotation = so3.exp(turn)
-    position = np.column_stack([moments[:, 3:5], moments[:, 2] / np.maximum(moments[:, 1], 1.0)])
+    position = np.column_stack([blob.x, blob.y, blob.volume_mm3 / np.maximum(blob.area_mm2, 1.0)])
     each = size[image]
     views = np.empty((N_WAYS * m, 1, VIEW), np.float32)
     scalars = np.empty((N_WAYS * m, kernels.N_SCALARS), np.float32)

@@ -22,6 +22,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.foreground.crop_camera import mm_per_px
+from liex_lab.foreground.height_maps import moment_columns
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.geometry import SE3, so3
@@ -287,6 +288,7 @@ def clue_samples(
     pose = chosen.pose
     unit = skeleton.relative_size
     whole = size * skeleton.relative_size
+    blob = moment_columns(moments)
     clues = np.stack(
         [
             chosen.score / unit,
@@ -296,10 +298,10 @@ def clue_samples(
             10 * pose.root.rotation[:, 2, 1],
             10 * np.abs(pose.angles).sum(axis=(1, 2)),
             10 * pose.scale / size,
-            5 * np.log(np.maximum(moments[:, 1], 1.0) / size**2),
-            5 * np.log(np.maximum(moments[:, 2], 1.0) / size**3),
-            moments[:, 6] / whole,
-            moments[:, 7] / whole,
+            5 * np.log(np.maximum(blob.area_mm2, 1.0) / size**2),
+            5 * np.log(np.maximum(blob.volume_mm3, 1.0) / size**3),
+            blob.sd_along / whole,
+            blob.sd_across / whole,
             10 * (mm_per_px(crop_cameras) / whole),
             *chosen.sd_root.T[:3] * 10,
             *chosen.sd_root.T[3:] / whole,

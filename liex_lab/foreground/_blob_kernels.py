@@ -11,6 +11,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -20,9 +22,62 @@ _ROW_STEP = 2
 _MIN_IN_BLOCK = 3  # of the 8 pixels looked at
 MAX_BLOBS = 32
 _MIN_UNREAD = 9  # of 16 pixels
-N_MOMENTS = 9
 _SLOPE_PASSES = 5
 _LEVEL_PASSES = 3
+
+
+class BlobMoments(NamedTuple):
+    """The moments of one component, or columns (n,) of many, in the order in which they are packed.
+
+    Attributes:
+        n_px: readings on the animal, pixels of the height map.
+        area_mm2: area seen from above, mm^2.
+        volume_mm3: volume under the back, mm^3.
+        x: centroid, mm, view frame.
+        y: centroid, mm, view frame.
+        angle: direction of the long axis, rad, modulo pi.
+        sd_along: standard deviation along the long axis, mm.
+        sd_across: standard deviation across it, mm.
+        slope: how steeply the back rises along it; 0 where it is not measured.
+    """
+
+    n_px: Any
+    area_mm2: Any
+    volume_mm3: Any
+    x: Any
+    y: Any
+    angle: Any
+    sd_along: Any
+    sd_across: Any
+    slope: Any
+
+
+N_MOMENTS = len(BlobMoments._fields)
+N_PX = BlobMoments._fields.index("n_px")
+AREA = BlobMoments._fields.index("area_mm2")
+VOLUME = BlobMoments._fields.index("volume_mm3")
+X = BlobMoments._fields.index("x")
+Y = BlobMoments._fields.index("y")
+ANGLE = BlobMoments._fields.index("angle")
+SD_ALONG = BlobMoments._fields.index("sd_along")
+SD_ACROSS = BlobMoments._fields.index("sd_across")
+SLOPE = BlobMoments._fields.index("slope")
+
+
+@njit(cache=True)
+def unpack_moments(packed):
+    """The record of one component's packed moments (N_MOMENTS,)."""
+    return BlobMoments(
+        packed[0],
+        packed[1],
+        packed[2],
+        packed[3],
+        packed[4],
+        packed[5],
+        packed[6],
+        packed[7],
+        packed[8],
+    )
 
 
 @njit(cache=True)
@@ -472,14 +527,14 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     angle = 0.5 * np.arctan2(2.0 * vxy, vxx - vyy)
     half = 0.5 * (vxx + vyy)
     root = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
-    moments[0] = n
-    moments[1] = area
-    moments[2] = volume
-    moments[3] = mx
-    moments[4] = my
-    moments[5] = angle
-    moments[6] = np.sqrt(max(half + root, 0.0))
-    moments[7] = np.sqrt(max(half - root, 0.0))
+    moments[N_PX] = n
+    moments[AREA] = area
+    moments[VOLUME] = volume
+    moments[X] = mx
+    moments[Y] = my
+    moments[ANGLE] = angle
+    moments[SD_ALONG] = np.sqrt(max(half + root, 0.0))
+    moments[SD_ACROSS] = np.sqrt(max(half - root, 0.0))
 
 
 @njit(cache=True)
@@ -503,8 +558,8 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
     size = heights.shape[0]
     along = np.empty(size * size)
     height = np.empty(size * size)
-    c = np.cos(moments[5])
-    s = np.sin(moments[5])
+    c = np.cos(moments[ANGLE])
+    s = np.sin(moments[ANGLE])
     n = 0
     for r in range(1, size - 1):
         for k in range(1, size - 1):
@@ -512,7 +567,7 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
                 z = distance - heights[r, k] / 16.0
                 x = (origin[0] + step * k - intrinsics[2]) / intrinsics[0] * z
                 y = -(origin[1] + step * r - intrinsics[3]) / intrinsics[1] * z
-                along[n] = c * (x - moments[3]) + s * (y - moments[4])
+                along[n] = c * (x - moments[X]) + s * (y - moments[Y])
                 height[n] = heights[r, k] / 16.0
                 n += 1
     level = 0.0

@@ -528,9 +528,10 @@ def cut_end(
     )
     # the arm tells which way along the long axis the fingers point
     along = rotation @ found[3:6]
-    if along[0] * np.cos(moments[k, 5]) + along[1] * np.sin(moments[k, 5]) < 0.0:
-        moments[k, 5] += np.pi
-    n_px[k] = int(moments[k, 0])
+    angle = moments[k, segment.ANGLE]
+    if along[0] * np.cos(angle) + along[1] * np.sin(angle) < 0.0:
+        moments[k, segment.ANGLE] += np.pi
+    n_px[k] = int(moments[k, segment.N_PX])
 
 
 @njit(cache=True)

@@ -301,7 +301,7 @@ def cut_crop(
         heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k]
     )
     if behind_mm > 0.0:
-        moments[k, 8] = segment.back_slope(
+        moments[k, segment.SLOPE] = segment.back_slope(
             heights[k], origin[k], step, intrinsics, distance[k], moments[k]
         )
 

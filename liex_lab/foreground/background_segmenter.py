@@ -283,7 +283,7 @@ class BackgroundSubtraction(Segmenter):
         n_blobs = np.zeros(len(depths), np.int64)
         for start in range(0, len(depths), 16):
             crops = self.extract(depths[start : start + 16], 1.0)
-            volume[start : start + 16] = crops.moments[:, 2]
+            volume[start : start + 16] = crops.blobs.volume_mm3
             n_blobs[start : start + 16] = crops.n_blobs
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
@@ -316,8 +316,8 @@ class BackgroundSubtraction(Segmenter):
         Args:
             crops: n height maps.
         """
-        area = np.maximum(crops.moments[:, 1], 1.0)
-        volume = np.maximum(crops.moments[:, 2], 1.0)
+        area = np.maximum(crops.blobs.area_mm2, 1.0)
+        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
         if (
             self.view.frame != VIEWS[0]
         ):  # what is below an animal that swims or is held up is not its own

@@ -111,8 +111,8 @@ class HandSegmenter(Segmenter):
         Args:
             crops: n height maps.
         """
-        area = np.maximum(crops.moments[:, 1], 1.0)
-        volume = np.maximum(crops.moments[:, 2], 1.0)
+        area = np.maximum(crops.blobs.area_mm2, 1.0)
+        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
         return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
             np.log(volume / self.volume_mm3) / _VOLUME_SD
         ) ** 2

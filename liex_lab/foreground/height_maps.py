@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.foreground import _height_map_kernels as kernels
-from liex_lab.foreground._blob_kernels import N_MOMENTS
+from liex_lab.foreground._blob_kernels import N_MOMENTS, BlobMoments
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.optics.camera import Camera
 
@@ -119,10 +119,27 @@ class HeightMaps:
         return self.n_px > 0
 
     @property
+    def blobs(self) -> BlobMoments:
+        """The moments (n,) of the components by name, see `BlobMoments`."""
+        return moment_columns(self.moments)
+
+    @property
     def centroid(self) -> Array:
         """The centroid (n, 3) mm of the animal's mass, at its mean height, in the view frame."""
-        moments = self.moments
-        return np.stack([moments[:, 3], moments[:, 4], moments[:, 2] / moments[:, 1]], axis=1)
+        blob = self.blobs
+        return np.stack([blob.x, blob.y, blob.volume_mm3 / blob.area_mm2], axis=1)
+
+
+def moment_columns(moments: Array) -> BlobMoments:
+    """The columns of packed moments by name.
+
+    Args:
+        moments: (n, 9), as in `HeightMaps`.
+
+    Returns:
+        Views (n,) of the columns.
+    """
+    return BlobMoments(*moments.T)
 
 
 @dataclass(frozen=True)

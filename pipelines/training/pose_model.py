@@ -213,6 +213,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
+    from liex_lab.foreground.height_maps import moment_columns
     from liex_lab.simulation.simulator import world_of
 
     rng = np.random.default_rng(recipe.seed)
@@ -227,7 +228,8 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     progress(steps - 2, steps, "growing forests: the learned metric")
     metric = train_metric(data, cascade, candidates, rng)
     pruner = train_pruner(data, cascade, candidates, rng)
-    area = float(np.median((data.images.moments[:, 1] / data.size**2)[data.animal]))
+    area_mm2 = moment_columns(data.images.moments).area_mm2
+    area = float(np.median((area_mm2 / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name,
         "variant": method.variant,
@@ -423,10 +425,11 @@ def with_truth(
             @ windows.joints_mm
         )
     middle = joints.mean(axis=1)
-    off = np.linalg.norm(crops.moments[:, 3:5] - middle[:, :2], axis=1)
+    blob = crops.blobs
+    off = np.linalg.norm(np.stack([blob.x, blob.y], axis=1) - middle[:, :2], axis=1)
     if method.camera_view:  # what is beside it in depth is another thing as well
         off = np.maximum(
-            off, np.abs(crops.moments[:, 2] / np.maximum(crops.moments[:, 1], 1e-9) - middle[:, 2])
+            off, np.abs(blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9) - middle[:, 2])
         )
     animal = off < 0.4 * windows.spine_mm
     other = off > 0.8 * windows.spine_mm
