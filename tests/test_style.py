@@ -58,3 +58,8 @@ def test_every_function_states_its_types(folder: str) -> None:
         for line in functions_without_types(path)
     ]
     assert not untyped, "\n".join(untyped)
+
+
+def test_the_formatter_would_change_nothing() -> None:
+    ran = run_module("ruff", "format", "--check", ".")
+    assert ran.returncode == 0, ran.stdout

@@ -17,7 +17,7 @@ import pytest
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import Recording, open_recording
-from tests.recordings.formats import FORMATS, Format
+from tests.recordings.every_format import FORMATS, Format
 from tests.recordings.writers import depth_frames
 
 STORED = depth_frames(6)
